@@ -1,0 +1,138 @@
+"""Make the embedded test scene: 50 photographs of a ray-traced still life, and the COLMAP model that belongs to them.
+
+    python assets/make_scene.py [--out assets/still_life]
+
+Because a ray tracer that knows nothing of Gaussians takes the pictures, cameras are exact and the truth is independent
+of the code under test. The geometry is in ``scene_geometry``, the look in ``scene_textures``, the tracer in
+``scene_trace``; this file places the cameras, takes the pictures and writes what COLMAP would have found.
+"""
+
+import argparse
+import pathlib
+import shutil
+
+import numpy as np
+import OpenImageIO as oiio
+import pycolmap
+from scene_geometry import still_life
+from scene_trace import Tracer
+
+VIEWS, TURNS = 50, 3  # a closed spiral: each eighth view lies between its neighbours
+SIZE = (264, 248)  # width, height [px]; not multiples of a tile
+FOCAL = (291.0, 288.0)  # fx, fy [px]
+CENTER = (130.6, 125.3)  # cx, cy [px]
+TARGET = (0.02, 0.06, 0.24)
+POINTS = 5000
+MAX_TRACK = 7  # observations kept per point, to keep the model small
+NOISE = 0.0015  # standard deviation of a point, as a share of its distance
+SEED = 7
+
+
+def camera_path() -> tuple[np.ndarray, np.ndarray]:
+    """Camera centres [V, 3] and rotations camera-from-world [V, 3, 3] (x right, y down, z forward)."""
+    t = 2 * np.pi * np.arange(VIEWS) / VIEWS
+    azimuth, elevation = TURNS * t, np.radians(34 + 17 * np.cos(t + 0.4))
+    distance = 3.2 + 0.45 * np.sin(7 * t)
+    circle = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], 1)
+    wander = 0.06 * np.stack([np.sin(5 * t), np.cos(4 * t), np.sin(9 * t)], 1)  # the aim is not perfect
+    centers = TARGET + distance[:, None] * circle
+    forward = TARGET + wander - centers
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return centers, np.stack([right, np.cross(forward, right), forward], 1)
+
+
+def project(points: np.ndarray, center: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel coordinates [N, 2] and depths [N] of world points [N, 3]."""
+    x = (points - center) @ rotation.T
+    return x[:, :2] / x[:, 2:] * FOCAL + CENTER, x[:, 2]
+
+
+def scan(tracer: Tracer, images: list[np.ndarray], centers: np.ndarray, rotations: np.ndarray):
+    """Surface points seen through random pixels: positions [N, 3], colours [N, 3], distances [N]."""
+    rng = np.random.default_rng(SEED)
+    view = np.arange(2 * POINTS) % VIEWS  # more than needed: some will be seen too rarely
+    column, row = rng.integers(SIZE[0], size=len(view)), rng.integers(SIZE[1], size=len(view))
+    rays = np.stack([(column + 0.5 - CENTER[0]) / FOCAL[0], (row + 0.5 - CENTER[1]) / FOCAL[1], np.ones(len(view))], 1)
+    rays = np.einsum("nji,nj->ni", rotations[view], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    distance = tracer.measure(centers[view], rays)
+    colors = np.stack(images)[view, row, column]
+    return centers[view] + distance[:, None] * rays, colors, distance
+
+
+def visibility(tracer: Tracer, points: np.ndarray, centers: np.ndarray, rotations: np.ndarray):
+    """Projections [V, N, 2] and whether each view sees each point [V, N]."""
+    pixels, seen = [], []
+    for center, rotation in zip(centers, rotations, strict=True):
+        xy, depth = project(points, center, rotation)
+        reach = np.linalg.norm(points - center, axis=1)
+        free = tracer.measure(np.broadcast_to(center, points.shape), (points - center) / reach[:, None]) > reach - 5e-3
+        pixels.append(xy)
+        seen.append(free & (depth > 0) & (xy > 1).all(1) & (xy < np.array(SIZE) - 1).all(1))
+    return np.stack(pixels), np.stack(seen)
+
+
+def choose_tracks(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first POINTS candidates with at least three views [N], and the few observations kept of each [V, N]."""
+    chosen = np.flatnonzero(seen.sum(0) >= 3)[:POINTS]
+    rank = np.random.default_rng(SEED + 1).random((len(seen), len(chosen)))
+    rank[~seen[:, chosen]] = 2.0
+    kept = np.zeros_like(rank, bool)
+    np.put_along_axis(kept, np.argsort(rank, axis=0)[:MAX_TRACK], True, axis=0)
+    return chosen, kept & seen[:, chosen]
+
+
+def write_model(folder: pathlib.Path, names, centers, rotations, points, colors, pixels, kept) -> None:
+    """Write cameras, images, points and their tracks with pycolmap."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[*FOCAL, *CENTER])
+    model.add_camera_with_trivial_rig(camera)
+    for view, name in enumerate(names):
+        image = pycolmap.Image(name=name, keypoints=pixels[view, kept[view]], camera_id=1, image_id=view + 1)
+        translation = -rotations[view] @ centers[view]
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotations[view]), translation)
+        model.add_image_with_trivial_frame(image, pose)
+    slot = np.cumsum(kept, axis=1) - 1  # place of a point among the keypoints of a view
+    for point in range(len(points)):
+        track = pycolmap.Track()
+        for view in np.flatnonzero(kept[:, point]):
+            track.add_element(int(view) + 1, int(slot[view, point]))
+        model.add_point3D(points[point], track, colors[point])
+    model.update_point_3d_errors()
+    model.write_binary(str(folder))
+
+
+def write_png(path: pathlib.Path, image: np.ndarray) -> None:
+    spec = oiio.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
+    spec.attribute("png:compressionLevel", 9)
+    output = oiio.ImageOutput.create(str(path))
+    if not (output and output.open(str(path), spec) and output.write_image(image) and output.close()):
+        raise OSError(f"cannot write {path}: {oiio.geterror()}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent / "still_life")
+    out = parser.parse_args().out
+    shutil.rmtree(out, ignore_errors=True)
+    (out / "images").mkdir(parents=True)
+    (out / "sparse" / "0").mkdir(parents=True)
+
+    tracer = Tracer(still_life())
+    centers, rotations = camera_path()
+    names = [f"view_{view:03d}.png" for view in range(VIEWS)]
+    images = [tracer.photograph(c, r, FOCAL, CENTER, SIZE) for c, r in zip(centers, rotations, strict=True)]
+    for name, image in zip(names, images, strict=True):
+        write_png(out / "images" / name, image)
+
+    points, colors, distance = scan(tracer, images, centers, rotations)
+    pixels, seen = visibility(tracer, points, centers, rotations)
+    chosen, kept = choose_tracks(seen)
+    noise = np.random.default_rng(SEED + 2).normal(size=points.shape) * NOISE * distance[:, None]
+    noisy = (points + noise)[chosen]
+    write_model(out / "sparse" / "0", names, centers, rotations, noisy, colors[chosen], pixels[:, chosen], kept)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""Truth for the renderer: float64 torch, every Gaussian at every pixel, gradients by torch.autograd.
+
+Written from the papers (Kerbl et al. 2023; Zwicker et al. 2001 for the projection), without a look at the kernels:
+no tiles, no early exit (only its effect), no inverse, nothing shared with the package but ``Camera``.
+
+A renderer in float32 may decide otherwise where a quantity lies within rounding of a threshold. ``Render.fragile``
+marks the pixels where that could be seen, so that a test can leave them out, and count them.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+NEAR = 0.2  # Gaussians nearer than this are culled
+BLUR = 0.3  # low-pass filter, px^2
+ALPHA_MAX = 0.99
+ALPHA_MIN = 1 / 255
+STOP = 1e-4  # a Gaussian that would take the transmittance below is not blended, nor is any behind it
+SIDE = 0.3  # the Jacobian sees x/z at most this share of the half width beyond the image
+
+ROUNDING = 2.0**-24  # float32, half a unit in the last place
+UNSEEN = 1e-5  # a blending weight (and its gradient) too small to tell, a tenth of the error allowed
+BAND = 1e-3  # a Gaussian whose largest alpha is this close (relative) to 1/255 may be culled or not
+
+
+@dataclass
+class Splats:
+    """Projected Gaussians, [N] each; ``live`` is False where the rest means nothing."""
+
+    means2d: torch.Tensor  # [N, 2] px
+    z: torch.Tensor  # depth in the camera
+    cov2d: torch.Tensor  # [N, 2, 2] px^2, low-pass filter included
+    opacity: torch.Tensor  # [N] times the antialiasing factor
+    colour: torch.Tensor  # [N, 3]
+    live: torch.Tensor  # [N] bool
+
+
+@dataclass
+class Render:
+    """What the renderer should return, and how sure we are."""
+
+    image: torch.Tensor  # [H, W, 3]
+    alpha: torch.Tensor  # [H, W]
+    depth: torch.Tensor  # [H, W] expected z, 0 where alpha is 0
+    means2d: torch.Tensor  # [N, 2] on the way to the image: retain_grad() works
+    fragile: torch.Tensor  # [H, W] bool, float32 may see another decision here
+    touches: torch.Tensor  # [N] bool, reaches a pixel beyond doubt
+    near_image: torch.Tensor  # [N] bool, the box around alpha >= 1/255 overlaps the image (or nearly)
+    reach: torch.Tensor  # [N] px, long half axis of the ellipse alpha = 1/255, 0 where there is none
+
+
+def rotation_matrices(quats):
+    """Rotations [N, 3, 3] of quaternions wxyz of any norm but zero (those give the identity)."""
+    norm = quats.norm(dim=1, keepdim=True)
+    w, x, y, z = torch.where(norm > 0, quats / norm.clamp_min(1e-300), quats.new_tensor([1.0, 0, 0, 0])).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, 1) for row in rows], 1)
+
+
+def covariances(quats, scales):
+    """Sigma = R S S^T R^T in the world, [N, 3, 3] (Kerbl et al. 2023, eq. 6)."""
+    rotation = rotation_matrices(quats)
+    return rotation @ torch.diag_embed(scales**2) @ rotation.transpose(1, 2)
+
+
+def sh_basis(directions, degree):
+    """Real spherical harmonics at unit ``directions`` [N, 3], [N, (degree + 1)^2], signs as in the reference's code."""
+    x, y, z = directions.unbind(1)
+    xx, yy, zz = x * x, y * y, z * z
+    terms = [
+        0.28209479177387814 * torch.ones_like(x),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+        -0.4570457994644658 * x * (4 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3 * yy),
+    ]
+    return torch.stack(terms[: (degree + 1) ** 2], 1)
+
+
+def jacobians(points, camera):
+    """d(pixel) / d(camera point) at ``points`` [N, 3], [N, 2, 3]; x/z and y/z limited to a frame around the image."""
+    z = points[:, 2]
+    entries = []
+    for axis, (focal, centre, size) in enumerate(
+        ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+    ):
+        margin = SIDE * size / (2 * focal)
+        slope = (points[:, axis] / z).clamp(-centre / focal - margin, (size - centre) / focal + margin)
+        row = [torch.zeros_like(z), torch.zeros_like(z), -focal * slope / z]
+        row[axis] = focal / z
+        entries.append(torch.stack(row, 1))
+    return torch.stack(entries, 1)
+
+
+def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False):
+    """Gaussians as the camera sees them."""
+    world_to_camera = torch.as_tensor(camera.rotation.copy(), dtype=torch.float64)
+    translation = torch.as_tensor(camera.translation.copy(), dtype=torch.float64)
+    points = means @ world_to_camera.T + translation
+    live = (points[:, 2] > NEAR) & (quats.norm(dim=1) > 0)
+    points = torch.where(live[:, None], points, points.new_tensor([0.0, 0, 1]))  # no division by zero, no gradient
+    x, y, z = points.unbind(1)
+    means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+
+    to_pixels = jacobians(points, camera) @ world_to_camera
+    sharp = to_pixels @ covariances(quats, scales) @ to_pixels.transpose(1, 2)
+    cov2d = sharp + BLUR * torch.eye(2, dtype=torch.float64)
+    opacity = opacities
+    if antialiasing:
+        ratio = torch.linalg.det(sharp) / torch.linalg.det(cov2d)
+        opacity = opacities * ratio.clamp_min(1e-30).sqrt()
+
+    centre = torch.as_tensor(camera.center, dtype=torch.float64)
+    degree = int(sh.shape[1] ** 0.5) - 1
+    degree = degree if sh_degree is None else min(degree, sh_degree)
+    basis = sh_basis(torch.nn.functional.normalize(means - centre, dim=1), degree)
+    colour = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
+    return Splats(means2d, z, cov2d, opacity, colour, live)
+
+
+def _alphas(splats, order, camera):
+    """Alpha of each pixel and splat before any decision, [P, M], and a bound on its relative error in float32."""
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    cov = splats.cov2d[order]
+    det = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
+    xx, xy, yy = cov[:, 1, 1] / det, -cov[:, 0, 1] / det, cov[:, 0, 0] / det  # the inverse's diagonal is swapped
+    dx = splats.means2d[order, 0] - (columns.reshape(-1, 1) + 0.5)
+    dy = splats.means2d[order, 1] - (rows.reshape(-1, 1) + 0.5)
+    alpha = splats.opacity[order] * torch.exp(-0.5 * (xx * dx**2 + yy * dy**2) - xy * dx * dy)
+    with torch.no_grad():
+        terms = 0.5 * (xx * dx**2 + yy * dy**2) + (xy * dx * dy).abs()  # what rounds when the exponent is summed
+        slope = (xx * dx + xy * dy).abs() + (xy * dx + yy * dy).abs()  # and when the mean is a rounded number
+        size = splats.means2d[order].abs().amax(1) + max(camera.width, camera.height)
+        error = 2e-5 + 8 * ROUNDING * (terms + slope * size)
+    return alpha, error
+
+
+def _decide(alpha, error):
+    """Which pairs are blended [P, M], and which pixels hang on rounding [P]. No gradient flows through a decision."""
+    solid = torch.where(alpha >= ALPHA_MIN, alpha.clamp_max(ALPHA_MAX), torch.zeros_like(alpha))
+    after = torch.cumprod(1 - solid, 1)  # transmittance if nothing stopped it: it can only fall
+    before = after / (1 - solid)
+    blended = (solid > 0) & (after >= STOP)
+
+    drift = torch.cumsum(error * solid / (1 - solid), 1) + 1e-5  # relative error of the transmittance
+    reached = before >= STOP * (1 - drift)
+    at_threshold = (alpha / ALPHA_MIN).log().abs().minimum((alpha / ALPHA_MAX).log().abs()) < error
+    at_stop = (solid > 0) & ((after / STOP).log().abs() < drift)
+    seen = before * alpha.clamp_max(ALPHA_MAX) > UNSEEN
+    return blended, ((at_threshold | at_stop) & reached & seen).any(1)
+
+
+def _culling(splats, alpha, order, camera):
+    """Which splats a renderer must keep, which it may keep, and how far they reach."""
+    touches = torch.zeros_like(splats.live)
+    touches[order] = (alpha >= ALPHA_MIN * (1 + BAND)).any(0)
+    level = 2 * torch.log((splats.opacity / ALPHA_MIN).clamp_min(1))  # d' conic d on the edge of the ellipse
+    half = (level[:, None] * torch.diagonal(splats.cov2d, dim1=1, dim2=2)).sqrt() + 0.01
+    low, high = splats.means2d - half, splats.means2d + half
+    size = splats.means2d.new_tensor([camera.width, camera.height])
+    inside = ((high > 0) & (low < size)).all(1) & splats.live & (splats.opacity > ALPHA_MIN * (1 - BAND))
+    reach = (level * torch.linalg.eigvalsh(splats.cov2d)[:, 1]).sqrt() * splats.live
+    return touches, inside, reach
+
+
+def render(means, quats, scales, opacities, sh, camera, background=(0.0, 0.0, 0.0), sh_degree=None, antialiasing=False):
+    """The image of N Gaussians (float64 tensors, activated values), differentiable in all of them and the background."""
+    splats = project(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing)
+    key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
+    order = torch.sort(key, stable=True).indices
+    order = order[splats.live[order]]
+    raw, error = _alphas(splats, order, camera)
+    with torch.no_grad():
+        blended, fragile = _decide(raw, error)
+        touches, near_image, reach = _culling(splats, raw, order, camera)
+
+    alpha = torch.where(blended, raw.clamp_max(ALPHA_MAX), torch.zeros_like(raw))
+    through = torch.cat([torch.ones_like(raw[:, :1].sum(1, keepdim=True)), torch.cumprod(1 - alpha, 1)], 1)
+    weight = alpha * through[:, :-1]
+    shape = (camera.height, camera.width)
+    background = torch.as_tensor(background, dtype=torch.float64)
+    image = weight @ splats.colour[order] + through[:, -1:] * background
+    total = weight.sum(1)
+    depth = torch.where(total > 0, weight @ splats.z[order] / torch.where(total > 0, total, 1), 0)
+    return Render(
+        image=image.reshape(*shape, 3),
+        alpha=(1 - through[:, -1]).reshape(shape),
+        depth=depth.reshape(shape),
+        means2d=splats.means2d,
+        fragile=fragile.reshape(shape),
+        touches=touches,
+        near_image=near_image,
+        reach=reach,
+    )

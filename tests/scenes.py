@@ -1,0 +1,230 @@
+"""Small named scenes, each for one thing that a renderer gets wrong. Deterministic: every scene has its seed.
+
+``SCENES[name]()`` builds one. Depths keep gaps well above float32 rounding (except in ``ties``), so that the order is
+a fact of the scene and not of a rounding; a bug fix brings the scene that failed before it.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+
+C0 = 0.28209479177387814  # colour = C0 * sh[0] + 0.5 at degree 0
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Activated Gaussians (float32, torch), a camera and a background."""
+
+    means: torch.Tensor  # [N, 3]
+    quats: torch.Tensor  # [N, 4] wxyz
+    scales: torch.Tensor  # [N, 3]
+    opacities: torch.Tensor  # [N]
+    sh: torch.Tensor  # [N, K, 3]
+    camera: Camera
+    background: torch.Tensor  # [3]
+
+    def to(self, device, dtype=None):
+        """The same scene elsewhere or in another precision."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "camera"}
+        return replace(self, **{name: tensor.to(device, dtype) for name, tensor in tensors.items()})
+
+    def parameters(self):
+        """The five inputs in the order of the renderer's arguments."""
+        return [getattr(self, name) for name in PARAMETERS]
+
+
+def make_camera(width, height, fx=None, fy=None, cx=None, cy=None, seed=0, centre=(0.3, -0.2, 0.5)):
+    """A camera in a general pose (``seed=None``: at the origin, axes of the world)."""
+    rotation, centre = np.eye(3), np.asarray(centre, dtype=np.float64)
+    if seed is None:
+        centre = np.zeros(3)
+    else:  # a random rotation: the Q of a random matrix, its determinant made +1
+        rotation, upper = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+        rotation *= np.sign(np.diag(upper))
+        rotation *= np.linalg.det(rotation)
+    fx = fx or 1.1 * width
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    return Camera(width, height, fx, fy or fx, cx, cy, rotation, -rotation @ centre)
+
+
+def spread(rng, count, low, high):
+    """``count`` numbers in random order, no two closer than half an even spacing: depths that cannot swap."""
+    step = (high - low) / max(count, 1)
+    return low + step * (rng.permutation(count) + rng.uniform(0.25, 0.75, count))
+
+
+def from_camera(points, camera):
+    """Camera points [N, 3] in the world."""
+    return (points - camera.translation) @ camera.rotation
+
+
+def pack(points, scales, opacities, sh, camera, rng, quats=None, background=(0.2, 0.4, 0.7)):
+    """A Scene of NumPy arrays; ``points`` in the camera, random rotations unless given."""
+    quats = rng.normal(size=(len(points), 4)) if quats is None else quats
+    arrays = (from_camera(points, camera), quats, scales, opacities, sh)
+    tensors = [torch.tensor(np.ascontiguousarray(array), dtype=torch.float32) for array in arrays]
+    return Scene(*tensors, camera, torch.tensor(background, dtype=torch.float32))
+
+
+def colours(rng, count, degree, low=0.0, high=1.0, rest=0.15):
+    """SH coefficients [N, K, 3]: base colours in low..high, the rest normal."""
+    sh = rng.normal(size=(count, (degree + 1) ** 2, 3)) * rest
+    sh[:, 0] = (rng.uniform(low, high, (count, 3)) - 0.5) / C0
+    return sh
+
+
+def cloud(
+    seed, count, camera, degree=0, z=(2, 8), sigma=(0.6, 6), aspect=0.15, opacity=(0.05, 0.95), frame=0.15, **sh_options
+):
+    """Random Gaussians over the image and a ``frame`` around it (a share of its size).
+
+    ``sigma``: range of the largest standard deviation on the image [px]; ``aspect``: smallest ratio of the others to it.
+    """
+    rng = np.random.default_rng(seed)
+    depth = spread(rng, count, *z)
+    pixels = rng.uniform(-frame, 1 + frame, (count, 2)) * [camera.width, camera.height]
+    slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    points = np.concatenate([slopes * depth[:, None], depth[:, None]], 1)
+    size = np.exp(rng.uniform(*np.log(sigma), count)) * np.abs(depth) / camera.fx
+    ratios = np.exp(rng.uniform(np.log(aspect), 0, (count, 3)))
+    ratios[np.arange(count), rng.integers(0, 3, count)] = 1
+    opacities = rng.uniform(*opacity, count)
+    sh = colours(rng, count, degree, **sh_options)
+    return pack(points, size[:, None] * ratios, opacities, sh, camera, rng)
+
+
+def near_and_behind():
+    """Depths from far behind to in front, with both sides of the near plane at 0.2."""
+    scene = cloud(21, 150, make_camera(44, 35), degree=1, z=(-3, 3), sigma=(1, 5))
+    near = cloud(22, 40, scene.camera, degree=1, z=(0.1, 0.3), sigma=(1, 8), opacity=(0.05, 0.3))
+    return join(scene, near)
+
+
+def inside():
+    """A wide camera in the middle of a cloud: Gaussians beyond the frame reach in, the Jacobian's clamp is active."""
+    camera, rng, count = make_camera(45, 37, fx=14, fy=16, seed=3), np.random.default_rng(23), 160
+    z = spread(rng, count, 0.25, 3)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    slope = rng.uniform(0, 5, count)  # the image ends at 1.6, the clamp at 2.1
+    points = np.stack([slope * np.cos(angle) * z, slope * np.sin(angle) * z, z], 1)
+    scales = np.exp(rng.uniform(np.log(0.05), np.log(0.5), (count, 3))) * z[:, None]
+    return pack(points, scales, rng.uniform(0.1, 0.7, count), colours(rng, count, 2), camera, rng)
+
+
+def join(first, second):
+    """Both scenes' Gaussians, seen by the first one's camera."""
+    tensors = {name: torch.cat([getattr(first, name), getattr(second, name)]) for name in PARAMETERS}
+    return replace(first, **tensors)
+
+
+def needles():
+    """Scale ratios of 10,000 at every angle on the image, and some along the line of sight."""
+    camera, rng, count = make_camera(47, 41, seed=None), np.random.default_rng(24), 48
+    z = spread(rng, count, 3, 6)
+    pixels = rng.uniform(0.1, 0.9, (count, 2)) * [47, 41]
+    points = np.concatenate([(pixels - [23.5, 20.5]) / camera.fx * z[:, None], z[:, None]], 1)
+    length = rng.uniform(3, 9, count) / camera.fx * z
+    scales = length[:, None] * np.array([1, 1e-4, 1e-4])
+    half = np.linspace(0, np.pi, count, endpoint=False) / 2
+    quats = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
+    quats[::6] = rng.normal(size=quats[::6].shape)
+    return pack(points, scales, rng.uniform(0.3, 0.9, count), colours(rng, count, 0), camera, rng, quats)
+
+
+def pancakes():
+    """Flat Gaussians, one axis 10,000 times shorter than the others: seen from the front, aslant and edge-on."""
+    scene = cloud(25, 60, make_camera(43, 39), degree=1, sigma=(2, 7), aspect=0.6)
+    flat = torch.ones_like(scene.scales)
+    flat[torch.arange(60), torch.arange(60) % 3] = 1e-4
+    return replace(scene, scales=scene.scales * flat)
+
+
+def ties():
+    """Every Gaussian at the same depth, many at the same place: the index decides. World axes keep z exact."""
+    scene = cloud(26, 40, make_camera(33, 30, seed=None), sigma=(3, 6), opacity=(0.3, 0.9), frame=0)
+    means = scene.means / scene.means[:, 2:] * 4
+    means[:, 2] = 4
+    means[1::2] = means[::2]
+    return replace(scene, means=means)
+
+
+def huge():
+    """One Gaussian far larger than the image in front of small ones, one behind them."""
+    scene = cloud(27, 40, make_camera(50, 34), degree=1)
+    big = cloud(28, 2, scene.camera, degree=1, z=(1, 20), sigma=(900, 1100), aspect=0.5, opacity=(0.3, 0.6), frame=0)
+    return join(scene, big)
+
+
+def faint():
+    """Opacities on both sides of 1/255, none within rounding of it."""
+    scene = cloud(29, 120, make_camera(40, 31), sigma=(2, 6))
+    opacities = torch.linspace(0.2, 3, 120) / 255
+    return replace(scene, opacities=opacities)
+
+
+def quat_norms():
+    """Quaternions of norm 1e-3 to 1e3."""
+    scene = cloud(30, 60, make_camera(37, 33), degree=1)
+    norms = torch.logspace(-3, 3, 60)[:, None]
+    return replace(scene, quats=scene.quats / scene.quats.norm(dim=1, keepdim=True) * norms)
+
+
+def dense_tile():
+    """450 Gaussians in the first tile (more than one batch of 256), 250 over the rest."""
+    camera = make_camera(48, 35)
+    scene = cloud(31, 250, camera, degree=1, opacity=(0.02, 0.4))
+    rng = np.random.default_rng(32)
+    z = spread(rng, 450, 1, 1.9)
+    pixels = rng.uniform(1, 15, (450, 2))
+    points = np.concatenate([(pixels - [camera.cx, camera.cy]) / camera.fx * z[:, None], z[:, None]], 1)
+    scales = rng.uniform(0.3, 1.5, (450, 3)) / camera.fx * z[:, None]
+    tile = pack(points, scales, rng.uniform(0.02, 0.2, 450), colours(rng, 450, 1), camera, rng)
+    return join(scene, tile)
+
+
+def empty():
+    """No Gaussian at all."""
+    scene = cloud(0, 1, make_camera(20, 18), degree=1)
+    return replace(scene, **{name: getattr(scene, name)[:0] for name in PARAMETERS})
+
+
+def _clouds(degree):
+    return lambda: cloud(10 + degree, 120, make_camera(37, 29, seed=degree), degree=degree)
+
+
+SCENES = {
+    "degree0": _clouds(0),
+    "degree1": _clouds(1),
+    "degree2": _clouds(2),
+    "degree3": _clouds(3),
+    "offcentre": lambda: cloud(1, 120, make_camera(50, 31, fx=60, fy=41, cx=38.3, cy=7.2, seed=5), degree=1),
+    "principal_outside": lambda: cloud(2, 120, make_camera(40, 24, cx=-25.5, cy=44.2, seed=6), degree=1),
+    "focal_ratio": lambda: cloud(3, 100, make_camera(45, 38, fx=33, fy=101, seed=7), degree=1, sigma=(0.5, 3)),
+    "size_1x1": lambda: cloud(4, 30, make_camera(1, 1, fx=2), sigma=(0.5, 2), opacity=(0.05, 0.4)),
+    "size_17x33": lambda: cloud(5, 100, make_camera(17, 33), frame=0.5),
+    "size_50x31": lambda: cloud(6, 100, make_camera(50, 31), frame=0.5),
+    "size_100x3": lambda: cloud(7, 100, make_camera(100, 3), frame=0.3),
+    "near_and_behind": near_and_behind,
+    "inside": inside,
+    "opaque": lambda: cloud(8, 60, make_camera(40, 33), degree=1, sigma=(1, 4), opacity=(0.99, 1)),
+    "saturated": lambda: cloud(9, 120, make_camera(36, 30), degree=1, sigma=(6, 20), opacity=(0.6, 0.95)),
+    "layers_4000": lambda: cloud(
+        14, 4000, make_camera(18, 13), z=(1, 9), sigma=(30, 60), aspect=0.5, opacity=(0.0042, 0.007), frame=0
+    ),
+    "needles": needles,
+    "pancakes": pancakes,
+    "ties": ties,
+    "subpixel": lambda: cloud(15, 300, make_camera(34, 30), degree=1, sigma=(0.001, 0.5)),
+    "huge": huge,
+    "faint": faint,
+    "empty": empty,
+    "single": lambda: cloud(16, 1, make_camera(21, 19), degree=3, sigma=(3, 4), opacity=(0.8, 0.9), frame=-0.4),
+    "dense_tile": dense_tile,
+    "quat_norms": quat_norms,
+    "far_world": lambda: cloud(17, 100, make_camera(41, 34, seed=8, centre=(1000.3, -900.7, 1100.2)), degree=1),
+    "negative_colour": lambda: cloud(18, 120, make_camera(39, 28), degree=1, low=-1.0, high=1.0, rest=0.4),
+}

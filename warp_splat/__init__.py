@@ -1,0 +1,37 @@
+"""3D Gaussian Splatting in NVIDIA Warp: train, render and differentiate on the CPU.
+
+Names are loaded when first used, so that ``warp-splat --help`` does not wait for torch and Warp.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Camera": "camera",
+    "InputError": "errors",
+    "RasterOptions": "config",
+    "RenderOutput": "rasterize",
+    "get_threads": "launch",
+    "load_scene": "scene",
+    "rasterize": "rasterize",
+    "set_threads": "launch",
+}
+__all__ = ["Camera", "InputError", "RasterOptions", "RenderOutput", "get_threads", "load_scene", "rasterize", "set_threads"]
+
+if TYPE_CHECKING:
+    from warp_splat.camera import Camera
+    from warp_splat.config import RasterOptions
+    from warp_splat.errors import InputError
+    from warp_splat.launch import get_threads, set_threads
+    from warp_splat.rasterize import RenderOutput, rasterize
+    from warp_splat.scene import load_scene
+
+
+def __getattr__(name: str):
+    if name not in _HOMES:
+        raise AttributeError(f"module 'warp_splat' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"warp_splat.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value

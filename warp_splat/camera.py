@@ -1,0 +1,76 @@
+"""A pinhole camera in COLMAP's conventions: x right, y down, z forward, pixel centres at +0.5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from warp_splat.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera and its pose, world to camera: ``x_camera = rotation @ x_world + translation``.
+
+    Args:
+        width: image width [px], at least 1.
+        height: image height [px], at least 1.
+        fx: horizontal focal length [px], positive.
+        fy: vertical focal length [px], positive.
+        cx: principal point from the image's left edge [px]; may lie outside the image.
+        cy: principal point from the image's top edge [px].
+        rotation: rotation part of camera_from_world, [3, 3], orthonormal with determinant +1.
+        translation: translation part of camera_from_world, [3], world units.
+
+    Raises:
+        InputError: if a value is missing its shape, not finite, or out of range.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def __post_init__(self):
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if int(value) != value or value < 1:
+                raise InputError(f"Camera {name}: expected a whole number of pixels, at least 1, got {value}.")
+            object.__setattr__(self, name, int(value))
+        for name in ("fx", "fy", "cx", "cy"):
+            value = float(getattr(self, name))
+            if not np.isfinite(value) or (name in ("fx", "fy") and value <= 0):
+                raise InputError(f"Camera {name}: expected a {'positive' if name[0] == 'f' else 'finite'} number, got {value}.")
+            object.__setattr__(self, name, value)
+        for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise InputError(f"Camera {name}: expected shape {shape}, got {value.shape}.")
+            if not np.isfinite(value).all():
+                raise InputError(f"Camera {name}: expected finite numbers, got {value.tolist()}.")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(self.rotation) < 0:
+            raise InputError("Camera rotation: expected an orthonormal matrix with determinant +1 (world to camera).")
+
+    @property
+    def center(self) -> np.ndarray:
+        """Camera centre in world coordinates, [3]."""
+        return -self.rotation.T @ self.translation
+
+    @property
+    def forward(self) -> np.ndarray:
+        """Viewing direction in world coordinates, unit length, [3]."""
+        return self.rotation[2]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for an image resized to ``width`` x ``height``: all of K is scaled."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )

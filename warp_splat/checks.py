@@ -1,0 +1,83 @@
+"""What :func:`warp_splat.rasterize` demands of its arguments, said in one sentence when it is not met."""
+
+from __future__ import annotations
+
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.config import ADJOINTS, RasterOptions
+from warp_splat.errors import InputError
+
+
+def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -> RasterOptions:
+    """The options to use. Raises InputError for an unknown adjoint, option or camera."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
+    if adjoint not in ADJOINTS:
+        raise InputError(f"adjoint: expected one of {', '.join(ADJOINTS)}, got {adjoint!r}.")
+    options = options or RasterOptions()
+    if not isinstance(options, RasterOptions):
+        raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
+    if options.sh_degree not in (None, 0, 1, 2, 3):
+        raise InputError(f"options.sh_degree: expected 0, 1, 2, 3 or None, got {options.sh_degree!r}.")
+    return options
+
+
+def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, ...]:
+    """Shapes, dtypes and devices; returns (means, quats, scales, opacities, sh_dc, sh_rest), contiguous where needed."""
+    _check_tensor("means", means, (None, 3))
+    count = means.shape[0]
+    _check_tensor("quats", quats, (count, 4))
+    _check_tensor("scales", scales, (count, 3))
+    _check_tensor("opacities", opacities, (count,))
+    if isinstance(sh, (tuple, list)) and len(sh) == 2:
+        sh_dc, sh_rest = sh
+        _check_tensor("sh[0]", sh_dc, (count, 1, 3))
+        _check_tensor("sh[1]", sh_rest, (count, None, 3))
+    else:
+        _check_tensor("sh", sh, (count, None, 3))
+        sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
+    if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
+        raise InputError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {1 + sh_rest.shape[1]}.")
+    check_range("scales", scales, bool((scales <= 0).any()), "positive values (activated, not their logarithm)")
+    outside = bool(((opacities < 0) | (opacities > 1)).any())
+    check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
+    return tuple(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest))
+
+
+def _check_tensor(name: str, tensor, shape: tuple[int | None, ...]) -> None:
+    wanted = "[" + ", ".join("N" if size is None else str(size) for size in shape) + "]"
+    if not isinstance(tensor, torch.Tensor):
+        raise InputError(f"{name}: expected a float32 torch tensor {wanted}, got {type(tensor).__name__}.")
+    fits = tensor.dim() == len(shape) and all(a is None or a == b for a, b in zip(shape, tensor.shape, strict=True))
+    if not fits:
+        raise InputError(f"{name}: expected shape {wanted}, got {list(tensor.shape)}.")
+    if tensor.dtype != torch.float32:
+        raise InputError(f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float().")
+    if tensor.device.type != "cpu":
+        raise InputError(f"{name}: expected a tensor on the CPU, got one on {tensor.device}; move it with .cpu().")
+
+
+def check_range(name: str, tensor: torch.Tensor, outside: bool, wanted: str) -> None:
+    """Raise InputError with the tensor's range if it lies ``outside`` what is ``wanted``."""
+    if outside:
+        low, high = tensor.min().item(), tensor.max().item()
+        raise InputError(f"{name}: expected {wanted}, got values from {low:g} to {high:g}.")
+
+
+def _dense(tensor: torch.Tensor) -> torch.Tensor:
+    """Kernels follow strides between Gaussians and coefficients, but not within a vector."""
+    return tensor if tensor.dim() < 2 or tensor.stride(-1) == 1 or tensor.numel() == 0 else tensor.contiguous()
+
+
+def explain_invalid(means, quats, scales, opacities, sh_dc, sh_rest) -> None:
+    """Raise InputError naming the argument that holds NaN or infinity, if one does (a zero quaternion is no error)."""
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh_dc, "sh ": sh_rest}
+    for name, tensor in named.items():
+        bad = ~torch.isfinite(tensor.detach())
+        if bool(bad.any()):
+            row = int(bad.flatten(1).any(1).nonzero()[0]) if tensor.dim() > 1 else int(bad.nonzero()[0])
+            raise InputError(
+                f"{name.strip()}: expected finite numbers, got {int(bad.sum())} that are NaN or infinite, the first in "
+                f"Gaussian {row}; remove those Gaussians."
+            )

@@ -1,0 +1,170 @@
+"""Everything that can be chosen, with units and sources. Standard library only, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+# The renderer's constants (those of the reference implementation, Kerbl et al. 2023).
+ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is skipped there
+ALPHA_MAX = 0.99  # alpha is clamped so that 1 / (1 - alpha) stays bounded
+T_MIN = 1.0e-4  # a pixel stops before the Gaussian that would take its transmittance below this
+NEAR = 0.2  # world units along the optical axis; Gaussians whose centre is nearer are culled
+BLUR = 0.3  # px^2, added to both variances of the projected Gaussian (low-pass)
+FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
+TILE = 16  # px, side of a tile
+
+ADJOINTS = ("manual",)  # how the pixel loop is differentiated; see warp_splat.rasterize
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """What the renderer is asked for; what is not asked for is not computed.
+
+    Args:
+        depth: also return the expected depth per pixel.
+        sh_degree: highest spherical-harmonics degree to evaluate (0 to 3); None evaluates all that ``sh`` holds.
+        antialiasing: scale each opacity by the share of its area that the low-pass filter added (Mip-Splatting, Yu
+            et al. 2024), so that small Gaussians do not grow brighter.
+    """
+
+    depth: bool = False
+    sh_degree: int | None = None
+    antialiasing: bool = False
+
+
+def flag(default: Any, help: str, *names: str, choices: tuple | None = None, many: type | None = None) -> Any:
+    """A dataclass field that is also a command-line flag: its default, its help, further names."""
+    metadata = {"help": help, "names": names, "choices": choices, "many": many}
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass
+class TrainConfig:
+    """Training options; names and defaults of the reference implementation (train.py, October 2024) where it has them."""
+
+    source_path: str = flag("", "scene folder (COLMAP or nerf-synthetic); without it, the embedded scene", "-s")
+    model_path: str = flag("", "output folder; default: output/<random name>", "-m")
+    images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
+    resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
+    white_background: bool = flag(False, "composite on white instead of black", "-w")
+    eval: bool = flag(False, "hold out every 8th image (by name) for testing")
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
+    seed: int = flag(0, "seed of everything random")
+    quiet: bool = flag(False, "print only the summary")
+    profile: int = flag(0, "time the stages of the last N iterations, as a table and a plot")
+
+    iterations: int = flag(30_000, "training steps, one image each")
+    sh_degree: int = flag(3, "highest degree of the view-dependent color", choices=(0, 1, 2, 3))
+    optimizer_type: str = flag(
+        "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
+    )
+    adjoint: str = flag("manual", "how the pixel loop is differentiated", choices=ADJOINTS)
+    antialiasing: bool = flag(False, "keep small Gaussians from growing brighter (Mip-Splatting)")
+    random_background: bool = flag(False, "a random background color in every step")
+    lambda_dssim: float = flag(0.2, "share of 1 - SSIM in the loss")
+    position_lr_init: float = flag(0.00016, "rate of the means at the start (times the scene's extent)")
+    position_lr_final: float = flag(0.0000016, "rate of the means after position_lr_max_steps")
+    position_lr_max_steps: int = flag(30_000, "steps over which the means' rate decays")
+    feature_lr: float = flag(0.0025, "rate of the base color; the higher degrees learn 20 times slower")
+    opacity_lr: float = flag(0.025, "rate of the opacity logits")
+    scaling_lr: float = flag(0.005, "rate of the log scales")
+    rotation_lr: float = flag(0.001, "rate of the quaternions")
+    sh_interval: int = flag(1000, "steps between two rises of the active SH degree")
+
+    densify_from_iter: int = flag(500, "first step of densification")
+    densify_until_iter: int = flag(15_000, "last step of densification")
+    densification_interval: int = flag(100, "steps between two densifications")
+    densify_grad_threshold: float = flag(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
+    percent_dense: float = flag(0.01, "share of the scene's extent above which a Gaussian splits instead of being cloned")
+    opacity_reset_interval: int = flag(3000, "steps between two resets of all opacities to 0.01")
+    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
+    prune_screen_size: int = flag(
+        0, "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does"
+    )
+
+    test_iterations: list[int] = flag([7_000, 30_000], "evaluate after these steps, besides 20 times in all", many=int)
+    save_iterations: list[int] = flag([7_000, 30_000], "save the model after these steps, and the last", many=int)
+
+
+#: What the embedded scene changes when no ``-s`` is given: a schedule that ends within a few minutes on two cores.
+EMBEDDED_DEFAULTS: dict[str, Any] = {
+    "eval": True,
+    "iterations": 5000,
+    "position_lr_max_steps": 5000,
+    "densify_until_iter": 2500,
+    "opacity_reset_interval": 3000,
+    "sh_interval": 500,
+}
+
+
+@dataclass
+class RenderConfig:
+    """Rendering options; the reference's render.py where it has them."""
+
+    model_path: str = flag("", "folder of a trained model", "-m")
+    source_path: str = flag("", "scene folder, if it has moved since training", "-s")
+    iteration: int = flag(-1, "which saved model; -1: the last")
+    skip_train: bool = flag(False, "no images of the training views")
+    skip_test: bool = flag(False, "no images of the test views")
+    orbit: bool = flag(False, "time an orbit of 100 frames at 980 x 545 instead of rendering the views")
+    orbit_center: str = flag("origin", "what the orbit goes around: the world's origin, or the point that the cameras look at", choices=("origin", "focus"))
+    orbit_output: str = flag("", "keep the orbit's frames: an .mp4 file, or a folder for PNG files")
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
+    quiet: bool = flag(False, "print only the summary")
+
+
+#: Flags of the reference that this program does not have, and what to say when somebody uses one.
+FOREIGN_FLAGS = {
+    "--checkpoint_iterations": "checkpoints are not supported yet; --save_iterations saves the model",
+    "--start_checkpoint": "training cannot be resumed yet; it starts from the scene's points",
+    "--depths": "depth regularization is not supported",
+    "--depth_l1_weight_init": "depth regularization is not supported",
+    "--depth_l1_weight_final": "depth regularization is not supported",
+    "--train_test_exp": "exposure compensation is not supported",
+    "--exposure_lr_init": "exposure compensation is not supported",
+    "--exposure_lr_final": "exposure compensation is not supported",
+    "--exposure_lr_delay_steps": "exposure compensation is not supported",
+    "--exposure_lr_delay_mult": "exposure compensation is not supported",
+    "--position_lr_delay_mult": "the delay of the means' rate has no effect in the reference and is left out",
+    "--data_device": "images stay in host memory",
+    "--convert_SHs_python": "colors are always computed by the kernels",
+    "--compute_cov3D_python": "covariances are always computed by the kernels",
+    "--ip": "there is no network viewer",
+    "--port": "there is no network viewer",
+    "--disable_viewer": "there is no network viewer",
+    "--debug": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
+    "--debug_from": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
+    "--detect_anomaly": "gradients that are not finite are always dropped and counted",
+}
+
+
+def check_train(config: TrainConfig) -> str | None:
+    """What is wrong with the values of ``config``, in one sentence, or None."""
+    at_least = {
+        "iterations": 1,
+        "threads": 0,
+        "profile": 0,
+        "max_gaussians": 0,
+        "prune_screen_size": 0,
+        "position_lr_max_steps": 1,
+        "densification_interval": 1,
+        "opacity_reset_interval": 1,
+        "sh_interval": 1,
+    }
+    for name, low in at_least.items():
+        if getattr(config, name) < low:
+            return f"--{name}: expected at least {low}, got {getattr(config, name)}."
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if isinstance(value, float) and not 0 <= value < float("inf"):
+            return f"--{item.name}: expected a finite number, at least 0, got {value}."
+    if config.lambda_dssim > 1:
+        return f"--lambda_dssim: expected 0 to 1, got {config.lambda_dssim}."
+    if config.position_lr_init <= 0 or config.position_lr_final <= 0:
+        return "--position_lr_init, --position_lr_final: expected more than 0 (the rate decays from one to the other)."
+    return None

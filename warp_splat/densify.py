@@ -1,0 +1,114 @@
+"""Growing and pruning the set (Kerbl et al. 2023, section 5.2), as the reference prescribes. No kernels: index logic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from warp_splat.config import TrainConfig
+from warp_splat.gaussians import GaussianModel
+from warp_splat.optimizer import Optimizer
+from warp_splat.rasterize import RenderOutput
+
+PRUNE_OPACITY = 0.005
+RESET_OPACITY = 0.01
+PRUNE_EXTENT = 0.1  # share of the scene's extent above which a Gaussian is pruned, once opacities have been reset
+SPLIT_SHRINK = 1.6  # the children's scales are the parent's divided by this
+
+
+@dataclass
+class Change:
+    """What one densification did, in Gaussians."""
+
+    cloned: int
+    split: int
+    pruned: int
+
+
+class Densifier:
+    """Statistics of the gradients of the 2D means, and what follows from them."""
+
+    def __init__(self, model: GaussianModel, optimizer: Optimizer, config: TrainConfig, extent: float):
+        self.model, self.optimizer, self.config, self.extent = model, optimizer, config, extent
+        self.random = torch.Generator().manual_seed(config.seed)
+        self._clear()
+
+    def _clear(self) -> None:
+        self.gradient = torch.zeros(len(self.model))  # sum over views of |dL/dmean2d|, NDC units
+        self.views = torch.zeros(len(self.model))  # in which the Gaussian was drawn
+        self.radius = torch.zeros(len(self.model), dtype=torch.int32)  # px, largest in any view
+
+    def observe(self, out: RenderOutput, width: int, height: int) -> None:
+        """Take in the gradient of one view's 2D means."""
+        if out.means2d.grad is None:
+            return
+        x, y = (0.5 * size * out.means2d.grad[:, axis] for axis, size in enumerate((width, height)))
+        self.gradient += torch.sqrt(x * x + y * y)
+        self.views += out.radii > 0
+        if self.config.prune_screen_size:
+            self.radius = torch.maximum(self.radius, out.radii)
+
+    def update(self, iteration: int) -> Change | None:
+        """Densify, prune and reset opacities if it is time; None if the set did not change."""
+        config, change = self.config, None
+        if iteration >= config.densify_until_iter:
+            return None
+        if iteration > config.densify_from_iter and iteration % config.densification_interval == 0:
+            change = self._densify(prune_large=iteration > config.opacity_reset_interval)
+        at_start = config.white_background and iteration == config.densify_from_iter
+        if iteration % config.opacity_reset_interval == 0 or at_start:
+            self.optimizer.reset_opacities(RESET_OPACITY)
+        return change
+
+    def _densify(self, prune_large: bool) -> Change:
+        raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
+        chosen = self._choose()
+        widest = torch.exp(raw["scales"]).amax(1)
+        splits = widest > self.config.percent_dense * self.extent
+        clone, split = chosen[~splits[chosen]], chosen[splits[chosen]]
+        added = self._children(raw, split)
+        added = {name: torch.cat([raw[name][clone], added[name]]) for name in raw}
+        keep, keep_added = self._survivors(raw, prune_large), self._survivors(added, prune_large)
+        if self.config.prune_screen_size and prune_large:
+            keep &= self.radius <= self.config.prune_screen_size
+        keep[split] = False
+        pruned = len(keep) + len(keep_added) - int(keep.sum()) - int(keep_added.sum()) - len(split)
+        if not bool(keep.any()) and not bool(keep_added.any()):  # an empty scene could never recover
+            keep[:], keep_added[:], pruned = True, False, 0
+        self.optimizer.replace(keep.nonzero()[:, 0], {name: rows[keep_added] for name, rows in added.items()})
+        self._clear()
+        return Change(len(clone), len(split), pruned)
+
+    def _choose(self) -> torch.Tensor:
+        """Gaussians whose mean gradient is over the threshold, ascending; the largest first where room is short."""
+        mean = self.gradient / self.views.clamp_min(1.0)
+        over = (mean >= self.config.densify_grad_threshold).nonzero()[:, 0]
+        room = max(self.config.max_gaussians - len(self.model), 0)
+        if self.config.max_gaussians and len(over) > room:
+            largest = torch.sort(mean[over], descending=True, stable=True).indices[:room]
+            over = torch.sort(over[largest]).values
+        return over
+
+    def _children(self, raw: dict[str, torch.Tensor], split: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Two samples of each Gaussian in ``split``, smaller than it."""
+        twice = split.repeat(2)
+        rows = {name: tensor[twice] for name, tensor in raw.items()}
+        offsets = torch.exp(rows["scales"]) * torch.randn(len(twice), 3, generator=self.random)
+        rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
+        rows["scales"] = rows["scales"] - float(torch.tensor(SPLIT_SHRINK).log())
+        return rows
+
+    def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
+        keep = torch.sigmoid(raw["opacities"]) >= PRUNE_OPACITY
+        if prune_large:
+            keep &= torch.exp(raw["scales"]).amax(1) <= PRUNE_EXTENT * self.extent
+        return keep
+
+
+def rotate(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any norm but 0."""
+    unit = torch.nn.functional.normalize(quats, dim=1)
+    w, axis = unit[:, :1], unit[:, 1:]
+    twist = 2.0 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twist + torch.linalg.cross(axis, twist)

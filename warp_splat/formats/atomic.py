@@ -1,0 +1,51 @@
+"""Files are written beside their final name and moved there when complete: a reader never sees half a file."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from warp_splat.errors import InputError
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path in the folder of ``path``; what was written there becomes ``path`` if the block succeeds.
+
+    Missing folders are created. The temporary name keeps the suffix, by which image writers choose their format. If the
+    block raises, the temporary file is removed and an older ``path`` stays as it was.
+
+    Args:
+        path: the file to write or to replace.
+
+    Raises:
+        InputError: if the operating system refuses: disk full, folder not writable, a file where a folder should be.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".tmp-{uuid.uuid4().hex[:12]}{path.suffix}")
+    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield temporary
+            # Some file systems report a full disk only here; without it a power cut could leave an empty file.
+            with open(temporary, "r+b") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            _remove(temporary)
+    except OSError as error:
+        raise InputError(
+            f"{path}: could not be written ({error.strerror or error}); an older file of this name is untouched. "
+            "Free some space or choose another folder."
+        ) from error
+
+
+def _remove(path: Path) -> None:
+    """Remove ``path`` if it is there; failing to tidy up must not hide the error that made it necessary."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        pass

@@ -1,0 +1,143 @@
+"""The folder that a training leaves behind, laid out as the reference's, so that its viewers and scripts find things.
+
+``cfg_args``, ``cameras.json``, ``input.ply``, ``point_cloud/iteration_N/point_cloud.ply``.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from warp_splat.scene.types import View
+
+
+def default_model_path() -> Path:
+    """A folder name that is new each time: ``output/`` and ten characters of a UUID."""
+    return Path("output") / str(uuid.uuid4())[:10]
+
+
+def prepare(folder: str | Path) -> Path:
+    """Create the model folder and prove that it can be written, before hours of training.
+
+    Raises:
+        InputError: if the folder cannot be created or written.
+    """
+    folder = Path(folder)
+    probe = folder / f".probe-{uuid.uuid4().hex[:12]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_text("written and removed at the start of a training")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"{folder}: expected a folder that can be written ({error.strerror or error}); choose another model path."
+        ) from error
+    return folder
+
+
+def ply_path(folder: str | Path, iteration: int) -> Path:
+    """Where the Gaussians of an iteration are."""
+    return Path(folder) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+
+def find_iteration(folder: str | Path, iteration: int = -1) -> int:
+    """The iteration to load: the one asked for, or the largest saved one for -1.
+
+    Raises:
+        InputError: if there is no such iteration.
+    """
+    matches = (
+        re.fullmatch(r"iteration_(\d+)", path.parent.name) for path in ply_path(folder, 0).parents[1].glob("*/*.ply")
+    )
+    saved = sorted({int(match[1]) for match in matches if match and ply_path(folder, int(match[1])).is_file()})
+    if not saved:
+        raise InputError(
+            f"{folder}: expected point_cloud/iteration_*/point_cloud.ply, found none; is it a model folder?"
+        )
+    if iteration == -1:
+        return saved[-1]
+    if iteration not in saved:
+        raise InputError(f"{folder}: iteration {iteration} was not saved; there are {', '.join(map(str, saved))}.")
+    return iteration
+
+
+def write_cfg_args(folder: str | Path, namespace: Mapping[str, object]) -> None:
+    """Write the arguments of a training as the reference does: one line ``Namespace(name=value, ...)``.
+
+    Args:
+        folder: the model folder.
+        namespace: argument names and values: Python literals, or paths, which are written as strings.
+
+    Raises:
+        InputError: if a value is not a literal (such a line could not be read back), or the file cannot be written.
+    """
+    path = Path(folder) / "cfg_args"
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in namespace.items()}
+    line = f"Namespace({', '.join(f'{name}={value!r}' for name, value in values.items())})"
+    _parse_namespace(line, path)
+    with atomic_write(path) as temporary:
+        temporary.write_text(line, encoding="utf-8")
+
+
+def read_cfg_args(folder: str | Path) -> dict[str, object]:
+    """Read ``cfg_args``. The values are parsed as literals and never evaluated, whoever wrote the file.
+
+    Raises:
+        InputError: if the file is missing or holds anything but ``Namespace(name=literal, ...)``.
+    """
+    path = Path(folder) / "cfg_args"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: could not be read ({error}); is {folder} a model folder?") from error
+    return _parse_namespace(text, path)
+
+
+def _parse_namespace(text: str, path: Path) -> dict[str, object]:
+    try:
+        call = ast.parse(text.strip(), mode="eval").body
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id != "Namespace":
+            raise ValueError("no Namespace(...)")
+        if call.args or any(keyword.arg is None for keyword in call.keywords):
+            raise ValueError("an argument without a name")
+        return {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
+    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
+        raise InputError(
+            f"{path}: expected one line Namespace(name=literal, ...), found something else ({error})."
+        ) from error
+
+
+def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: Sequence[View]) -> None:
+    """Write ``cameras.json`` for viewers: test cameras first, then training cameras, at their original sizes.
+
+    Positions are camera centres and rotations camera-to-world, both in world coordinates; focal lengths in pixels.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    cameras = [_camera_entry(index, view) for index, view in enumerate([*views_test, *views_train])]
+    with atomic_write(Path(folder) / "cameras.json") as temporary:
+        temporary.write_text(json.dumps(cameras, allow_nan=False), encoding="utf-8")
+
+
+def _camera_entry(index: int, view: View) -> dict[str, object]:
+    camera = view.original
+    return {
+        "id": index,
+        "img_name": view.name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera.center.tolist(),
+        "rotation": camera.rotation.T.tolist(),
+        "fy": camera.fy,
+        "fx": camera.fx,
+    }

@@ -1,0 +1,191 @@
+"""Splats and points as PLY files, in the layout of the reference implementation (Kerbl et al. 2023).
+
+One element ``vertex`` of little-endian float32: ``x y z nx ny nz f_dc_0..2 f_rest_0..n opacity scale_0..2 rot_0..3``.
+Values are stored before their activation: opacity as a logit, scales as natural logarithms, quaternions w x y z of any
+length. ``f_rest`` is channel-major: all coefficients of red, then of green, then of blue; here they are [N, K, 3].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyParseError
+
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")  # zeros; only there because readers of the reference's files may expect them
+F_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+COLOR = ("red", "green", "blue")
+REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
+
+
+class SplatArrays(NamedTuple):
+    """Gaussians as stored, float32: before sigmoid, exp and normalisation."""
+
+    means: np.ndarray  # [N, 3] world units
+    sh: np.ndarray  # [N, K, 3] spherical harmonics, K = 1, 4, 9 or 16
+    opacities: np.ndarray  # [N] logits
+    scales: np.ndarray  # [N, 3] natural logarithms of world units
+    quats: np.ndarray  # [N, 4] w x y z, not necessarily of unit length
+
+
+def save_ply(
+    path: str | Path,
+    means: np.ndarray,
+    sh: np.ndarray,
+    opacities: np.ndarray,
+    scales: np.ndarray,
+    quats: np.ndarray,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write Gaussians as stored (see :class:`SplatArrays`); equal arrays give equal bytes.
+
+    Args:
+        path: the file to write.
+        means: centres, [N, 3], world units.
+        sh: spherical harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16.
+        opacities: logits, [N].
+        scales: natural logarithms of the standard deviations, [N, 3].
+        quats: rotations w x y z, [N, 4].
+        comments: lines for the header, ASCII.
+
+    Raises:
+        ValueError: if a shape disagrees with the others.
+        InputError: if the file cannot be written.
+    """
+    splats = SplatArrays(*(np.asarray(array, np.float32) for array in (means, sh, opacities, scales, quats)))
+    _check_shapes(splats)
+    count, coefficients, _ = splats.sh.shape
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
+    columns = (
+        splats.means,
+        np.zeros((count, 3)),
+        splats.sh[:, 0],
+        rest,
+        splats.opacities[:, None],
+        splats.scales,
+        splats.quats,
+    )
+    names = (*POSITION, *NORMAL, *F_DC, *_rest_names(rest.shape[1]), "opacity", *SCALE, *ROTATION)
+    table = np.concatenate(columns, axis=1, dtype="<f4")
+    _write(path, table.view([(name, "<f4") for name in names])[:, 0], comments)
+
+
+def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """Write a coloured point cloud as the reference's ``input.ply``: x y z, zero normals, red green blue.
+
+    Args:
+        path: the file to write.
+        points: positions, [P, 3], world units.
+        colors: colours 0..255, [P, 3] uint8.
+
+    Raises:
+        ValueError: if the shapes are not both [P, 3].
+        InputError: if the file cannot be written.
+    """
+    points, colors = np.asarray(points), np.asarray(colors)
+    if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+        raise ValueError(f"points, colors: expected shapes (P, 3) twice, got {points.shape} and {colors.shape}.")
+    rows = np.zeros(len(points), [(name, "<f4") for name in POSITION + NORMAL] + [(name, "u1") for name in COLOR])
+    for axis in range(3):
+        rows[POSITION[axis]], rows[COLOR[axis]] = points[:, axis], colors[:, axis]
+    _write(path, rows, ())
+
+
+def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatArrays:
+    """Read Gaussians by property name: any order, with or without normals, SH degree 0 to 3.
+
+    Rows with a value that is not finite (as a float32) are left out, since one of them can spoil a whole image.
+
+    Args:
+        path: a PLY file, binary or text.
+        report: called with one line if rows were left out.
+
+    Returns:
+        The Gaussians as stored.
+
+    Raises:
+        InputError: if the file is missing, damaged, or not a PLY file of 3D Gaussians.
+    """
+    vertex = _read_vertices(path)
+    names = vertex.dtype.names or ()
+    rest_count = sum(name.startswith("f_rest_") for name in names)
+    if rest_count not in REST_COUNTS:
+        raise InputError(
+            f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found {rest_count}; "
+            "export the Gaussians with a degree of at most 3."
+        )
+    wanted = (*POSITION, *F_DC, *_rest_names(rest_count), "opacity", *SCALE, *ROTATION)
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise InputError(
+            f"{path}: expected an uncompressed PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
+            "missing; export it as 'PLY (standard)' or train again."
+        )
+    if any(vertex.dtype[name].hasobject for name in wanted):
+        raise InputError(f"{path}: expected one number for each property of a Gaussian, found a list.")
+    with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
+        table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
+    finite = np.isfinite(table).all(axis=1)
+    if not finite.all():
+        report(
+            f"{path}: left out {np.count_nonzero(~finite)} of {len(table)} Gaussians with values that are not finite."
+        )
+    return _split_columns(table[finite], rest_count // 3)
+
+
+def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:
+    """Arrays from the columns x y z, f_dc, f_rest, opacity, scale, rot, with ``rest`` coefficients in each channel."""
+    sh_rest = table[:, 6 : 6 + 3 * rest].reshape(len(table), 3, rest).transpose(0, 2, 1)
+    other = table[:, 6 + 3 * rest :]
+    return SplatArrays(
+        means=table[:, :3].copy(),
+        sh=np.concatenate([table[:, None, 3:6], sh_rest], axis=1),
+        opacities=other[:, 0].copy(),
+        scales=other[:, 1:4].copy(),
+        quats=other[:, 4:8].copy(),
+    )
+
+
+def _rest_names(count: int) -> list[str]:
+    return [f"f_rest_{index}" for index in range(count)]
+
+
+def _check_shapes(splats: SplatArrays) -> None:
+    count = len(splats.means)
+    shapes = {"means": (count, 3), "opacities": (count,), "scales": (count, 3), "quats": (count, 4)}
+    for name, shape in shapes.items():
+        found = getattr(splats, name).shape
+        if found != shape:
+            raise ValueError(f"{name}: expected shape {shape}, got {found}.")
+    if splats.sh.shape not in [(count, 1 + rest // 3, 3) for rest in REST_COUNTS]:
+        raise ValueError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
+
+
+def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
+    element = PlyElement.describe(rows, "vertex")
+    with atomic_write(path) as temporary:
+        PlyData([element], byte_order="<", comments=list(comments)).write(str(temporary))
+
+
+def _read_vertices(path: str | Path) -> np.ndarray:
+    """The rows of the element ``vertex``, one field for each property."""
+    try:
+        return PlyData.read(str(path))["vertex"].data
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check the path and the iteration.") from error
+    except OSError as error:
+        raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
+    except KeyError as error:
+        raise InputError(f"{path}: expected a PLY file with an element 'vertex', found none.") from error
+    except PlyElementParseError as error:
+        raise InputError(f"{path}: the file is damaged or cut short ({error}); copy or save it again.") from error
+    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: expected a PLY file, found something else ({error}).") from error

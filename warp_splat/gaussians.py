@@ -1,0 +1,83 @@
+"""The trained set: raw parameters as torch leaves, their activations, and how they start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from warp_splat.formats.ply import SplatArrays, load_ply, save_ply
+from warp_splat.kernels.harmonics import C0
+
+INITIAL_OPACITY = 0.1
+SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
+
+
+class GaussianModel:
+    """N Gaussians before activation.
+
+    Attributes:
+        parameters: name -> leaf tensor with N rows: means [N, 3], sh_dc [N, 1, 3], sh_rest [N, K-1, 3], opacities
+            [N] (logits), scales [N, 3] (logarithms), quats [N, 4] (any norm).
+    """
+
+    NAMES = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
+
+    def __init__(self, parameters: dict[str, torch.Tensor]):
+        self.parameters = {name: parameters[name].detach().clone().requires_grad_() for name in self.NAMES}
+
+    def __len__(self) -> int:
+        return len(self.parameters["means"])
+
+    @classmethod
+    def from_points(cls, points: np.ndarray, colors: np.ndarray, sh_degree: int) -> GaussianModel:
+        """Start from points [P, 3] with colors [P, 3] uint8, as the reference does.
+
+        A point becomes a ball as wide as the root mean squared distance to its three nearest neighbors, opacity 0.1.
+        """
+        count = len(points)
+        neighbors = min(4, count)  # the point itself and three others
+        distances = KDTree(points).query(points, k=neighbors)[0].reshape(count, neighbors)[:, 1:]
+        # fewer than four points: no or few neighbors; one unit then
+        squared = np.mean(distances**2, axis=1) if neighbors > 1 else np.ones(count)
+        scales = 0.5 * np.log(np.maximum(squared, SMALLEST_DISTANCE2))
+        tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
+        return cls(
+            {
+                "means": tensor(points),
+                "sh_dc": tensor((colors / 255.0 - 0.5) / C0)[:, None],
+                "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+                "opacities": torch.full((count,), float(np.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)))),
+                "scales": tensor(scales)[:, None].repeat(1, 3),
+                "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+            }
+        )
+
+    def activated(self) -> tuple[torch.Tensor, ...]:
+        """(means, quats, scales, opacities, sh_dc, sh_rest) as the renderer takes them."""
+        raw = self.parameters
+        return (
+            raw["means"],
+            raw["quats"],
+            torch.exp(raw["scales"]),
+            torch.sigmoid(raw["opacities"]),
+            raw["sh_dc"],
+            raw["sh_rest"],
+        )
+
+    def save(self, path: Path, comments: tuple[str, ...] = ()) -> None:
+        """Write a PLY file in the reference's layout."""
+        raw = {name: tensor.detach() for name, tensor in self.parameters.items()}
+        sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
+        arrays = (tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
+        save_ply(path, *arrays, comments=comments)
+
+    @classmethod
+    def load(cls, path: Path) -> GaussianModel:
+        """Read a PLY file. Raises InputError if it is missing or not a file of Gaussians."""
+        splats: SplatArrays = load_ply(path)
+        means, sh, opacities, scales, quats = (torch.from_numpy(np.ascontiguousarray(array)) for array in splats)
+        parameters = {"means": means, "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
+        return cls({**parameters, "opacities": opacities, "scales": scales, "quats": quats})

@@ -1,0 +1,154 @@
+"""From 3D Gaussians to 2D ones: EWA splatting with an affine camera (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5).
+
+With A = J W R S (2 x 3, rows a1, a2; J the Jacobian of the projection at the mean, W the camera's rotation, R S the
+Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLUR. Its determinant is computed as
+
+    |a1 x a2|^2 + e (|a1|^2 + |a2|^2) + e^2,
+
+a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
+"""
+
+import warp as wp
+
+from warp_splat.config import ALPHA_MIN, BLUR, NEAR
+from warp_splat.kernels.harmonics import evaluate_sh
+from warp_splat.kernels.lanes import CPU_FLAGS
+
+wp.set_module_options({"optimization_level": 3, "cpu_compiler_flags": CPU_FLAGS})
+
+CULLED = wp.constant(0)
+INVALID = wp.constant(-1)  # an input of the Gaussian is not finite, or its quaternion is zero
+COMPENSATION_MIN = wp.constant(2.5e-5)  # floor of det / det with blur, as in the reference
+
+
+@wp.struct
+class CameraView:
+    """What the kernels need of a camera and its options."""
+
+    rotation: wp.mat33  # camera_from_world
+    translation: wp.vec3
+    center: wp.vec3  # world
+    focal: wp.vec2  # px
+    principal: wp.vec2  # px
+    size: wp.vec2  # px, (W, H)
+    slope_min: wp.vec2  # clamp of (x/z, y/z) in the Jacobian
+    slope_max: wp.vec2
+    sh_degree: int
+    antialiasing: int
+
+
+@wp.func
+def rotation_matrix(quat: wp.vec4):
+    """Rotation of a quaternion (w, x, y, z) of any norm but 0; scaled first, so that denormals keep their direction."""
+    q = wp.normalize(quat / wp.max(wp.max(wp.abs(quat)), 1.0e-37))
+    w = q[0]
+    x = q[1]
+    y = q[2]
+    z = q[3]
+    return wp.mat33(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@wp.func
+def covers_pixel(mean: float, extent: float, size: float):
+    """Whether a pixel centre of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
+    first = wp.max(wp.ceil(mean - extent - 0.5), 0.0)
+    return first <= wp.min(wp.floor(mean + extent - 0.5), size - 1.0)
+
+
+@wp.kernel
+def project(
+    first: int,  # Gaussian of this slice
+    camera: CameraView,
+    means: wp.array[wp.vec3],  # [N] world
+    quats: wp.array[wp.vec4],  # [N] wxyz, any norm
+    scales: wp.array[wp.vec3],  # [N] world
+    opacities: wp.array[float],  # [N] 0..1
+    sh_dc: wp.array2d[wp.vec3],  # [N, 1]
+    sh_rest: wp.array2d[wp.vec3],  # [N, K - 1]
+    # out: zero where culled, so the caller clears them
+    means2d_out: wp.array[wp.vec2],  # [N] px
+    conics_out: wp.array[wp.vec3],  # [N] 1/px^2, (xx, xy, yy)
+    opacities_out: wp.array[float],  # [N] after antialiasing
+    colors_out: wp.array[wp.vec3],  # [N]
+    depths_out: wp.array[float],  # [N] z in the camera
+    extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= ALPHA_MIN
+    radii_out: wp.array[int],  # [N] px, rounded up; CULLED or INVALID if not drawn
+):
+    i = first + wp.tid()
+    mean = means[i]
+    quat = quats[i]
+    scale = scales[i]
+    opacity = opacities[i]
+    finite = wp.isfinite(mean) and wp.isfinite(quat) and wp.isfinite(scale) and wp.isfinite(opacity)
+    if not finite or wp.max(wp.abs(quat)) == 0.0:
+        radii_out[i] = INVALID
+        return
+    p = camera.rotation * mean + camera.translation
+    z = p[2]
+    if not z > NEAR:
+        return
+    slope = wp.vec2(p[0] / z, p[1] / z)
+    u = wp.clamp(slope[0], camera.slope_min[0], camera.slope_max[0])
+    v = wp.clamp(slope[1], camera.slope_min[1], camera.slope_max[1])
+    toward = wp.vec3(camera.rotation[2, 0], camera.rotation[2, 1], camera.rotation[2, 2])
+    j1 = (camera.focal[0] / z) * (wp.vec3(camera.rotation[0, 0], camera.rotation[0, 1], camera.rotation[0, 2]) - u * toward)
+    j2 = (camera.focal[1] / z) * (wp.vec3(camera.rotation[1, 0], camera.rotation[1, 1], camera.rotation[1, 2]) - v * toward)
+    axes = rotation_matrix(quat)
+    a1 = wp.cw_mul(scale, j1 * axes)
+    a2 = wp.cw_mul(scale, j2 * axes)
+    area = wp.cross(a1, a2)
+    xx = wp.dot(a1, a1)
+    yy = wp.dot(a2, a2)
+    sharp = wp.dot(area, area)
+    det = sharp + BLUR * (xx + yy) + BLUR * BLUR
+    if camera.antialiasing != 0:
+        opacity = opacity * wp.sqrt(wp.max(sharp / det, COMPENSATION_MIN))
+    if not (opacity >= ALPHA_MIN and wp.isfinite(det)):
+        return
+    mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
+    reach = 2.0 * wp.log(opacity / ALPHA_MIN)
+    extent = wp.vec2(wp.sqrt(reach * (xx + BLUR)), wp.sqrt(reach * (yy + BLUR)))
+    if not (covers_pixel(mean2d[0], extent[0], camera.size[0]) and covers_pixel(mean2d[1], extent[1], camera.size[1])):
+        return
+    color = evaluate_sh(camera.sh_degree, wp.normalize(mean - camera.center), sh_dc, sh_rest, i) + wp.vec3(0.5)
+    if not wp.isfinite(color):
+        radii_out[i] = INVALID
+        return
+    means2d_out[i] = mean2d
+    conics_out[i] = wp.vec3(yy + BLUR, -wp.dot(a1, a2), xx + BLUR) / det
+    opacities_out[i] = opacity
+    colors_out[i] = wp.max(color, wp.vec3(0.0))
+    depths_out[i] = z
+    extents_out[i] = extent
+    radii_out[i] = int(wp.min(wp.ceil(wp.max(extent)), 1.0e9))
+
+
+@wp.kernel(enable_backward=False)
+def quarantine(
+    first: int,
+    radii: wp.array[int],  # [N]
+    # out: gradients, cleared where one of a Gaussian's is not finite
+    means_out: wp.array[wp.vec3],
+    quats_out: wp.array[wp.vec4],
+    scales_out: wp.array[wp.vec3],
+    opacities_out: wp.array[float],
+    sh_dc_out: wp.array2d[wp.vec3],
+    sh_rest_out: wp.array2d[wp.vec3],
+    dropped_out: wp.array[int],  # [N] 1 where that happened
+):
+    i = first + wp.tid()
+    if radii[i] > 0:
+        geometry = wp.isfinite(means_out[i]) and wp.isfinite(quats_out[i]) and wp.isfinite(scales_out[i])
+        if not (geometry and wp.isfinite(opacities_out[i]) and wp.isfinite(sh_dc_out[i, 0])):
+            means_out[i] = wp.vec3(0.0)
+            quats_out[i] = wp.vec4(0.0)
+            scales_out[i] = wp.vec3(0.0)
+            opacities_out[i] = 0.0
+            sh_dc_out[i, 0] = wp.vec3(0.0)
+            for k in range(sh_rest_out.shape[1]):
+                sh_rest_out[i, k] = wp.vec3(0.0)
+            dropped_out[i] = 1

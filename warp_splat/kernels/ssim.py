@@ -1,0 +1,167 @@
+"""Structural similarity and its adjoint (Wang et al. 2004), with the reference's window: 11 pixels, sigma 1.5, zeros
+outside the image.
+
+An image is a matrix of rows of interleaved channels; rows are padded by zeros, so that a tap k pixels away lies k
+times ``channels`` floats away and sixteen neighbouring floats fill a register whatever channel they belong to. With
+blur(.) the window, mu1 = blur(x), mu2 = blur(y), E11 = blur(x x), E22 = blur(y y), E12 = blur(x y):
+
+    A = 2 mu1 mu2 + C1            B = 2 (E12 - mu1 mu2) + C2
+    C = mu1^2 + mu2^2 + C1        D = E11 + E22 - mu1^2 - mu2^2 + C2        SSIM = A B / (C D)
+
+    dSSIM/dmu1 = 2 mu2 (B - A) / (C D) - 2 mu1 SSIM (1/C - 1/D),   dSSIM/dE11 = -SSIM / D,   dSSIM/dE12 = 2 A / (C D)
+    dL/dx = blur(dL/dmu1) + 2 x blur(dL/dE11) + y blur(dL/dE12)
+"""
+
+import math
+
+import warp as wp
+
+from warp_splat.kernels.lanes import LANES, MODULE_OPTIONS, fill, over, times, total, vec16, where_less
+
+wp.set_module_options(MODULE_OPTIONS)
+
+WINDOW = 11
+RADIUS = WINDOW // 2
+CHANNELS = 3
+C1 = wp.constant(0.01**2)
+C2 = wp.constant(0.03**2)
+IOTA = wp.constant(vec16(*[float(lane) for lane in range(LANES)]))
+
+_bell = [math.exp(-((tap - RADIUS) ** 2) / (2.0 * 1.5**2)) for tap in range(WINDOW)]
+WEIGHTS = wp.constant(wp.types.vector(length=WINDOW, dtype=float)(*[value / sum(_bell) for value in _bell]))
+
+
+@wp.func
+def inside(values: vec16, start: int, length: int):
+    """``values`` where start + lane < length, else 0: what lies in the padding right of the image."""
+    return where_less(IOTA, vec16(float(length - start)), values, vec16(0.0))
+
+
+@wp.kernel
+def blur_rows(
+    first: int,  # row of this slice
+    x: wp.array2d[vec16],  # [H, P - 15] element p holds floats p .. p + 15 of a padded row
+    y: wp.array2d[vec16],
+    # out
+    moments_out: wp.array3d[vec16],  # [H, 5, G] x, y, x x, y y, x y, blurred along rows
+):
+    row = first + wp.tid()
+    for group in range(moments_out.shape[2]):
+        mx = vec16(0.0)
+        my = vec16(0.0)
+        xx = vec16(0.0)
+        yy = vec16(0.0)
+        xy = vec16(0.0)
+        for tap in range(WINDOW):
+            place = LANES * (group + 1) + CHANNELS * (tap - RADIUS)
+            a = x[row, place]
+            b = y[row, place]
+            wa = a * WEIGHTS[tap]
+            wb = b * WEIGHTS[tap]
+            mx = mx + wa
+            my = my + wb
+            xx = xx + times(wa, a)
+            yy = yy + times(wb, b)
+            xy = xy + times(wa, b)
+        moments_out[row, 0, group] = mx
+        moments_out[row, 1, group] = my
+        moments_out[row, 2, group] = xx
+        moments_out[row, 3, group] = yy
+        moments_out[row, 4, group] = xy
+
+
+@wp.kernel
+def compare(
+    first: int,
+    x: wp.array2d[vec16],  # [H, P - 15]
+    y: wp.array2d[vec16],
+    moments: wp.array3d[vec16],  # [H, 5, G]
+    length: int,  # floats in a row of the image
+    # out
+    sums_out: wp.array2d[float],  # [H, 2] sum of |x - y| and of SSIM over the row
+    slopes_out: wp.array3d[vec16],  # [H, 3, G] dSSIM / dmu1, dE11, dE12; 0 outside the image
+):
+    row = first + wp.tid()
+    height = moments.shape[0]
+    difference = vec16(0.0)
+    similarity = vec16(0.0)
+    one = vec16(1.0)
+    for group in range(moments.shape[2]):
+        mx = vec16(0.0)
+        my = vec16(0.0)
+        xx = vec16(0.0)
+        yy = vec16(0.0)
+        xy = vec16(0.0)
+        for other in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
+            w = WEIGHTS[other - row + RADIUS]
+            mx = mx + moments[other, 0, group] * w
+            my = my + moments[other, 1, group] * w
+            xx = xx + moments[other, 2, group] * w
+            yy = yy + moments[other, 3, group] * w
+            xy = xy + moments[other, 4, group] * w
+        mxy = times(mx, my)
+        squares = times(mx, mx) + times(my, my)
+        a = mxy * 2.0 + fill(C1, mxy)
+        b = (xy - mxy) * 2.0 + fill(C2, mxy)
+        c = over(one, squares + fill(C1, mxy))
+        d = over(one, xx + yy - squares + fill(C2, mxy))
+        scale = times(c, d)
+        ssim = times(times(a, b), scale)
+        start = LANES * group
+        similarity = similarity + inside(ssim, start, length)
+        delta = x[row, start + LANES] - y[row, start + LANES]
+        difference = difference + wp.max(delta, -delta)
+        slope = times(times(my, b - a), scale) - times(times(mx, ssim), c - d)
+        slopes_out[row, 0, group] = inside(slope * 2.0, start, length)
+        slopes_out[row, 1, group] = inside(-times(ssim, d), start, length)
+        slopes_out[row, 2, group] = inside(times(a, scale) * 2.0, start, length)
+    sums_out[row, 0] = total(difference)
+    sums_out[row, 1] = total(similarity)
+
+
+@wp.kernel
+def adj_blur_columns(
+    first: int,
+    slopes: wp.array3d[vec16],  # [H, 3, G]
+    # out
+    slopes_out: wp.array3d[vec16],  # [H, 3, G + 2] blurred along columns, a group of zeros at either end
+):
+    row = first + wp.tid()
+    height = slopes.shape[0]
+    groups = slopes.shape[2]
+    for which in range(3):
+        slopes_out[row, which, 0] = vec16(0.0)
+        slopes_out[row, which, groups + 1] = vec16(0.0)
+        for group in range(groups):
+            blurred = vec16(0.0)
+            for other in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
+                blurred = blurred + slopes[other, which, group] * WEIGHTS[other - row + RADIUS]
+            slopes_out[row, which, group + 1] = blurred
+
+
+@wp.kernel
+def adj_compare(
+    first: int,
+    x: wp.array2d[vec16],  # [H, P - 15]
+    y: wp.array2d[vec16],
+    slopes: wp.array3d[vec16],  # [H, 3, P - 15] blurred along columns
+    adj_l1: float,  # dL / d(sum of |x - y|)
+    adj_ssim: float,  # dL / d(sum of SSIM)
+    # out
+    adj_x_out: wp.array2d[vec16],  # [H, G]
+):
+    row = first + wp.tid()
+    for group in range(adj_x_out.shape[1]):
+        dmu = vec16(0.0)
+        dxx = vec16(0.0)
+        dxy = vec16(0.0)
+        for tap in range(WINDOW):
+            place = LANES * (group + 1) + CHANNELS * (tap - RADIUS)
+            dmu = dmu + slopes[row, 0, place] * WEIGHTS[tap]
+            dxx = dxx + slopes[row, 1, place] * WEIGHTS[tap]
+            dxy = dxy + slopes[row, 2, place] * WEIGHTS[tap]
+        a = x[row, LANES * (group + 1)]
+        b = y[row, LANES * (group + 1)]
+        zero = vec16(0.0)
+        sign = where_less(b, a, vec16(1.0), where_less(a, b, vec16(-1.0), zero))
+        adj_x_out[row, group] = sign * adj_l1 + (dmu + times(a, dxx) * 2.0 + times(b, dxy)) * adj_ssim

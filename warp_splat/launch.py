@@ -1,0 +1,115 @@
+"""The only place that calls ``wp.launch``: threads, slices, timers, and views of torch tensors.
+
+A Warp launch on the CPU runs on the thread that makes it and releases the interpreter's lock. Every kernel here takes
+the first index of its slice, so that a pool of threads can share a launch. A kernel writes each element from one
+index only; hence the result does not depend on the slices, bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import torch
+import warp as wp
+
+from warp_splat.errors import InputError
+
+SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
+
+_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+_pool: ThreadPoolExecutor | None = None
+_seconds: dict[str, float] | None = None
+
+
+def get_threads() -> int:
+    """Number of threads that a CPU launch may use."""
+    return _threads
+
+
+def set_threads(count: int) -> None:
+    """Use ``count`` threads (at least 1) for CPU launches. Results do not depend on it.
+
+    Raises:
+        InputError: if ``count`` is below 1.
+    """
+    global _threads, _pool
+    if count < 1:
+        raise InputError(f"threads: expected at least 1, got {count}.")
+    if count != _threads:
+        if _pool is not None:
+            _pool.shutdown()
+        _threads, _pool = count, None
+
+
+def even_slices(dim: int) -> list[int]:
+    """Bounds of one slice per thread of ``dim`` equal pieces of work."""
+    parts = max(1, min(_threads, dim // SMALLEST_SLICE))
+    return [dim * part // parts for part in range(parts + 1)]
+
+
+def launch(kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Sequence = (), *, bounds: list[int] | None = None, **adjoint):
+    """Launch ``kernel`` on ``dim`` indices, sliced over the threads.
+
+    Args:
+        kernel: takes the first index of its slice before ``inputs``.
+        dim: number of indices; nothing happens for 0.
+        inputs: Warp arrays, :func:`view` results, structs or scalars.
+        outputs: likewise.
+        bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
+        adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
+    """
+    if dim == 0:
+        return
+    bounds = bounds or even_slices(dim)
+    slices = iter([(low, high) for low, high in zip(bounds, bounds[1:], strict=False) if high > low])
+    if adjoint:
+        adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
+
+    def work():
+        for low, high in slices:  # shared by the threads: whoever is free takes the next one
+            wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
+
+    helpers = min(_threads, len(bounds) - 1) - 1
+    if helpers <= 0:
+        work()
+        return
+    global _pool
+    if _pool is None:
+        _pool = ThreadPoolExecutor(_threads - 1, thread_name_prefix="warp_splat")
+    wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
+    futures = [_pool.submit(work) for _ in range(helpers)]
+    work()
+    for future in futures:
+        future.result()
+
+
+def view(tensor: torch.Tensor, dtype):
+    """``tensor`` as a kernel argument of element type ``dtype``, without a copy. The caller keeps the tensor alive."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Add the block's time to stage ``name``, if :func:`profile` is on."""
+    if _seconds is None:
+        yield
+        return
+    start = time.perf_counter()
+    yield
+    _seconds[name] += time.perf_counter() - start
+
+
+@contextmanager
+def profile() -> Iterator[dict[str, float]]:
+    """Collect the seconds spent in each :func:`stage` while the block runs."""
+    global _seconds
+    _seconds = defaultdict(float)
+    try:
+        yield _seconds
+    finally:
+        _seconds = None

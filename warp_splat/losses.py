@@ -1,0 +1,99 @@
+"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM), one pass over the rows of two images."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warp_splat.errors import InputError
+from warp_splat.kernels import ssim
+from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.launch import launch, stage, view
+
+ROWS_PER_SLICE = 16
+
+
+def image_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 0.2) -> torch.Tensor:
+    """(1 - lambda) mean |image - target| + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), a scalar.
+
+    Args:
+        image: [H, W, 3] float32, differentiable.
+        target: [H, W, 3] float32, or uint8 to be divided by 255.
+        lambda_dssim: share of the structural term, 0..1.
+
+    Raises:
+        InputError: if the shapes differ or are not [H, W, 3].
+    """
+    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS:
+        raise InputError(
+            f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
+        )
+    return ImageLoss.apply(image, target, lambda_dssim)
+
+
+class ImageLoss(torch.autograd.Function):
+    """See :func:`image_loss`."""
+
+    @staticmethod
+    def forward(ctx, image, target, lambda_dssim):
+        with stage("loss"):
+            height, length = image.shape[0], image.shape[1] * image.shape[2]
+            groups = -(-length // LANES)
+            x, y = _pad(image, groups), _pad(target, groups)
+            if target.dtype == torch.uint8:
+                y /= 255.0
+            moments, slopes = torch.empty(height, 5, groups, LANES), torch.empty(height, 3, groups, LANES)
+            sums = torch.empty(height, 2)
+            bounds = _row_slices(height)
+            launch(ssim.blur_rows, height, [_taps(x), _taps(y)], [view(moments, vec16)], bounds=bounds)
+            launch(
+                ssim.compare,
+                height,
+                [_taps(x), _taps(y), view(moments, vec16), length],
+                [view(sums, wp.float32), view(slopes, vec16)],
+                bounds=bounds,
+            )
+            l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
+            ctx.save_for_backward(x, y, slopes)
+            ctx.shape, ctx.lambda_dssim = image.shape, lambda_dssim
+            return torch.tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx, adj_loss):
+        with stage("adjoint of loss"):
+            x, y, slopes = ctx.saved_tensors
+            height, groups = x.shape[0], slopes.shape[2]
+            scale = adj_loss.item() / ctx.shape.numel()
+            blurred = torch.empty(height, 3, groups + 2, LANES)
+            adj = torch.empty(height, groups, LANES)
+            bounds = _row_slices(height)
+            launch(ssim.adj_blur_columns, height, [view(slopes, vec16)], [view(blurred, vec16)], bounds=bounds)
+            weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
+            launch(
+                ssim.adj_compare,
+                height,
+                [_taps(x), _taps(y), _taps(blurred.view(height, 3, -1)), *weights],
+                [view(adj, vec16)],
+                bounds=bounds,
+            )
+            length = ctx.shape[1] * ctx.shape[2]
+            return adj.view(height, -1)[:, :length].reshape(ctx.shape), None, None
+
+
+def _pad(image: torch.Tensor, groups: int) -> torch.Tensor:
+    """Rows of the image as float32 in [H, P], a group of zeros at either end."""
+    height, length = image.shape[0], image.shape[1] * image.shape[2]
+    padded = torch.zeros(height, (groups + 2) * LANES)
+    padded[:, LANES : LANES + length] = image.detach().reshape(height, length)
+    return padded
+
+
+def _taps(rows: torch.Tensor) -> wp.array:
+    """[..., P] floats as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbours."""
+    shape = (*rows.shape[:-1], rows.shape[-1] - LANES + 1)
+    strides = tuple(4 * stride for stride in rows.stride())
+    return wp.array(ptr=rows.data_ptr(), dtype=vec16, shape=shape, strides=strides, device="cpu", copy=False)
+
+
+def _row_slices(height: int) -> list[int]:
+    return [*range(0, height, ROWS_PER_SLICE), height]

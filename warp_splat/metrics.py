@@ -1,0 +1,155 @@
+"""How close renders are to photographs: PSNR and SSIM of 8-bit images, and the files they are kept in.
+
+Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import correlate1d
+
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.png import load_png
+
+# Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
+RADIUS, SIGMA = 5, 1.5
+C1, C2 = 1e-4, 9e-4
+WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
+WINDOW /= WINDOW.sum()
+
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB, over all pixels and channels at once; infinite for equal images.
+
+    Args:
+        image: [H, W, 3] uint8.
+        reference: [H, W, 3] uint8.
+
+    Raises:
+        ValueError: if the shapes differ or the type is not uint8.
+    """
+    image, reference = _unit_images(image, reference)
+    error = np.mean((image - reference) ** 2)
+    return float(-10 * np.log10(error)) if error > 0 else math.inf
+
+
+def ssim(image: np.ndarray, reference: np.ndarray) -> float:
+    """Structural similarity (Wang et al. 2004, eq. 13) with zeros outside the image; mean over pixels and channels.
+
+    Args:
+        image: [H, W, 3] uint8.
+        reference: [H, W, 3] uint8.
+
+    Raises:
+        ValueError: if the shapes differ or the type is not uint8.
+    """
+    x, y = _unit_images(image, reference)
+    mean_x, mean_y = _blur(x), _blur(y)
+    var_x, var_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2
+    covariance = _blur(x * y) - mean_x * mean_y
+    similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    return float(np.mean(similarity / ((mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2))))
+
+
+def evaluate_folder(folder_split: Path) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+    """Compare ``renders/*.png`` with ``gt/*.png`` of the same name.
+
+    Args:
+        folder_split: such as ``<model>/test/ours_30000``.
+
+    Returns:
+        The mean over the images of each metric, ``{"SSIM": ..., "PSNR": ...}``, and the values for each image,
+        ``{"SSIM": {"00000.png": ...}, "PSNR": {...}}``. PSNR is infinite if the images are equal.
+
+    Raises:
+        InputError: if there are no renders, an image has no partner, or their sizes differ.
+    """
+    folder_split = Path(folder_split)
+    names = [sorted(path.name for path in (folder_split / folder).glob("*.png")) for folder in ("renders", "gt")]
+    if not names[0] or names[0] != names[1]:
+        raise InputError(
+            f"{folder_split}: expected the same PNG files in renders and gt, found {len(names[0])} and "
+            f"{len(names[1])}; render the views again."
+        )
+    per_view: dict[str, dict[str, float]] = {"SSIM": {}, "PSNR": {}}
+    for name in names[0]:
+        image, reference = load_png(folder_split / "renders" / name), load_png(folder_split / "gt" / name)
+        if image.shape != reference.shape:
+            raise InputError(
+                f"{folder_split / 'renders' / name}: expected the size of gt/{name}, "
+                f"{reference.shape[1]}x{reference.shape[0]}, found {image.shape[1]}x{image.shape[0]}."
+            )
+        per_view["SSIM"][name] = ssim(image, reference)
+        per_view["PSNR"][name] = psnr(image, reference)
+    return {metric: sum(values.values()) / len(values) for metric, values in per_view.items()}, per_view
+
+
+def write_results(
+    model_folder: str | Path,
+    iteration: int,
+    means: Mapping[str, float],
+    per_view: Mapping[str, Mapping[str, float]],
+    extra: Mapping[str, float | int | str] | None = None,
+) -> None:
+    """Put the metrics of one iteration into ``results.json`` and ``per_view.json``, under ``ours_<iteration>``.
+
+    The entry of this iteration is replaced, those of others stay. JSON has no infinity: a value that is not finite,
+    such as the PSNR of equal images, is written as ``null``.
+
+    Args:
+        model_folder: the model folder.
+        iteration: the iteration that was rendered.
+        means: means of each metric, as :func:`evaluate_folder` returns them.
+        per_view: values of each metric for each image.
+        extra: more to keep in ``results.json`` beside the means: number of Gaussians, seconds, iterations per second.
+
+    Raises:
+        InputError: if an older file is not a JSON object (it is left alone), or a file cannot be written.
+    """
+    _merge(Path(model_folder) / "results.json", f"ours_{iteration}", {**means, **(extra or {})})
+    _merge(Path(model_folder) / "per_view.json", f"ours_{iteration}", per_view)
+
+
+def _merge(path: Path, key: str, entry: Mapping[str, object]) -> None:
+    entries = _read_object(path) if path.exists() else {}
+    entries[key] = _without_infinities(entry)
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(entries, indent=1, allow_nan=False), encoding="utf-8")
+
+
+def _read_object(path: Path) -> dict[str, object]:
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: could not be read as JSON ({error}); move it away and run again.") from error
+    if not isinstance(entries, dict):
+        raise InputError(f"{path}: expected a JSON object with entries ours_N; move it away and run again.")
+    return _without_infinities(entries)  # the reference writes the PSNR of equal images as Infinity
+
+
+def _without_infinities(value):
+    if isinstance(value, Mapping):
+        return {key: _without_infinities(item) for key, item in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _blur(image: np.ndarray) -> np.ndarray:
+    """Weighted mean over the window around each pixel, with zeros outside the image."""
+    rows = correlate1d(image, WINDOW, axis=0, mode="constant")
+    return correlate1d(rows, WINDOW, axis=1, mode="constant")
+
+
+def _unit_images(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both images in float64, 0..1."""
+    for array in (image, reference):
+        if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
+            raise ValueError(f"image: expected (H, W, 3) uint8, got {array.shape} {array.dtype}.")
+    if image.shape != reference.shape:
+        raise ValueError(f"image: expected the shape of the reference, {reference.shape}, got {image.shape}.")
+    return image / 255.0, reference / 255.0

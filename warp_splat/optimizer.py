@@ -1,0 +1,100 @@
+"""Adam over the Gaussians' parameters, and its moments through every change of the set."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import warp as wp
+
+from warp_splat.config import TrainConfig
+from warp_splat.gaussians import GaussianModel
+from warp_splat.kernels.adam import adam_rows
+from warp_splat.launch import launch, view
+
+EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+class Optimizer:
+    """torch's Adam with one group per parameter, or its sparse variant.
+
+    Args:
+        model: whose parameters are updated in place.
+        config: rates and ``optimizer_type``.
+        extent: size of the scene, world units; the means' rate is relative to it.
+    """
+
+    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float):
+        rates = {
+            "means": config.position_lr_init * extent,
+            "sh_dc": config.feature_lr,
+            "sh_rest": config.feature_lr / 20.0,
+            "opacities": config.opacity_lr,
+            "scales": config.scaling_lr,
+            "quats": config.rotation_lr,
+        }
+        self.model, self.config, self.extent = model, config, extent
+        groups = [{"name": name, "params": [model.parameters[name]], "lr": rate} for name, rate in rates.items()]
+        self.adam = torch.optim.Adam(groups, lr=0.0, eps=EPS, fused=True)
+        self._groups = {group["name"]: group for group in self.adam.param_groups}
+
+    def set_iteration(self, iteration: int) -> None:
+        """Set the rate of the means for this step: log-linear from init to final over position_lr_max_steps."""
+        config = self.config
+        share = min(iteration / config.position_lr_max_steps, 1.0)
+        rate = math.exp((1 - share) * math.log(config.position_lr_init) + share * math.log(config.position_lr_final))
+        self._groups["means"]["lr"] = rate * self.extent
+
+    def step(self, radii: torch.Tensor) -> None:
+        """Update from the gradients and clear them; ``radii`` [N] int32 tells what the image showed (0: not)."""
+        if self.config.optimizer_type == "sparse_adam":
+            for group in self.adam.param_groups:
+                self._sparse_step(group, radii)
+        else:
+            self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
+
+    def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
+        """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
+        parameter = group["params"][0]
+        if parameter.grad is None or parameter.numel() == 0:
+            return
+        state = self.adam.state[parameter]
+        if not state:
+            state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=torch.tensor(0.0))
+        tables = [tensor.detach().view(len(radii), -1) for tensor in (parameter, *(state[name] for name in MOMENTS))]
+        grad = parameter.grad.reshape(len(radii), -1)
+        launch(
+            adam_rows,
+            len(radii),
+            [view(radii, wp.int32), view(grad, wp.float32), group["lr"], *group["betas"], group["eps"]],
+            [view(table, wp.float32) for table in tables],
+        )
+
+    def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
+        """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""
+        for name in self.model.NAMES:
+            old = self.model.parameters[name]
+            self._swap(name, torch.cat([old.detach()[kept], added[name]]))
+            state = self.adam.state.get(self.model.parameters[name], {})
+            for moment in MOMENTS:
+                if moment in state:
+                    state[moment] = torch.cat([state[moment][kept], torch.zeros_like(added[name])])
+
+    def reset_opacities(self, ceiling: float) -> None:
+        """Lower every opacity to at most ``ceiling`` and forget its moments."""
+        logits = self.model.parameters["opacities"].detach()
+        self._swap("opacities", logits.clamp_max(math.log(ceiling / (1.0 - ceiling))))
+        state = self.adam.state.get(self.model.parameters["opacities"], {})
+        for moment in MOMENTS:
+            if moment in state:
+                state[moment] = torch.zeros_like(state[moment])
+
+    def _swap(self, name: str, values: torch.Tensor) -> None:
+        """Put a new leaf, without a gradient, in the place of a parameter; its state moves along."""
+        old, new = self.model.parameters[name], values.requires_grad_()
+        self.model.parameters[name] = new
+        self._groups[name]["params"][0] = new
+        if old in self.adam.state:
+            self.adam.state[new] = self.adam.state.pop(old)

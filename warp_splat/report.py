@@ -1,0 +1,227 @@
+"""Pictures and tables of a result: views beside photographs, training curves, time by stage.
+
+Colours are those of Okabe and Ito (2008), which people with colour vision deficiencies can tell apart.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warp_splat.formats.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
+INK, FAINT = "#222222", "#d9d9d9"
+DPI = 200  # sharp on dense displays at the width of a README, about 850 px
+WIDTH = 8.0  # inches
+DIFFERENCE_GAIN = 4  # a difference of a quarter of the range is white
+NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
+
+
+def contact_sheet(
+    path: str | Path, rows: Sequence[tuple[str, np.ndarray, np.ndarray, float]], columns: int = 1
+) -> None:
+    """Draw views as photograph, render and their absolute difference, 1600 pixels wide.
+
+    The difference is the mean over the channels, amplified fourfold; black means equal.
+
+    Args:
+        path: the PNG file to write.
+        rows: for each view its name, photograph and render, [H, W, 3] uint8 of one size, and PSNR in dB.
+        columns: views side by side; more than one suits portrait photographs.
+
+    Raises:
+        ValueError: if there are no views, or a photograph and its render differ in size.
+        InputError: if the file cannot be written.
+    """
+    if not rows:
+        raise ValueError("rows: expected at least one view, got none.")
+    views = [(name, photo, render, _difference(photo, render), psnr) for name, photo, render, psnr in rows]
+    lines = [views[start : start + columns] for start in range(0, len(views), columns)]
+    margin, gap, text, heading = 0.1, 0.04, 0.22, 0.26  # inches
+    cell = (WIDTH - 2 * margin - (columns - 1) * 2 * gap) / (3 * columns)
+    heights = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) * (cell - gap) for line in lines]
+    figure = _figure(WIDTH, heading + sum(heights) + len(lines) * (text + gap) + margin)
+    top = figure.get_figheight() - heading
+    for line, height in zip(lines, heights, strict=True):
+        top -= text + height
+        for column, (name, photo, render, difference, psnr) in enumerate(line):
+            left = margin + column * (3 * cell + 2 * gap)
+            titles = (_shorten(name, cell), f"{psnr:.2f} dB", "")
+            for place, (picture, title) in enumerate(zip((photo, render, difference), titles, strict=True)):
+                _place_picture(figure, (left + place * cell, top, cell - gap, height), picture, title)
+        top -= gap
+    for column in range(min(columns, len(views))):
+        for place, title in enumerate(("photograph", "render", f"{DIFFERENCE_GAIN} x difference")):
+            x = margin + column * (3 * cell + 2 * gap) + place * cell
+            y = figure.get_figheight() - heading + 0.04
+            figure.text(x / WIDTH, y / figure.get_figheight(), title, fontsize=9, fontweight="bold", color=INK)
+    _save(figure, path)
+
+
+def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
+    """Draw loss, test PSNR and number of Gaussians over the iterations, a panel for each that was recorded.
+
+    Args:
+        path: the PNG file to write.
+        history: records with ``iteration`` and any of ``loss``, ``psnr`` [dB] and ``gaussians``, in order.
+
+    Raises:
+        ValueError: if nothing was recorded.
+        InputError: if the file cannot be written.
+    """
+    panels = (("loss", "loss", BLUE), ("psnr", "test PSNR [dB]", ORANGE), ("gaussians", "Gaussians", GREEN))
+    series = {key: [(record["iteration"], record[key]) for record in history if key in record] for key, *_ in panels}
+    drawn = [panel for panel in panels if series[panel[0]]]
+    if not drawn:
+        raise ValueError("history: expected records with loss, psnr or gaussians, got none.")
+    figure = _figure(WIDTH, 2.5, layout="constrained")
+    all_axes = figure.subplots(1, len(drawn), squeeze=False)[0]
+    for axes, (key, title, color) in zip(all_axes, drawn, strict=True):
+        iterations, values = np.array(series[key], dtype=np.float64).T
+        _plain_axes(axes, title)
+        if key == "loss":
+            axes.plot(iterations, values, color=color, linewidth=0.6, alpha=0.25)
+            values = _smooth(values)
+        axes.plot(iterations, values, color=color, linewidth=1.8, marker="o" if key == "psnr" else "", markersize=4)
+        if key == "psnr":
+            _label(axes, (iterations[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
+        else:
+            axes.set_ylim(bottom=0)
+        axes.set_xlabel("iteration", fontsize=9)
+        axes.yaxis.set_major_formatter(_thousands)
+        axes.xaxis.set_major_formatter(_thousands)
+    _save(figure, path)
+
+
+def plot_profile(path: str | Path, stages: Mapping[str, float]) -> None:
+    """Draw the time of each stage as a bar with its share of the whole.
+
+    Args:
+        path: the PNG file to write.
+        stages: milliseconds of each stage, in the order of the data flow, which becomes the order of the bars.
+
+    Raises:
+        ValueError: if there are no stages.
+        InputError: if the file cannot be written.
+    """
+    if not stages:
+        raise ValueError("stages: expected at least one, got none.")
+    times = np.array(list(stages.values()), dtype=np.float64)
+    total = times.sum()
+    figure = _figure(WIDTH, 0.7 + 0.28 * len(times), layout="constrained")
+    axes = figure.subplots()
+    _plain_axes(axes, f"time by stage, {total:.3g} ms in all")
+    axes.grid(False)
+    axes.barh(list(stages), times, color=BLUE, height=0.7)
+    for row, time in enumerate(times):
+        share = 100 * time / total if total > 0 else 0.0
+        _label(axes, (time, row), f"{time:.3g} ms  ({share:.0f} %)", (4, -3), "left")
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.2 * max(times.max(), 1e-9))
+    axes.set_xticks([])
+    axes.spines["bottom"].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    _save(figure, path)
+
+
+def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table that reads well in a terminal and is Markdown: columns padded, columns of numbers to the right.
+
+    Args:
+        headers: one for each column.
+        rows: cells, written by ``str``; the first column is always text.
+
+    Raises:
+        ValueError: if a row has another length than the headers.
+    """
+    table = [[str(cell).replace("|", "\\|") for cell in row] for row in (headers, *rows)]
+    if any(len(row) != len(headers) for row in table):
+        raise ValueError(f"rows: expected {len(headers)} cells each, got {sorted({len(row) for row in table})}.")
+    widths = [max(3, *(len(cell) for cell in column)) for column in zip(*table, strict=True)]
+    right = [
+        index > 0 and all(NUMBER.fullmatch(cell) for cell in column[1:])
+        for index, column in enumerate(zip(*table, strict=True))
+    ]
+    rule = ["-" * (width - 1) + (":" if to_right else "-") for width, to_right in zip(widths, right, strict=True)]
+    lines = [
+        [
+            f"{cell:>{width}}" if to_right else f"{cell:<{width}}"
+            for cell, width, to_right in zip(row, widths, right, strict=True)
+        ]
+        for row in (table[0], rule, *table[1:])
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
+    """[H, W] uint8: mean absolute difference of the channels, amplified and cut at white."""
+    if photo.shape != render.shape:
+        raise ValueError(f"rows: expected a render of shape {photo.shape}, got {render.shape}.")
+    difference = np.abs(photo.astype(np.float64) - render).mean(axis=2)
+    return np.minimum(DIFFERENCE_GAIN * difference, 255).astype(np.uint8)
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Running mean over a twentieth of the values, centred, and narrower at the ends."""
+    half = len(values) // 40
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(len(values))
+    reach = np.minimum(half, np.minimum(index, len(values) - 1 - index))
+    return (sums[index + reach + 1] - sums[index - reach]) / (2 * reach + 1)
+
+
+def _figure(width: float, height: float, layout: str | None = None) -> Figure:
+    """An empty figure in inches that belongs to no pyplot state and needs no display."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
+
+    return Figure(figsize=(width, height), dpi=DPI, layout=layout, facecolor="white")
+
+
+def _save(figure: Figure, path: str | Path) -> None:
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _place_picture(figure: Figure, box: tuple[float, float, float, float], picture: np.ndarray, title: str) -> None:
+    """Show ``picture`` in ``box`` = (left, bottom, width, height) [inches], with a title above its left edge."""
+    width, height = figure.get_size_inches()
+    axes = figure.add_axes((box[0] / width, box[1] / height, box[2] / width, box[3] / height))
+    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, anchor="NW")
+    axes.set_axis_off()
+    axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5)
+
+
+def _shorten(name: str, inches: float) -> str:
+    """The end of a name that is too long for its cell: views of one scene differ there."""
+    letters = int(inches * 15)  # of 8 points, about 1/15 inch each
+    return name if len(name) <= letters else "…" + name[1 - letters :]
+
+
+def _plain_axes(axes: Axes, title: str) -> None:
+    axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(labelsize=9, labelcolor=INK, color=FAINT)
+    axes.grid(axis="y", color=FAINT, linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def _label(axes: Axes, at: tuple[float, float], text: str, offset: tuple[float, float], align: str) -> None:
+    """Write ``text`` beside a point, ``offset`` in points of type."""
+    axes.annotate(text, at, offset, textcoords="offset points", ha=align, fontsize=9, color=INK)
+
+
+def _thousands(value: float, _position: int) -> str:
+    """1500 as 1.5k, 2e6 as 2M, small numbers as they are."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= size:
+            return f"{value / size:.3g}{letter}"
+    return f"{value:.3g}"

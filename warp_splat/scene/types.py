@@ -1,0 +1,33 @@
+"""What a loaded scene is: cameras with their photographs, and sparse points."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_splat.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph and the camera that took it."""
+
+    name: str  # as in the scene's files, with sub-folder and extension
+    camera: Camera  # scaled to `image`
+    image: np.ndarray  # [H, W, 3] uint8, alpha already composited on the background
+    original: Camera  # before the resize of `-r` (after undistortion)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views to train on, views held out, and the points to start from."""
+
+    train: list[View]
+    test: list[View]
+    points: np.ndarray  # [P, 3] float32, world coordinates
+    colors: np.ndarray  # [P, 3] uint8
+
+    @property
+    def extent(self) -> float:
+        """1.1 x the largest distance of a training camera's centre from their mean (the reference's getNerfppNorm)."""
+        centers = np.stack([view.camera.center for view in self.train])
+        return float(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())

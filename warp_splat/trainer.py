@@ -1,0 +1,104 @@
+"""One training step after another: sample a view, render, compare, adapt. No files, no printing."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions, TrainConfig
+from warp_splat.densify import Densifier
+from warp_splat.gaussians import GaussianModel
+from warp_splat.launch import stage
+from warp_splat.losses import image_loss
+from warp_splat.metrics import psnr
+from warp_splat.optimizer import Optimizer
+from warp_splat.rasterize import render
+from warp_splat.scene.types import Scene, View
+
+
+@dataclass
+class Quarantine:
+    """What was kept from spreading, counted over the run."""
+
+    pixels: int = 0  # with an upstream gradient that was not finite
+    gradients: int = 0  # of Gaussians, not finite: no update in that step
+    gaussians: int = 0  # left out of an image because a parameter was not finite (once per image)
+
+
+class Trainer:
+    """The reference's training (Kerbl et al. 2023) on one scene.
+
+    Args:
+        scene: views and points.
+        config: options.
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig):
+        # one thread: torch's elementwise work here is bound by memory (Adam on 200k Gaussians: 6.7 ms against 5.7 ms
+        # with two), its sums would depend on the number of threads, and its idle threads would spin beside ours
+        torch.set_num_threads(1)
+        self.scene, self.config = scene, config
+        extent = scene.extent
+        self.model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
+        self.optimizer = Optimizer(self.model, config, extent)
+        self.densifier = Densifier(self.model, self.optimizer, config, extent)
+        self.quarantine = Quarantine()
+        self.background = torch.full((3,), float(config.white_background))
+        self.degree = 0
+        self._views_random = random.Random(config.seed)
+        self._background_random = torch.Generator().manual_seed(config.seed)
+        self._deck: list[View] = []
+
+    def step(self, iteration: int) -> float:
+        """Train on one view; returns the loss. Iterations count from 1."""
+        config = self.config
+        self.optimizer.set_iteration(iteration)
+        self.degree = min(iteration // config.sh_interval, config.sh_degree)
+        view = self._next_view()
+        background = self.background
+        if config.random_background:
+            background = torch.rand(3, generator=self._background_random)
+        out = self._render(view.camera, background)
+        out.means2d.retain_grad()
+        loss = image_loss(out.image, torch.from_numpy(view.image), config.lambda_dssim)
+        loss.backward()
+        self.quarantine.pixels += out.dropped.pixels
+        self.quarantine.gradients += out.dropped.gaussians
+        self.quarantine.gaussians += out.invalid
+        with stage("densify"):
+            if iteration < config.densify_until_iter:
+                self.densifier.observe(out, view.camera.width, view.camera.height)
+            changed = self.densifier.update(iteration)
+        with stage("Adam"):
+            # a new set has no gradients yet; the reference skips the last step, too
+            if changed is None and iteration < config.iterations:
+                self.optimizer.step(out.radii)
+        return loss.item()
+
+    def _next_view(self) -> View:
+        """Views in random order, each once before any comes again."""
+        if not self._deck:
+            self._deck = list(self.scene.train)
+        return self._deck.pop(self._views_random.randrange(len(self._deck)))
+
+    def _render(self, camera: Camera, background: torch.Tensor):
+        options = RasterOptions(sh_degree=self.degree, antialiasing=self.config.antialiasing)
+        return render(self.model.activated(), camera, background, options)
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """The present model seen by ``camera``, [H, W, 3] uint8."""
+        with torch.no_grad():
+            return to_bytes(self._render(camera, self.background).image)
+
+    def evaluate(self, views: list[View]) -> float:
+        """Mean PSNR [dB] of 8-bit renders against the photographs."""
+        return float(np.mean([psnr(self.picture(view.camera), view.image) for view in views]))
+
+
+def to_bytes(image: torch.Tensor) -> np.ndarray:
+    """[H, W, 3] float image, clamped to 0..1, as uint8."""
+    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
