@@ -22,8 +22,8 @@ SIZE = (264, 248)  # width, height [px]; not multiples of a tile
 FOCAL = (291.0, 288.0)  # fx, fy [px]
 CENTER = (130.6, 125.3)  # cx, cy [px]
 TARGET = (0.02, 0.06, 0.24)
-POINTS = 5000
-MAX_TRACK = 7  # observations kept per point, to keep the model small
+POINTS = 4500
+MAX_TRACK = 6  # observations kept per point, to keep the model small
 NOISE = 0.0015  # standard deviation of a point, as a share of its distance
 SEED = 7
 

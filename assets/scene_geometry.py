@@ -1,8 +1,8 @@
 """The still life as triangles: a laid table in the middle of a furnished room.
 
-Every part is a parametric patch ``(u, v) in [0, 1]^2 -> point`` sampled on a grid, so one function makes spheres, lathed
-shapes, tubes and walls, together with their normals and texture coordinates. World axes: z up, table top at z = 0,
-lengths in units of about one metre.
+Every part is a parametric patch ``(u, v) in [0, 1]^2 -> point`` sampled on a grid, so one function makes spheres,
+lathed shapes, tubes and walls, together with their normals and texture coordinates. World axes: z up, table top at
+z = 0. The room is ten units wide, the table 2.6.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,12 @@ def patch(material: Material, position: Callable, nu: int, nv: int, seed: float 
 
 def place(part: Patch, offset=(0, 0, 0), yaw: float = 0.0, pitch: float = 0.0) -> Patch:
     """Turn by ``pitch`` about x, then by ``yaw`` about z [degrees], then move."""
-    cy, sy, cp, sp = np.cos(np.radians(yaw)), np.sin(np.radians(yaw)), np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
+    cy, sy, cp, sp = (
+        np.cos(np.radians(yaw)),
+        np.sin(np.radians(yaw)),
+        np.cos(np.radians(pitch)),
+        np.sin(np.radians(pitch)),
+    )
     turn = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
     return part._replace(points=part.points @ turn.T + np.array(offset, float), normals=part.normals @ turn.T)
 
@@ -73,7 +78,9 @@ def lathe(material: Material, profile, nu: int, nv: int, seed=0.0, flute=0.0, tw
 
 
 def sphere(material: Material, radius: float, n: int = 32, seed: float = 0.0, coords=None) -> Patch:
-    return lathe(material, lambda v: (radius * np.sin(np.pi * v), -radius * np.cos(np.pi * v)), 2 * n, n, seed, coords=coords)
+    return lathe(
+        material, lambda v: (radius * np.sin(np.pi * v), -radius * np.cos(np.pi * v)), 2 * n, n, seed, coords=coords
+    )
 
 
 def tube(material: Material, path, radius: float, along: int, around: int, reference=(0, 0, 1), seed=0.0) -> Patch:
@@ -99,7 +106,9 @@ def rod(material: Material, start, end, radius: float, around: int = 6) -> Patch
     return tube(material, lambda t: start + t[..., None] * (end - start), radius, 1, around, reference)
 
 
-def plane(material: Material, origin, edge_u, edge_v, n: int = 1, scale=(1.0, 1.0), shift=(0.0, 0.0), seed=0.0) -> Patch:
+def plane(
+    material: Material, origin, edge_u, edge_v, n: int = 1, scale=(1.0, 1.0), shift=(0.0, 0.0), seed=0.0
+) -> Patch:
     """A parallelogram; texture coordinates run from ``shift`` to ``shift + scale``."""
     origin, edge_u, edge_v = (np.array(x, float) for x in (origin, edge_u, edge_v))
 
@@ -141,13 +150,18 @@ def room() -> list[Patch]:
     width, height = 2 * ROOM, CEILING - FLOOR
     floor = plane(Material.FLOOR, (-ROOM, -ROOM, FLOOR), (width, 0, 0), (0, width, 0), 64, (width, width))
     ceiling = plane(Material.CEILING, (-ROOM, ROOM, CEILING), (width, 0, 0), (0, -width, 0), 4)
-    rug = lathe(Material.RUG, lambda v: (2.3 * (1 - v), np.full_like(v, FLOOR + 0.01)), 96, 24, coords=lambda u, v: _polar(2.3 * (1 - v), TAU * u, 0.0))
+    rug = lathe(
+        Material.RUG,
+        lambda v: (2.3 * (1 - v), np.full_like(v, FLOOR + 0.01)),
+        96,
+        24,
+        coords=lambda u, v: _polar(2.3 * (1 - v), TAU * u, 0.0),
+    )
     parts = [floor, ceiling, rug]
     for side in range(4):
         wall = [plane(Material.WALL, (-ROOM, ROOM, FLOOR), (width, 0, 0), (0, 0, height), 32, (width, height))]
-        for x, z, w, h in ((-3.6, 0.1, 2.0, 1.5), (-0.9, -0.1, 1.5, 2.0), (1.4, 0.1, 2.2, 1.6)):
-            seed = 10.0 * side + x
-            wall += picture(x, z, w, h, seed)
+        for k, frame in enumerate(((-3.6, 0.1, 2.0, 1.5), (-0.9, -0.1, 1.5, 2.0), (1.4, 0.1, 2.2, 1.6))):
+            wall += picture(*frame, seed=3.0 * side + k)
         parts += [place(p, yaw=90.0 * side) for p in wall]
     return parts
 
@@ -168,13 +182,34 @@ def table() -> list[Patch]:
 
     top = patch(Material.TABLE, disc, 256, 96, coords=disc)
     rim = lathe(Material.LEG, _profile([(1.15, -0.1), (1.29, -0.08), (1.325, -0.04), (1.3, 0.0)]), 128, 8)
-    leg = [(0.8, FLOOR + 0.01), (0.7, -1.02), (0.2, -0.95), (0.12, -0.8), (0.2, -0.6), (0.1, -0.4), (0.16, -0.2), (0.5, -0.1)]
+    leg = [
+        (0.8, FLOOR + 0.01),
+        (0.7, -1.02),
+        (0.2, -0.95),
+        (0.12, -0.8),
+        (0.2, -0.6),
+        (0.1, -0.4),
+        (0.16, -0.2),
+        (0.5, -0.1),
+    ]
     return [top, rim, lathe(Material.LEG, _profile(leg), 48, 64)]
 
 
 def vase() -> list[Patch]:
     """The glossy, twisted vase and the flowers in it."""
-    knots = [(0.0, 0.005), (0.13, 0.005), (0.15, 0.03), (0.24, 0.22), (0.22, 0.4), (0.11, 0.56), (0.1, 0.62), (0.15, 0.7), (0.135, 0.695), (0.085, 0.61), (0.0, 0.5)]
+    knots = [
+        (0.0, 0.005),
+        (0.13, 0.005),
+        (0.15, 0.03),
+        (0.24, 0.22),
+        (0.22, 0.4),
+        (0.11, 0.56),
+        (0.1, 0.62),
+        (0.15, 0.7),
+        (0.135, 0.695),
+        (0.085, 0.61),
+        (0.0, 0.5),
+    ]
     parts = [lathe(Material.VASE, _profile(knots), 200, 120, flute=0.06, twist=3.0)]
     for k in range(7):
         angle, reach, top = 2.4 * k, 0.12 + 0.045 * k, 1.28 - 0.055 * k
@@ -245,7 +280,11 @@ def globe() -> list[Patch]:
 
     foot = [(0.0, 0.0), (0.17, 0.002), (0.17, 0.02), (0.06, 0.05), (0.04, 0.1), (0.03, 0.14)]
     ball = place(sphere(Material.GLOBE, 0.29, 48, coords=direction), (0, 0, 0.41), yaw=40, pitch=23)
-    return [ball, lathe(Material.LEG, _profile(foot), 48, 32), place(ring(Material.WIRE, 0.315, 0.012), (0, 0, 0.41), pitch=67, yaw=40)]
+    return [
+        ball,
+        lathe(Material.LEG, _profile(foot), 48, 32),
+        place(ring(Material.WIRE, 0.315, 0.012), (0, 0, 0.41), pitch=67, yaw=40),
+    ]
 
 
 def knot() -> Patch:
@@ -253,7 +292,11 @@ def knot() -> Patch:
 
     def path(t):
         a = TAU * t
-        return np.stack([np.sin(a) + 2 * np.sin(2 * a), np.cos(a) - 2 * np.cos(2 * a), -np.sin(3 * a)], -1) * (0.075, 0.075, 0.06)
+        return np.stack([np.sin(a) + 2 * np.sin(2 * a), np.cos(a) - 2 * np.cos(2 * a), -np.sin(3 * a)], -1) * (
+            0.075,
+            0.075,
+            0.06,
+        )
 
     return place(tube(Material.KNOT, path, 0.05, 240, 24), (0, 0, 0.112))
 

@@ -80,7 +80,9 @@ def wood(x: float, y: float, light: wp.vec3, dark: wp.vec3, seed: int):
 @wp.func
 def palette(t: float):
     """A smooth ring of saturated colours."""
-    return wp.vec3(0.5 + 0.42 * wp.cos(TAU * t), 0.42 + 0.38 * wp.cos(TAU * (t + 0.67)), 0.42 + 0.4 * wp.cos(TAU * (t + 0.36)))
+    return wp.vec3(
+        0.5 + 0.42 * wp.cos(TAU * t), 0.42 + 0.38 * wp.cos(TAU * (t + 0.67)), 0.42 + 0.4 * wp.cos(TAU * (t + 0.36))
+    )
 
 
 # surfaces --------------------------------------------------------------------------------------
@@ -110,7 +112,9 @@ def floor_boards(x: float, y: float):
     along = x / 1.7 + 0.5 * cell(0.0, row, 4) + 0.37 * wp.floor(row)
     tone = 0.6 + 0.5 * cell(along, row, 6)
     gap = wp.max(band(fract(row), 0.0, 0.03), band(fract(along), 0.0, 0.006))
-    board = tone * wood(0.6 * x, 0.7 * y + 5.0 * cell(along, row, 11), wp.vec3(0.40, 0.24, 0.12), wp.vec3(0.22, 0.12, 0.06), 12)
+    board = tone * wood(
+        0.6 * x, 0.7 * y + 5.0 * cell(along, row, 11), wp.vec3(0.40, 0.24, 0.12), wp.vec3(0.22, 0.12, 0.06), 12
+    )
     return wp.lerp(board, wp.vec3(0.04, 0.025, 0.015), gap)
 
 
@@ -146,15 +150,21 @@ def wall(x: float, z: float):
 @wp.func
 def painting(x: float, y: float, seed: float):
     """A hilly landscape under a cloudy sky, different for each seed."""
-    tint = fract(seed * 0.37 + 0.1)
-    sky = wp.lerp(wp.vec3(0.80, 0.60, 0.36), wp.lerp(wp.vec3(0.12, 0.30, 0.55), wp.vec3(0.45, 0.22, 0.20), tint), wp.clamp(0.6 * y, 0.0, 1.0))
+    tint = fract(0.618 * seed)
+    sky = wp.lerp(
+        wp.vec3(0.80, 0.60, 0.36),
+        wp.lerp(wp.vec3(0.06, 0.28, 0.62), wp.vec3(0.45, 0.16, 0.14), tint),
+        wp.clamp(0.6 * y, 0.0, 1.0),
+    )
     puff = cloud(wp.vec3(2.2 * x, 4.0 * y, seed), 4, 20)
     color = wp.lerp(sky, wp.vec3(0.9, 0.87, 0.8), wp.clamp(2.0 * puff, 0.0, 1.0))
     for ridge in range(4):
         height = 1.05 - 0.25 * float(ridge) + 0.3 * cloud(wp.vec3(1.6 * x, seed + 3.0 * float(ridge), 0.0), 4, 24)
         if y < height:
             near = float(ridge) / 3.0
-            hill = wp.lerp(wp.vec3(0.20, 0.30, 0.42), wp.lerp(wp.vec3(0.12, 0.22, 0.05), wp.vec3(0.45, 0.24, 0.05), tint), near)
+            hill = wp.lerp(
+                wp.vec3(0.18, 0.30, 0.48), wp.lerp(wp.vec3(0.10, 0.26, 0.03), wp.vec3(0.55, 0.24, 0.03), tint), near
+            )
             color = hill * (1.0 + 0.5 * cloud(wp.vec3(9.0 * x, 12.0 * y, seed), 3, 30))
     return 0.85 * color
 
@@ -169,14 +179,21 @@ def globe(d: wp.vec3):
         color = color * (1.0 + 0.4 * cloud(14.0 * d, 2, 45))
     if wp.abs(latitude) > 1.15 + 0.25 * height:
         color = wp.vec3(0.62, 0.66, 0.70)
-    line = wp.max(band(fract(latitude * 12.0 / 3.1415927), 0.5, 0.035), band(fract(longitude * 12.0 / TAU), 0.5, 0.02 / wp.max(0.2, wp.cos(latitude))))
+    line = wp.max(
+        band(fract(latitude * 12.0 / 3.1415927), 0.5, 0.035),
+        band(fract(longitude * 12.0 / TAU), 0.5, 0.02 / wp.max(0.2, wp.cos(latitude))),
+    )
     return wp.lerp(color, wp.vec3(0.72, 0.62, 0.38), 0.8 * line)
 
 
 @wp.func
 def glaze(u: float, v: float):
     """The vase: deep blue, with gilded bands and a row of rosettes."""
-    color = wp.lerp(wp.vec3(0.015, 0.05, 0.22), wp.vec3(0.03, 0.20, 0.36), wp.clamp(0.5 + cloud(wp.vec3(9.0 * u, 7.0 * v, 0.0), 3, 50), 0.0, 1.0))
+    color = wp.lerp(
+        wp.vec3(0.015, 0.05, 0.22),
+        wp.vec3(0.03, 0.20, 0.36),
+        wp.clamp(0.5 + cloud(wp.vec3(9.0 * u, 7.0 * v, 0.0), 3, 50), 0.0, 1.0),
+    )
     a, b = fract(16.0 * u) - 0.5, (v - 0.34) * 22.0
     r, phi = wp.sqrt(a * a + b * b), wp.atan2(b, a)
     if r < 0.30 + 0.12 * wp.cos(6.0 * phi):
@@ -205,7 +222,11 @@ def carton(u: float, v: float, lettering: wp.array2d[float]):
 def bloom(u: float, v: float, seed: float):
     if v > 0.76:
         return wp.lerp(wp.vec3(0.75, 0.50, 0.06), wp.vec3(0.28, 0.12, 0.03), band(fract(u * 16.0 + 9.0 * v), 0.5, 0.25))
-    hue = wp.where(int(seed) % 3 == 0, wp.vec3(0.85, 0.80, 0.74), wp.where(int(seed) % 3 == 1, wp.vec3(0.80, 0.20, 0.30), wp.vec3(0.85, 0.48, 0.08)))
+    hue = wp.where(
+        int(seed) % 3 == 0,
+        wp.vec3(0.85, 0.80, 0.74),
+        wp.where(int(seed) % 3 == 1, wp.vec3(0.80, 0.20, 0.30), wp.vec3(0.85, 0.48, 0.08)),
+    )
     vein = 0.75 + 0.25 * wp.abs(wp.cos(4.0 * TAU * u))
     return hue * vein * (0.7 + 0.4 * v)
 
@@ -218,7 +239,11 @@ def ornament(material: int, u: float, v: float, seed: float):
         return wp.vec4(c[0], c[1], c[2], 0.0)
     if material == int(Material.TORUS):  # candy stripes
         stripe = fract(10.0 * u + v) * 4.0
-        c = wp.where(stripe < 1.5, wp.vec3(0.80, 0.76, 0.66), wp.where(stripe < 2.5, wp.vec3(0.70, 0.10, 0.08), wp.vec3(0.05, 0.30, 0.33)))
+        c = wp.where(
+            stripe < 1.5,
+            wp.vec3(0.80, 0.76, 0.66),
+            wp.where(stripe < 2.5, wp.vec3(0.70, 0.10, 0.08), wp.vec3(0.05, 0.30, 0.33)),
+        )
         c = wp.lerp(c, wp.vec3(0.05, 0.04, 0.04), band(fract(stripe), 0.5, 0.07))
         return wp.vec4(c[0], c[1], c[2], 0.3)
     if material == int(Material.KNOT):
@@ -242,7 +267,7 @@ def ornament(material: int, u: float, v: float, seed: float):
 def paint(material: int, p: wp.vec3, lettering: wp.array2d[float]):
     """Colour and gloss (0..1; above 0.5 the surface also mirrors the room) at texture coordinates ``p``."""
     c = wp.vec3(0.62, 0.60, 0.55)
-    gloss = float(0.0)
+    gloss = 0.0
     if material == int(Material.TABLE):
         c = table_top(p[0], p[1])
         gloss = 0.25
@@ -303,7 +328,9 @@ def lettering() -> np.ndarray:
     def write(text: str, top: int, size: int):
         left = (columns - size * (6 * len(text) - 1)) // 2
         for k, letter in enumerate(text):
-            glyph = [[int(row, 16) >> (4 - bit) & 1 for bit in range(5)] for row in FONT.get(letter, "0 0 0 0 0 0 0").split()]
+            glyph = [
+                [int(row, 16) >> (4 - bit) & 1 for bit in range(5)] for row in FONT.get(letter, "0 0 0 0 0 0 0").split()
+            ]
             x = left + 6 * size * k
             texels[top : top + 7 * size, x : x + 5 * size] = np.kron(glyph, np.ones((size, size)))
 

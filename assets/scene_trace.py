@@ -1,7 +1,7 @@
 """A small ray tracer on Warp's mesh queries: the source of the photographs, which knows nothing of Gaussians.
 
-Light comes from one square lamp below the ceiling (soft shadows, a Blinn-Phong highlight that moves with the camera) and
-from the room itself (an ambient term, dimmed by an occlusion baked per vertex). Glossy things mirror the room once.
+Light comes from one square lamp below the ceiling (soft shadows, a Blinn-Phong highlight that moves with the camera)
+and from the room itself (an ambient term, dimmed by an occlusion baked per vertex). Glossy things mirror the room once.
 All sample patterns are fixed, so that shadows agree between views and a second run writes the same bytes.
 """
 
@@ -84,7 +84,7 @@ def radiance(scene: Scene, hit: Hit, direction: wp.vec3, lamp: wp.vec3):
     distance = wp.length(to_lamp)
     to_lamp = to_lamp / distance
     cosine = wp.dot(hit.normal, to_lamp)
-    if cosine > 0.0:
+    if cosine > 0.0:  # Warp's `and` does not skip the ray
         if not wp.mesh_query_ray_anyhit(scene.mesh, hit.point + 2.0e-3 * hit.normal, to_lamp, distance):
             incoming = LAMP_POWER * (cosine * wp.max(to_lamp[2], 0.15) / (distance * distance))
             exponent = 12.0 + 320.0 * hit.paint[3] * hit.paint[3]
@@ -146,7 +146,9 @@ def bake_openness(
 ):
     vertex = wp.tid()
     normal = scene.normals[vertex]
-    side = wp.normalize(wp.cross(normal, wp.where(wp.abs(normal[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))))
+    side = wp.normalize(
+        wp.cross(normal, wp.where(wp.abs(normal[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0)))
+    )
     up = wp.cross(normal, side)
     free = float(0.0)
     for ray in range(OCCLUSION_RAYS):  # cosine-weighted sunflower
@@ -201,7 +203,9 @@ class Tracer:
 
     def measure(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distance [R] along unit rays [R, 3] to the first surface."""
-        rays = [wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device="cpu") for x in (origins, directions)]
+        rays = [
+            wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device="cpu") for x in (origins, directions)
+        ]
         distance = wp.empty(len(origins), dtype=float, device="cpu")
         wp.launch(measure, dim=distance.size, inputs=[self.scene, *rays], outputs=[distance], device="cpu")
         return distance.numpy()

@@ -46,6 +46,19 @@ def set_threads(count: int) -> None:
         _threads, _pool = count, None
 
 
+def prepare(device: str, threads: int) -> None:
+    """Choose the device and the number of threads (0: all cores) of a run, and keep Warp from talking.
+
+    Raises:
+        InputError: if there is no such device here.
+    """
+    if device == "cuda":
+        raise InputError("--device cuda: this version has kernels for the CPU only; use --device auto or cpu.")
+    wp.config.log_level = wp.LOG_ERROR  # no list of devices, no word about a missing GPU driver
+    if threads:
+        set_threads(threads)
+
+
 def even_slices(dim: int) -> list[int]:
     """Bounds of one slice per thread of ``dim`` equal pieces of work."""
     parts = max(1, min(_threads, dim // SMALLEST_SLICE))
@@ -105,11 +118,12 @@ def stage(name: str) -> Iterator[None]:
 
 
 @contextmanager
-def profile() -> Iterator[dict[str, float]]:
-    """Collect the seconds spent in each :func:`stage` while the block runs."""
+def profile(active: bool = True) -> Iterator[dict[str, float]]:
+    """Collect the seconds spent in each :func:`stage` while the block runs (unless not ``active``)."""
     global _seconds
-    _seconds = defaultdict(float)
+    before, collected = _seconds, defaultdict(float)
+    _seconds = collected if active else None
     try:
-        yield _seconds
+        yield collected
     finally:
-        _seconds = None
+        _seconds = before

@@ -32,7 +32,7 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
         reference: [H, W, 3] uint8.
 
     Raises:
-        ValueError: if the shapes differ or the type is not uint8.
+        InputError: if the shapes differ or the type is not uint8.
     """
     image, reference = _unit_images(image, reference)
     error = np.mean((image - reference) ** 2)
@@ -47,7 +47,7 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
         reference: [H, W, 3] uint8.
 
     Raises:
-        ValueError: if the shapes differ or the type is not uint8.
+        InputError: if the shapes differ or the type is not uint8.
     """
     x, y = _unit_images(image, reference)
     mean_x, mean_y = _blur(x), _blur(y)
@@ -149,7 +149,7 @@ def _unit_images(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, 
     """Both images in float64, 0..1."""
     for array in (image, reference):
         if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
-            raise ValueError(f"image: expected (H, W, 3) uint8, got {array.shape} {array.dtype}.")
+            raise InputError(f"image: expected (H, W, 3) uint8, got {array.shape} {array.dtype}.")
     if image.shape != reference.shape:
-        raise ValueError(f"image: expected the shape of the reference, {reference.shape}, got {image.shape}.")
+        raise InputError(f"image: expected the shape of the reference, {reference.shape}, got {image.shape}.")
     return image / 255.0, reference / 255.0

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
 
 if TYPE_CHECKING:
@@ -34,16 +35,15 @@ def contact_sheet(
     The difference is the mean over the channels, amplified fourfold; black means equal.
 
     Args:
-        path: the PNG file to write.
+        path: the file to write, .png, or .jpg for a smaller one.
         rows: for each view its name, photograph and render, [H, W, 3] uint8 of one size, and PSNR in dB.
         columns: views side by side; more than one suits portrait photographs.
 
     Raises:
-        ValueError: if there are no views, or a photograph and its render differ in size.
-        InputError: if the file cannot be written.
+        InputError: if there are no views, or a photograph and its render differ in size; if the file cannot be written.
     """
     if not rows:
-        raise ValueError("rows: expected at least one view, got none.")
+        raise InputError("rows: expected at least one view, got none.")
     views = [(name, photo, render, _difference(photo, render), psnr) for name, photo, render, psnr in rows]
     lines = [views[start : start + columns] for start in range(0, len(views), columns)]
     margin, gap, text, heading = 0.1, 0.04, 0.22, 0.26  # inches
@@ -71,18 +71,17 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> N
     """Draw loss, test PSNR and number of Gaussians over the iterations, a panel for each that was recorded.
 
     Args:
-        path: the PNG file to write.
+        path: the file to write, such as .png.
         history: records with ``iteration`` and any of ``loss``, ``psnr`` [dB] and ``gaussians``, in order.
 
     Raises:
-        ValueError: if nothing was recorded.
-        InputError: if the file cannot be written.
+        InputError: if nothing was recorded; if the file cannot be written.
     """
     panels = (("loss", "loss", BLUE), ("psnr", "test PSNR [dB]", ORANGE), ("gaussians", "Gaussians", GREEN))
     series = {key: [(record["iteration"], record[key]) for record in history if key in record] for key, *_ in panels}
     drawn = [panel for panel in panels if series[panel[0]]]
     if not drawn:
-        raise ValueError("history: expected records with loss, psnr or gaussians, got none.")
+        raise InputError("history: expected records with loss, psnr or gaussians, got none.")
     figure = _figure(WIDTH, 2.5, layout="constrained")
     all_axes = figure.subplots(1, len(drawn), squeeze=False)[0]
     for axes, (key, title, color) in zip(all_axes, drawn, strict=True):
@@ -106,15 +105,14 @@ def plot_profile(path: str | Path, stages: Mapping[str, float]) -> None:
     """Draw the time of each stage as a bar with its share of the whole.
 
     Args:
-        path: the PNG file to write.
+        path: the file to write, such as .png.
         stages: milliseconds of each stage, in the order of the data flow, which becomes the order of the bars.
 
     Raises:
-        ValueError: if there are no stages.
-        InputError: if the file cannot be written.
+        InputError: if there are no stages; if the file cannot be written.
     """
     if not stages:
-        raise ValueError("stages: expected at least one, got none.")
+        raise InputError("stages: expected at least one, got none.")
     times = np.array(list(stages.values()), dtype=np.float64)
     total = times.sum()
     figure = _figure(WIDTH, 0.7 + 0.28 * len(times), layout="constrained")
@@ -141,11 +139,11 @@ def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> st
         rows: cells, written by ``str``; the first column is always text.
 
     Raises:
-        ValueError: if a row has another length than the headers.
+        InputError: if a row has another length than the headers.
     """
     table = [[str(cell).replace("|", "\\|") for cell in row] for row in (headers, *rows)]
     if any(len(row) != len(headers) for row in table):
-        raise ValueError(f"rows: expected {len(headers)} cells each, got {sorted({len(row) for row in table})}.")
+        raise InputError(f"rows: expected {len(headers)} cells each, got {sorted({len(row) for row in table})}.")
     widths = [max(3, *(len(cell) for cell in column)) for column in zip(*table, strict=True)]
     right = [
         index > 0 and all(NUMBER.fullmatch(cell) for cell in column[1:])
@@ -165,7 +163,7 @@ def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> st
 def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
     """[H, W] uint8: mean absolute difference of the channels, amplified and cut at white."""
     if photo.shape != render.shape:
-        raise ValueError(f"rows: expected a render of shape {photo.shape}, got {render.shape}.")
+        raise InputError(f"rows: expected a render of shape {photo.shape}, got {render.shape}.")
     difference = np.abs(photo.astype(np.float64) - render).mean(axis=2)
     return np.minimum(DIFFERENCE_GAIN * difference, 255).astype(np.uint8)
 
@@ -188,14 +186,15 @@ def _figure(width: float, height: float, layout: str | None = None) -> Figure:
 
 def _save(figure: Figure, path: str | Path) -> None:
     with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary)
 
 
 def _place_picture(figure: Figure, box: tuple[float, float, float, float], picture: np.ndarray, title: str) -> None:
     """Show ``picture`` in ``box`` = (left, bottom, width, height) [inches], with a title above its left edge."""
     width, height = figure.get_size_inches()
     axes = figure.add_axes((box[0] / width, box[1] / height, box[2] / width, box[3] / height))
-    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, anchor="NW")
+    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255)
+    axes.set_anchor("NW")
     axes.set_axis_off()
     axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5)
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import RasterOptions, TrainConfig
+from warp_splat.config import TILE, RasterOptions, TrainConfig
 from warp_splat.densify import Densifier
 from warp_splat.gaussians import GaussianModel
 from warp_splat.launch import stage
@@ -52,9 +52,14 @@ class Trainer:
         self._views_random = random.Random(config.seed)
         self._background_random = torch.Generator().manual_seed(config.seed)
         self._deck: list[View] = []
+        self._radii = torch.zeros(0, dtype=torch.int32)  # of the view that was differentiated last
 
-    def step(self, iteration: int) -> float:
-        """Train on one view; returns the loss. Iterations count from 1."""
+    def differentiate(self, iteration: int) -> float:
+        """Gradients of the loss of one view; returns the loss. Iterations count from 1.
+
+        The reference evaluates and saves between this and :meth:`update`: a set that was densified a moment ago is
+        unsettled and renders several dB worse.
+        """
         config = self.config
         self.optimizer.set_iteration(iteration)
         self.degree = min(iteration // config.sh_interval, config.sh_degree)
@@ -66,18 +71,29 @@ class Trainer:
         out.means2d.retain_grad()
         loss = image_loss(out.image, torch.from_numpy(view.image), config.lambda_dssim)
         loss.backward()
+        if iteration < config.densify_until_iter:
+            with stage("densify"):
+                self.densifier.observe(out, view.camera.width, view.camera.height)
         self.quarantine.pixels += out.dropped.pixels
         self.quarantine.gradients += out.dropped.gaussians
         self.quarantine.gaussians += out.invalid
+        self._radii = out.radii
+        return loss.item()
+
+    def update(self, iteration: int) -> None:
+        """Densify or take a step of Adam. A new set has no gradients yet: no step then, as in the reference."""
         with stage("densify"):
-            if iteration < config.densify_until_iter:
-                self.densifier.observe(out, view.camera.width, view.camera.height)
             changed = self.densifier.update(iteration)
         with stage("Adam"):
-            # a new set has no gradients yet; the reference skips the last step, too
-            if changed is None and iteration < config.iterations:
-                self.optimizer.step(out.radii)
-        return loss.item()
+            if changed is None:
+                self.optimizer.step(self._radii)
+
+    def warm_up(self) -> None:
+        """Compile and load every kernel of a step, changing nothing."""
+        camera = self.scene.train[0].camera.resized(TILE, TILE)
+        out = self._render(camera, self.background)
+        image_loss(out.image, torch.zeros_like(out.image), self.config.lambda_dssim).backward()
+        self.optimizer.adam.zero_grad(set_to_none=True)
 
     def _next_view(self) -> View:
         """Views in random order, each once before any comes again."""

@@ -57,8 +57,7 @@ def save_ply(
         comments: lines for the header, ASCII.
 
     Raises:
-        ValueError: if a shape disagrees with the others.
-        InputError: if the file cannot be written.
+        InputError: if a shape disagrees with the others; if the file cannot be written.
     """
     splats = SplatArrays(*(np.asarray(array, np.float32) for array in (means, sh, opacities, scales, quats)))
     _check_shapes(splats)
@@ -87,12 +86,11 @@ def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> Non
         colors: colours 0..255, [P, 3] uint8.
 
     Raises:
-        ValueError: if the shapes are not both [P, 3].
-        InputError: if the file cannot be written.
+        InputError: if the shapes are not both [P, 3]; if the file cannot be written.
     """
     points, colors = np.asarray(points), np.asarray(colors)
     if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
-        raise ValueError(f"points, colors: expected shapes (P, 3) twice, got {points.shape} and {colors.shape}.")
+        raise InputError(f"points, colors: expected shapes (P, 3) twice, got {points.shape} and {colors.shape}.")
     rows = np.zeros(len(points), [(name, "<f4") for name in POSITION + NORMAL] + [(name, "u1") for name in COLOR])
     for axis in range(3):
         rows[POSITION[axis]], rows[COLOR[axis]] = points[:, axis], colors[:, axis]
@@ -164,9 +162,9 @@ def _check_shapes(splats: SplatArrays) -> None:
     for name, shape in shapes.items():
         found = getattr(splats, name).shape
         if found != shape:
-            raise ValueError(f"{name}: expected shape {shape}, got {found}.")
+            raise InputError(f"{name}: expected shape {shape}, got {found}.")
     if splats.sh.shape not in [(count, 1 + rest // 3, 3) for rest in REST_COUNTS]:
-        raise ValueError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
+        raise InputError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
 
 
 def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:

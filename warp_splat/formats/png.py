@@ -21,8 +21,7 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
         image: [H, W, 3] uint8, sRGB.
 
     Raises:
-        ValueError: if the image has another shape or type.
-        InputError: if the file cannot be written.
+        InputError: if the image has another shape or type; if the file cannot be written.
     """
     _check_image(image)
     height, width, _ = image.shape
@@ -66,8 +65,7 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
         fps: frames per second.
 
     Raises:
-        ValueError: if there are no frames, or a frame has another shape or type than the first.
-        InputError: if PyAV is not installed, or the file cannot be written.
+        InputError: if there are no frames, or a frame has another shape or type than the first; if PyAV is not installed, or the file cannot be written.
     """
     try:
         import av  # noqa: PLC0415 - optional, and large
@@ -76,7 +74,7 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
     frames = iter(frames)
     first = next(frames, None)
     if first is None:
-        raise ValueError("frames: expected at least one image, got none.")
+        raise InputError("frames: expected at least one image, got none.")
     _check_image(first)
     height, width, _ = first.shape
     with atomic_write(path) as temporary:
@@ -85,7 +83,7 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
             frame = first
             while frame is not None:
                 if frame.shape != first.shape or frame.dtype != np.uint8:
-                    raise ValueError(f"frames: expected {first.shape} uint8 each, got {frame.shape} {frame.dtype}.")
+                    raise InputError(f"frames: expected {first.shape} uint8 each, got {frame.shape} {frame.dtype}.")
                 padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
                 picture = av.VideoFrame.from_ndarray(padded, format="rgb24")
                 container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
@@ -108,4 +106,4 @@ def _h264_stream(container, width: int, height: int, fps: float):
 
 def _check_image(image: np.ndarray) -> None:
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise ValueError(f"image: expected (H, W, 3) uint8, got {image.shape} {image.dtype}.")
+        raise InputError(f"image: expected (H, W, 3) uint8, got {image.shape} {image.dtype}.")

@@ -4,6 +4,7 @@ Poses are camera-to-world in OpenGL axes (x right, y up, z backward); the points
 """
 
 import json
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +75,17 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError):
         world_from_camera = np.empty(0)
     if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
-        raise InputError(f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {matrix}; correct the file.")
-    u, scales, vt = np.linalg.svd(world_from_camera[:3, :3])  # u @ vt is the nearest rotation; a uniform scale drops out
+        raise InputError(
+            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix)}; correct the file."
+        )
+    u, scales, vt = np.linalg.svd(
+        world_from_camera[:3, :3]
+    )  # u @ vt is the nearest rotation; a uniform scale drops out
     is_scaled_rotation = np.linalg.det(u @ vt) > 0 and scales[2] > 0 and scales[0] - scales[2] <= TOLERANCE * scales[0]
     if not is_scaled_rotation or not np.allclose(world_from_camera[3], (0, 0, 0, 1)):
         raise InputError(
-            f"{where}: expected transform_matrix to be a rotation and a translation (camera to world), but its axes are "
-            "sheared, mirrored or scaled unequally, or its last row is not 0 0 0 1; correct the file."
+            f"{where}: expected transform_matrix to be a rotation and a translation (camera to world), but its axes "
+            "are sheared, mirrored or scaled unequally, or its last row is not 0 0 0 1; correct the file."
         )
     rotation = (u @ vt * (1, -1, -1)).T  # OpenGL's y and z axes point the other way
     return rotation, -rotation @ world_from_camera[:3, 3]
@@ -88,5 +93,7 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _value(content: Any, key: str, where: str | Path) -> Any:
     if not isinstance(content, dict) or key not in content:
-        raise InputError(f"{where}: expected the key {key} (as in nerf-synthetic), but it is missing; correct the file.")
+        raise InputError(
+            f"{where}: expected the key {key} (as in nerf-synthetic), but it is missing; correct the file."
+        )
     return content[key]

@@ -18,6 +18,7 @@ from warp_splat.scene.images import Photo
 
 UINT64 = struct.Struct("<Q")
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
+KNOWN_MODELS = {int(model): model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0}
 IMAGE_HEAD = 64  # bytes of id, quaternion, translation, camera id; then the name, the number of keypoints, these
 POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the track, the track
 
@@ -39,7 +40,9 @@ def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[li
     where, model = _largest_model(source / "sparse", report)
     registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     if not registered:
-        raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run COLMAP's mapper again.")
+        raise InputError(
+            f"{where}: expected a COLMAP model with registered images, found none; run COLMAP's mapper again."
+        )
     points, colors = _points(where, model, report)
     root = source / folder
     missing = [image.name for image in registered if not (root / image.name).is_file()]
@@ -49,8 +52,17 @@ def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[li
             f"{missing[0]!r}; copy them there or choose another folder with --images."
         )
     sampling = functools.lru_cache(maxsize=images.THREADS)(_sampling)  # lives as long as the photos
-    photos = [_photo(image, root / image.name, sampling) for image in registered]
-    _report_changes(photos, registered, folder, report)
+    sizes = [images.read_size(root / image.name) for image in registered]
+    photos = [_photo(image, root / image.name, size, sampling) for image, size in zip(registered, sizes, strict=True)]
+    lenses = [image.camera.model_name for image, photo in zip(registered, photos, strict=True) if photo.sampling]
+    if lenses:
+        names = ", ".join(sorted(set(lenses)))
+        report(f"Undistorting {len(lenses)} of {len(photos)} images to pinhole cameras (models: {names}).")
+    scaled = sum(
+        size != (image.camera.width, image.camera.height) for image, size in zip(registered, sizes, strict=True)
+    )
+    if scaled:
+        report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {folder}.")
     return photos, points, colors
 
 
@@ -59,8 +71,8 @@ def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path,
     folders = [path for path in folders if any((path / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))]
     if not folders:
         raise InputError(
-            f"{sparse}: expected a COLMAP model (cameras, images and points3D as .bin or .txt) there or in a sub-folder "
-            "such as 0, found none; run COLMAP's mapper or copy its model there."
+            f"{sparse}: expected a COLMAP model (cameras, images and points3D as .bin or .txt) there or in a "
+            "sub-folder such as 0, found none; run COLMAP's mapper or copy its model there."
         )
     models = {path: _read_model(path) for path in folders}
     largest = max(folders, key=lambda path: models[path].num_reg_images())
@@ -79,12 +91,13 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
     except Exception as error:  # pycolmap raises many types, IndexError and ValueError among them
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"{folder}: expected a COLMAP model, but pycolmap cannot read it ({reason}); export the model again."
+            f"{folder}: expected a COLMAP model, but pycolmap cannot read it ({reason}); export it again, "
+            f"for COLMAP {pycolmap.__version__} or older."
         ) from error
 
 
 def _check_length(path: Path, end: Callable[[bytes], int]) -> None:
-    """Refuse a file whose records do not fill it: pycolmap 4.2 never returns from one that is cut short, or accepts it."""
+    """Refuse a file that its records do not fill: pycolmap 4.2 accepts some, and never returns from others."""
     data = path.read_bytes()
     try:
         expected = end(data)
@@ -100,16 +113,11 @@ def _check_length(path: Path, end: Callable[[bytes], int]) -> None:
 def _cameras_end(data: bytes) -> int:
     (count,), end = UINT64.unpack_from(data), UINT64.size
     for _ in range(count):
-        camera, model, width, height = CAMERA.unpack_from(data, end)
-        try:
-            kind = pycolmap.CameraModelId(model)
-            params = pycolmap.Camera.create_from_model_id(camera, kind, 1.0, width, height).params
-        except ValueError as error:
-            raise InputError(
-                f"cameras.bin: expected a camera model that COLMAP {pycolmap.__version__} knows, camera {camera} has "
-                f"number {model}; undistort the images with the COLMAP that made them."
-            ) from error
-        end += CAMERA.size + 8 * len(params)
+        _, model, width, height = CAMERA.unpack_from(data, end)
+        if model not in KNOWN_MODELS:
+            return len(data)  # its number of parameters is unknown: pycolmap will refuse it
+        camera = pycolmap.Camera.create_from_model_id(0, KNOWN_MODELS[model], 1.0, width, height)
+        end += CAMERA.size + 8 * len(camera.params)
     return end
 
 
@@ -147,9 +155,8 @@ def _points(
     return points[finite], colors[finite]
 
 
-def _photo(image: pycolmap.Image, path: Path, sampling: Callable[..., np.ndarray]) -> Photo:
+def _photo(image: pycolmap.Image, path: Path, size: tuple[int, int], sampling: Callable[..., np.ndarray]) -> Photo:
     lens = image.camera
-    size = images.read_size(path)
     # The same factor for both sides, up to the rounding of either to whole pixels.
     if abs(size[0] / lens.width - size[1] / lens.height) >= 1 / lens.width + 1 / lens.height:
         raise InputError(
@@ -164,18 +171,14 @@ def _photo(image: pycolmap.Image, path: Path, sampling: Callable[..., np.ndarray
     pose = image.cam_from_world()
     with images.named(str(path)):
         if lens.is_undistorted():
-            camera = _pinhole(lens, pose).resized(*size)
-            return Photo(image.name, path, camera)
+            return Photo(image.name, path, _pinhole(lens, pose).resized(*size))
         key = (lens.model_name, lens.width, lens.height, tuple(lens.params), size)
-        camera = _pinhole(_undistorted(_lens(*key)), pose)
-    return Photo(image.name, path, camera, functools.partial(sampling, *key))
+        return Photo(image.name, path, _pinhole(_undistorted(_lens(*key)), pose), functools.partial(sampling, *key))
 
 
 def _pinhole(lens: pycolmap.Camera, pose: pycolmap.Rigid3d) -> Camera:
     k = lens.calibration_matrix()
-    return Camera(
-        lens.width, lens.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], pose.rotation.matrix(), pose.translation
-    )
+    return Camera(lens.width, lens.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], pose.rotation.matrix(), pose.translation)
 
 
 def _lens(model: str, width: int, height: int, params: tuple[float, ...], size: tuple[int, int]) -> pycolmap.Camera:
@@ -186,7 +189,14 @@ def _lens(model: str, width: int, height: int, params: tuple[float, ...], size: 
 
 def _undistorted(lens: pycolmap.Camera) -> pycolmap.Camera:
     """The pinhole that COLMAP's image_undistorter gives ``lens``, without blank pixels."""
-    return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    try:
+        return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+    except Exception as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(
+            f"expected a lens that can be undistorted, pycolmap refuses {lens.model_name} {lens.params.tolist()} "
+            f"({reason}); correct the model or leave this image out."
+        ) from error
 
 
 def _sampling(*key: object) -> np.ndarray:
@@ -197,12 +207,3 @@ def _sampling(*key: object) -> np.ndarray:
     rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
     pixels = lens.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
     return pixels.astype(np.float32).reshape(*x.shape, 2)
-
-
-def _report_changes(
-    photos: list[Photo], registered: list[pycolmap.Image], folder: str, report: Callable[[str], object]
-) -> None:
-    lenses = sorted({i.camera.model_name for i, p in zip(registered, photos, strict=True) if p.sampling is not None})
-    if lenses:
-        count = sum(photo.sampling is not None for photo in photos)
-        report(f"Undistorting {count} of {len(photos)} images to pinhole cameras (models: {', '.join(lenses)}).")

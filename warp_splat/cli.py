@@ -1,0 +1,98 @@
+"""The command line: flags from the fields of the configurations, errors as one sentence."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from dataclasses import MISSING, fields
+
+from warp_splat import __version__
+from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, RenderConfig, TrainConfig
+from warp_splat.errors import InputError
+
+COMMANDS = {
+    "train": (TrainConfig, "train Gaussians on a scene's photographs"),
+    "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
+}
+
+
+def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
+    """A flag for each field of the configuration, with its default and help."""
+    for item in fields(config_type):
+        default = item.default if item.default is not MISSING else item.default_factory()
+        note = "" if default in ("", [], False) else f" (default: {default})"
+        options: dict = {"default": argparse.SUPPRESS, "help": item.metadata["help"].replace("%", "%%") + note}
+        if isinstance(default, bool):
+            options["action"] = argparse.BooleanOptionalAction
+        else:
+            options["type"] = item.metadata["many"] or type(default)
+            options["metavar"] = options["type"].__name__.upper()
+            options["choices"] = item.metadata["choices"]
+            if options["choices"]:
+                del options["metavar"]
+            if item.metadata["many"]:
+                options["nargs"] = "*"
+        parser.add_argument(*item.metadata["names"], f"--{item.name}", **options)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of ``warp-splat``."""
+    parser = argparse.ArgumentParser(
+        prog="warp-splat", description="3D Gaussian Splatting in NVIDIA Warp: photographs in, splats and new views out."
+    )
+    parser.add_argument("--version", action="version", version=f"warp-splat {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, (config_type, help) in COMMANDS.items():
+        add_flags(commands.add_parser(name, help=help, description=help.capitalize() + "."), config_type)
+    return parser
+
+
+def parse(arguments: list[str]) -> TrainConfig | RenderConfig:
+    """The configuration that the arguments ask for.
+
+    Raises:
+        InputError: for a flag of the reference that does not exist here.
+    """
+    for argument in arguments:
+        name = argument.split("=")[0]
+        if name in FOREIGN_FLAGS:
+            raise InputError(f"{name}: {FOREIGN_FLAGS[name]}; leave this flag out.")
+    known, unknown = make_parser().parse_known_args(arguments)
+    config_type = COMMANDS[known.command][0]
+    if unknown:
+        flags = [f"--{item.name}" for item in fields(config_type)]
+        near = difflib.get_close_matches(unknown[0].split("=")[0], flags, 1)
+        hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
+        raise InputError(f"{unknown[0]}: no such flag; {hint}")
+    values = {name: value for name, value in vars(known).items() if name != "command"}
+    if config_type is TrainConfig and "source_path" not in values:
+        values = {**EMBEDDED_DEFAULTS, **values}
+    return config_type(**values)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
+    try:
+        config = parse(sys.argv[1:] if arguments is None else arguments)
+        # idle OpenMP threads of torch must not spin beside busy kernels; read when torch is loaded
+        os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        os.environ.setdefault("GOMP_SPINCOUNT", "0")
+        if isinstance(config, TrainConfig):
+            from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
+        else:
+            from warp_splat.render import render as run  # noqa: PLC0415
+        return run(config)
+    except InputError as error:
+        if os.environ.get("WARP_SPLAT_TRACEBACK"):
+            raise
+        print(f"warp-splat: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("warp-splat: interrupted; nothing more was saved.", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

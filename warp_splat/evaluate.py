@@ -1,0 +1,54 @@
+"""Renders beside photographs, in the reference's folders, and their metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.camera import Camera
+from warp_splat.formats.png import save_png
+from warp_splat.metrics import evaluate_folder, write_results
+from warp_splat.scene.types import View
+
+
+def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
+    """Write ``renders/00000.png`` and ``gt/00000.png`` ... in ``folder``; returns the renders.
+
+    Images of an earlier run are removed first: metrics are taken over all that lie there.
+    """
+    renders = []
+    for kind in ("renders", "gt"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+        for old in (folder / kind).glob("*.png"):
+            old.unlink()
+    for index, view in enumerate(views):
+        renders.append(picture(view.camera))
+        save_png(folder / "renders" / f"{index:05d}.png", renders[-1])
+        save_png(folder / "gt" / f"{index:05d}.png", view.image)
+    return renders
+
+
+def evaluate_views(
+    picture: Callable[[Camera], np.ndarray],
+    views: list[View],
+    model_folder: Path,
+    split: str,
+    iteration: int,
+    extra: dict,
+) -> tuple[dict[str, float], list[tuple[str, np.ndarray, np.ndarray, float]]]:
+    """Render ``views`` into ``<model>/<split>/ours_<iteration>``, then PSNR and SSIM of the saved 8-bit images.
+
+    Returns:
+        The mean of each metric, and for each view its name, photograph, render and PSNR [dB].
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    folder = model_folder / split / f"ours_{iteration}"
+    renders = write_views(picture, views, folder)
+    means, per_view = evaluate_folder(folder)
+    write_results(model_folder, iteration, means, per_view, extra)
+    values = per_view["PSNR"].values()
+    return means, [(v.name, v.image, r, p) for v, r, p in zip(views, renders, values, strict=True)]

@@ -1,0 +1,156 @@
+"""Pictures of a trained model: its views with their metrics, or a timed orbit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warp_splat import launch
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions, RenderConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluate import evaluate_views, write_views
+from warp_splat.formats import model_folder
+from warp_splat.formats.png import save_png, save_video
+from warp_splat.gaussians import GaussianModel
+from warp_splat.rasterize import render as render_gaussians
+from warp_splat.scene import load_scene
+from warp_splat.scene.types import Scene
+from warp_splat.trainer import to_bytes
+
+ORBIT_SIZE = (980, 545)  # px
+ORBIT_VIEW = (1.4, 0.9)  # horizontal and vertical field of view, rad
+ORBIT_RADIUS = 5.0  # world units from the world's origin
+WARM_UP, FRAMES, FPS = 10, 100, 25
+
+
+def render(config: RenderConfig) -> int:
+    """Render as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the model, its scene or an option is not usable.
+    """
+    launch.prepare(config.device, config.threads)
+    say = (lambda *_: None) if config.quiet else print
+    if not config.model_path:
+        raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
+    folder = Path(config.model_path)
+    iteration = model_folder.find_iteration(folder, config.iteration)
+    model = GaussianModel.load(model_folder.ply_path(folder, iteration))
+    trained = model_folder.read_cfg_args(folder)
+    picture = make_picture(model, bool(trained.get("white_background")), bool(trained.get("antialiasing")))
+    say(f"{len(model)} Gaussians from iteration {iteration} of {folder}")
+    if config.orbit:
+        scene = _load(config, trained, say) if config.orbit_center == "focus" else None
+        _orbit(picture, scene, config.orbit_output)
+        return 0
+    scene = _load(config, trained, say)
+    if scene.train and not config.skip_train:
+        write_views(picture, scene.train, folder / "train" / f"ours_{iteration}")
+        print(f"  train  {len(scene.train)} views in {folder / 'train' / f'ours_{iteration}'}")
+    if scene.test and not config.skip_test:
+        extra = {"split": "test", "gaussians": len(model)}
+        means, _ = evaluate_views(picture, scene.test, folder, "test", iteration, extra)
+        print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
+        print(f"  PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f} in {folder / 'results.json'}")
+    return 0
+
+
+def _load(config: RenderConfig, trained: dict, say) -> Scene:
+    source = config.source_path or str(trained.get("source_path", ""))
+    return load_scene(
+        source,
+        images=str(trained.get("images", "images")),
+        resolution=int(trained.get("resolution", -1)),
+        white_background=bool(trained.get("white_background")),
+        eval=bool(trained.get("eval")),
+        report=say,
+    )
+
+
+def make_picture(model: GaussianModel, white_background: bool, antialiasing: bool) -> Callable[[Camera], np.ndarray]:
+    """A function from a camera to the model's image, [H, W, 3] uint8."""
+    background = torch.full((3,), float(white_background))
+    options = RasterOptions(antialiasing=antialiasing)
+    with torch.no_grad():
+        gaussians = model.activated()
+
+    def picture(camera: Camera) -> np.ndarray:
+        with torch.no_grad():
+            return to_bytes(render_gaussians(gaussians, camera, background, options).image)
+
+    return picture
+
+
+def orbit_cameras(center: np.ndarray, up: np.ndarray, start: np.ndarray, count: int) -> list[Camera]:
+    """Cameras on a circle around ``center``, looking at it.
+
+    Args:
+        center: [3], world.
+        up: unit vector, [3]; the circle lies in the plane across it.
+        start: the first camera's place, [3]; fixes radius and height.
+        count: cameras.
+    """
+    (width, height), fov = ORBIT_SIZE, ORBIT_VIEW
+    fx, fy = 0.5 * width / np.tan(0.5 * fov[0]), 0.5 * height / np.tan(0.5 * fov[1])
+    arm = start - center
+    lift = np.dot(arm, up) * up
+    first = arm - lift
+    second = np.cross(up, first)
+    cameras = []
+    for angle in 2.0 * np.pi * np.arange(count) / count:
+        place = center + lift + np.cos(angle) * first + np.sin(angle) * second
+        forward = (center - place) / np.linalg.norm(center - place)
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        cameras.append(Camera(width, height, fx, fy, 0.5 * width, 0.5 * height, rotation, -rotation @ place))
+    return cameras
+
+
+def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
+    """The point nearest to all optical axes (least squares), the cameras' mean up, their mean distance from it."""
+    cameras = [view.camera for view in scene.train]
+    across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
+    center = np.linalg.lstsq(
+        sum(across), sum(a @ camera.center for a, camera in zip(across, cameras, strict=True)), rcond=None
+    )[0]
+    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    distance = float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
+    return center, up / np.linalg.norm(up), distance
+
+
+def _orbit(picture: Callable[[Camera], np.ndarray], scene: Scene | None, output: str) -> None:
+    """Ten frames to warm up, a hundred timed; keep them if ``output`` says where."""
+    if scene is None:
+        center, up, start = np.zeros(3), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -ORBIT_RADIUS])
+    else:
+        center, up, distance = focus_point(scene)
+        first = scene.train[0].camera.center - center
+        level = first - np.dot(first, up) * up
+        start = center + distance * level / np.linalg.norm(level)
+    cameras = orbit_cameras(center, up, start, FRAMES)
+    for camera in cameras[:WARM_UP]:
+        picture(camera)
+    start = time.perf_counter()
+    frames = [picture(camera) for camera in cameras]
+    seconds = time.perf_counter() - start
+    print(f"{FRAMES} frames at {ORBIT_SIZE[0]} x {ORBIT_SIZE[1]} in {seconds:.2f} s: {FRAMES / seconds:.1f} frames per second")
+    if not any(frame.max() != frame.min() for frame in frames):
+        print("Every frame is empty: no Gaussian lies on the orbit's way; try --orbit_center focus.")
+    if output:
+        _keep(iter(frames), output)
+
+
+def _keep(frames: Iterator[np.ndarray], output: str) -> None:
+    if output.endswith(".mp4"):
+        save_video(output, frames, FPS)
+    else:
+        folder = model_folder.prepare(output)
+        for index, frame in enumerate(frames):
+            save_png(folder / f"{index:05d}.png", frame)
+    print(f"  frames in {output}")

@@ -1,0 +1,235 @@
+"""A whole training run: scene in; model, pictures, plots and numbers out."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from warp_splat import launch, report
+from warp_splat.config import TrainConfig, check_train
+from warp_splat.errors import InputError
+from warp_splat.evaluate import evaluate_views
+from warp_splat.formats import model_folder
+from warp_splat.formats.ply import save_points
+from warp_splat.formats.png import save_png
+from warp_splat.scene import load_scene
+from warp_splat.scene.types import Scene, View
+from warp_splat.trainer import Trainer
+
+EVALUATIONS = 20  # over the run, besides --test_iterations
+PROGRESS_VIEWS = 8  # at most, in the evaluations while training
+PREVIEW_SECONDS = 5.0
+SHEET_VIEWS = 6
+
+
+@dataclass
+class Run:
+    """What has happened so far."""
+
+    folder: Path
+    start: float = field(default_factory=time.perf_counter)
+    history: list[dict[str, float]] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)  # since the last record
+    iteration: int = 0
+    seconds: float = 0.0  # of training steps alone, without evaluations and pictures
+    preview: float = 0.0  # when last drawn
+    stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
+
+
+def train(config: TrainConfig) -> int:
+    """Train as ``config`` says; returns the process's exit code (130 if interrupted, with the model saved).
+
+    Raises:
+        InputError: if an option, the scene or the output folder is not usable.
+    """
+    problem = check_train(config)
+    if problem:
+        raise InputError(problem)
+    launch.prepare(config.device, config.threads)
+    config.source_path = config.source_path or str(embedded_scene())
+    say = (lambda *_: None) if config.quiet else tqdm.write
+    run = Run(model_folder.prepare(config.model_path or model_folder.default_model_path()))
+    say(f"Scene {config.source_path}, output in {run.folder}")
+    scene = load_scene(
+        config.source_path,
+        images=config.images,
+        resolution=config.resolution,
+        white_background=config.white_background,
+        eval=config.eval,
+        report=say,
+    )
+    width, height = scene.train[0].camera.width, scene.train[0].camera.height
+    say(
+        f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
+        f"{len(scene.points)} points; {launch.get_threads()} threads"
+    )
+    trainer = Trainer(scene, config)
+    _write_inputs(run.folder, config, scene)
+    say("Preparing kernels (compiled once on a machine, about 15 s) ...")
+    start = time.perf_counter()
+    trainer.warm_up()
+    say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
+    with _interruptible() as interrupted:
+        _loop(trainer, run, interrupted)
+    _finish(trainer, run, say)
+    return 130 if interrupted else 0
+
+
+def embedded_scene() -> Path:
+    """The scene that comes with the package."""
+    here = Path(__file__).parent
+    for folder in (here / "assets" / "still_life", here.parent / "assets" / "still_life"):
+        if folder.is_dir():
+            return folder
+    raise InputError("The embedded scene is missing from this installation; name a scene with -s.")
+
+
+def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
+    model_folder.write_cfg_args(folder, {**asdict(config), "model_path": str(folder), "data_device": "cpu"})
+    model_folder.write_cameras(folder, scene.test, scene.train)
+    save_points(folder / "input.ply", scene.points, scene.colors)
+
+
+@contextmanager
+def _interruptible():
+    """Ctrl-C ends the loop after the step at hand, so that the model is whole; a second one ends at once."""
+    interrupted: list[int] = []
+
+    def handle(number, frame):
+        if interrupted:
+            raise KeyboardInterrupt
+        interrupted.append(number)
+
+    previous = signal.signal(signal.SIGINT, handle)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
+    config = trainer.config
+    checks = set(config.test_iterations) | {config.iterations}
+    checks |= {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
+    saves = set(config.save_iterations) - {config.iterations}
+    pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
+    bar = tqdm(total=config.iterations, disable=config.quiet, unit="it", mininterval=pause, maxinterval=pause, miniters=0)
+    profiled, before_profile = max(config.iterations - config.profile, 0), 0.0
+    with bar, launch.profile(config.profile > 0) as stages:
+        for iteration in range(1, config.iterations + 1):
+            if iteration == profiled + 1:
+                stages.clear()
+                before_profile = run.seconds
+            start = time.perf_counter()
+            run.losses.append(trainer.differentiate(iteration))
+            run.iteration = iteration
+            spent = time.perf_counter() - start
+            if iteration in checks or interrupted:
+                with launch.profile(False):
+                    _check(trainer, run, bar)
+            if iteration in saves:
+                _save(trainer, run)
+            if iteration == config.iterations or interrupted:
+                run.seconds += spent
+                bar.update()
+                break
+            start = time.perf_counter()
+            trainer.update(iteration)
+            run.seconds += spent + time.perf_counter() - start
+            bar.update()
+        if config.profile:
+            steps = max(run.iteration - profiled, 1)
+            times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
+            step = 1e3 * (run.seconds - before_profile) / steps
+            run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
+
+
+def _progress_views(scene: Scene) -> tuple[str, list[View]]:
+    views = scene.test or scene.train
+    return "test" if scene.test else "train", views[:: -(-len(views) // PROGRESS_VIEWS)]
+
+
+def _check(trainer: Trainer, run: Run, bar: tqdm) -> None:
+    """Measure PSNR, note it, show it, and refresh the preview."""
+    split, views = _progress_views(trainer.scene)
+    record = {
+        "iteration": run.iteration,
+        "loss": float(np.mean(run.losses)),
+        "psnr": trainer.evaluate(views),
+        "gaussians": len(trainer.model),
+        "seconds": run.seconds,
+    }
+    run.history.append(record)
+    run.losses.clear()
+    text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
+    bar.set_postfix_str(text, refresh=False)
+    if time.perf_counter() - run.preview > PREVIEW_SECONDS:
+        run.preview = time.perf_counter()
+        view = views[len(views) // 2]
+        save_png(run.folder / "preview.png", np.concatenate([view.image, trainer.picture(view.camera)], 1))
+
+
+def _save(trainer: Trainer, run: Run) -> Path:
+    """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
+    path = model_folder.ply_path(run.folder, run.iteration)
+    try:
+        trainer.model.save(path)
+    except InputError as error:
+        path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
+        trainer.model.save(path)
+        tqdm.write(f"warning: {error} The model was saved as {path} instead.", file=sys.stderr)
+    return path
+
+
+def _finish(trainer: Trainer, run: Run, say) -> None:
+    """Save the model first, then everything that is made from it."""
+    path = _save(trainer, run)
+    wall = time.perf_counter() - run.start
+    lines = [("model", path)]
+    split, views = ("test", trainer.scene.test) if trainer.scene.test else ("train", trainer.scene.train)
+    extra = {
+        "split": split,
+        "iterations": run.iteration,
+        "gaussians": len(trainer.model),
+        "seconds": round(wall, 2),
+        "iterations_per_second": round(run.iteration / run.seconds, 2),
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // (1024 * (1024 if sys.platform == "darwin" else 1)),
+        "dropped": asdict(trainer.quarantine),
+    }
+    means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)
+    sheet, plot = run.folder / "contact_sheet.png", run.folder / "training.png"
+    chosen = pictures[:: -(-len(pictures) // SHEET_VIEWS)]
+    portrait = chosen[0][1].shape[0] > chosen[0][1].shape[1]
+    report.contact_sheet(sheet, chosen, columns=2 if portrait else 1)
+    report.plot_training(plot, run.history)
+    (run.folder / "history.json").write_text(json.dumps(run.history, indent=1))
+    lines += [("pictures", sheet), ("curves", plot), ("numbers", run.folder / "results.json")]
+    if run.stages:
+        report.plot_profile(run.folder / "profile.png", run.stages)
+        lines += [("profile", run.folder / "profile.png")]
+        total = sum(run.stages.values())
+        rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
+        say(report.format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
+    state = "Interrupted; saved" if run.iteration < trainer.config.iterations else "Done"
+    print(
+        f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
+        f"{split} PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f}, {len(trainer.model)} Gaussians"
+    )
+    for name, where in lines:
+        print(f"  {name:9s} {where}")
+    dropped = trainer.quarantine
+    if dropped.pixels or dropped.gradients or dropped.gaussians:
+        print(
+            f"  kept from spreading: {dropped.pixels} pixels and {dropped.gradients} Gaussians with gradients, and "
+            f"{dropped.gaussians} Gaussians with parameters, that were not finite"
+        )
