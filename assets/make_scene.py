@@ -104,6 +104,7 @@ def write_model(folder: pathlib.Path, names, centers, rotations, points, colors,
 
 
 def write_png(path: pathlib.Path, image: np.ndarray) -> None:
+    """Write an 8 bit RGB image [H, W, 3]."""
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
     spec.attribute("png:compressionLevel", 9)
     output = oiio.ImageOutput.create(str(path))
@@ -112,6 +113,7 @@ def write_png(path: pathlib.Path, image: np.ndarray) -> None:
 
 
 def main() -> None:
+    """Take the pictures and write the model."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent / "still_life")
     out = parser.parse_args().out

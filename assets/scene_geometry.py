@@ -78,6 +78,7 @@ def lathe(material: Material, profile, nu: int, nv: int, seed=0.0, flute=0.0, tw
 
 
 def sphere(material: Material, radius: float, n: int = 32, seed: float = 0.0, coords=None) -> Patch:
+    """A ball about the origin, its poles on z."""
     return lathe(
         material, lambda v: (radius * np.sin(np.pi * v), -radius * np.cos(np.pi * v)), 2 * n, n, seed, coords=coords
     )
@@ -97,10 +98,12 @@ def tube(material: Material, path, radius: float, along: int, around: int, refer
 
 
 def ring(material: Material, major: float, minor: float, height=0.0, along=64, around=10, seed=0.0) -> Patch:
+    """A torus about z."""
     return tube(material, lambda t: _polar(major, TAU * t, height), minor, along, around, seed=seed)
 
 
 def rod(material: Material, start, end, radius: float, around: int = 6) -> Patch:
+    """A straight bar."""
     start, end = np.array(start, float), np.array(end, float)
     reference = np.eye(3)[np.argmin(np.abs(end - start))]
     return tube(material, lambda t: start + t[..., None] * (end - start), radius, 1, around, reference)
@@ -175,6 +178,7 @@ def picture(x: float, z: float, w: float, h: float, seed: float) -> list[Patch]:
 
 
 def table() -> list[Patch]:
+    """A round table on one turned leg."""
     radius = 1.3
 
     def disc(u, v):
@@ -275,6 +279,8 @@ def box() -> list[Patch]:
 
 
 def globe() -> list[Patch]:
+    """A globe in its meridian ring."""
+
     def direction(u, v):
         return _polar(np.sin(np.pi * v), TAU * u, -np.cos(np.pi * v))
 

@@ -15,6 +15,8 @@ ATLAS = (64, 72)  # texels of the lettering: columns, rows (upper half: title, l
 
 
 class Material(IntEnum):
+    """What a face is made of."""
+
     TABLE = 0
     LEG = 1
     FLOOR = 2
@@ -42,8 +44,8 @@ class Material(IntEnum):
 @wp.func
 def cloud(p: wp.vec3, octaves: int, seed: int):
     """Fractal noise, roughly -1..1."""
-    total = float(0.0)
-    weight = float(1.0)
+    total = wp.float32(0.0)
+    weight = wp.float32(1.0)
     for octave in range(octaves):
         total += weight * wp.noise(wp.rand_init(seed + octave), p)
         p = p * 2.03
@@ -53,6 +55,7 @@ def cloud(p: wp.vec3, octaves: int, seed: int):
 
 @wp.func
 def fract(x: float):
+    """The part after the point."""
     return x - wp.floor(x)
 
 
@@ -90,9 +93,10 @@ def palette(t: float):
 
 @wp.func
 def table_top(x: float, y: float):
+    """A chequered board with an inlaid border of saw teeth."""
     maple, walnut = wp.vec3(0.62, 0.40, 0.19), wp.vec3(0.17, 0.075, 0.03)
     radius, angle = wp.sqrt(x * x + y * y), wp.atan2(y, x)
-    if radius > 1.02 and radius < 1.2:  # an inlaid border of saw teeth
+    if radius > 1.02 and radius < 1.2:
         tooth = wp.abs(2.0 * fract(angle * 36.0 / TAU) - 1.0)
         inside = wp.where(tooth > (radius - 1.04) / 0.14, 1.0, 0.0)
         return wp.lerp(walnut, maple, inside) * (0.9 + 0.2 * cloud(wp.vec3(30.0 * x, 30.0 * y, 0.0), 2, 3))
@@ -108,6 +112,7 @@ def table_top(x: float, y: float):
 
 @wp.func
 def floor_boards(x: float, y: float):
+    """Planks of uneven tone."""
     row = y / 0.32
     along = x / 1.7 + 0.5 * cell(0.0, row, 4) + 0.37 * wp.floor(row)
     tone = 0.6 + 0.5 * cell(along, row, 6)
@@ -120,6 +125,7 @@ def floor_boards(x: float, y: float):
 
 @wp.func
 def rug(x: float, y: float):
+    """Wavy rings and dots."""
     radius, angle = wp.sqrt(x * x + y * y), wp.atan2(y, x)
     wave = radius + 0.05 * wp.sin(18.0 * angle)
     ground = wp.lerp(wp.vec3(0.30, 0.085, 0.045), wp.vec3(0.045, 0.12, 0.13), band(fract(wave * 1.7), 0.5, 0.22))
@@ -171,6 +177,7 @@ def painting(x: float, y: float, seed: float):
 
 @wp.func
 def globe(d: wp.vec3):
+    """Seas, land and ice under a graticule, for a unit direction."""
     height = cloud(1.9 * d + wp.vec3(3.1, 0.0, 0.4), 5, 40)
     latitude, longitude = wp.asin(wp.clamp(d[2], -1.0, 1.0)), wp.atan2(d[1], d[0])
     color = wp.lerp(wp.vec3(0.03, 0.16, 0.36), wp.vec3(0.10, 0.38, 0.50), wp.clamp(1.0 + 2.5 * height, 0.0, 1.0))
@@ -220,6 +227,7 @@ def carton(u: float, v: float, lettering: wp.array2d[float]):
 
 @wp.func
 def bloom(u: float, v: float, seed: float):
+    """Veined petals, a spiral of seeds in the middle."""
     if v > 0.76:
         return wp.lerp(wp.vec3(0.75, 0.50, 0.06), wp.vec3(0.28, 0.12, 0.03), band(fract(u * 16.0 + 9.0 * v), 0.5, 0.25))
     hue = wp.where(

@@ -16,7 +16,7 @@ GRID = 4  # GRID x GRID samples per pixel, each with its own point on the lamp
 FAR = 100.0
 LAMP = wp.vec3(2.2, -1.9, 3.0)
 LAMP_HALF = 0.4  # half its width
-LAMP_POWER = wp.vec3(38.0, 34.0, 28.0)
+LAMP_POWER = wp.vec3(44.0, 39.5, 32.5)
 SKY = wp.vec3(0.40, 0.43, 0.49)  # ambient light from above
 GROUND = wp.vec3(0.27, 0.22, 0.18)  # and from below
 OCCLUSION_RAYS = 96
@@ -25,6 +25,8 @@ OCCLUSION_REACH = 1.2
 
 @wp.struct
 class Scene:
+    """The mesh and all that is attached to its vertices and faces."""
+
     mesh: wp.uint64
     faces: wp.array[int]  # [3 F]
     normals: wp.array[wp.vec3]  # [V]
@@ -47,6 +49,8 @@ class Camera:
 
 @wp.struct
 class Hit:
+    """The nearest surface along a ray."""
+
     distance: float  # negative: nothing hit
     point: wp.vec3
     normal: wp.vec3  # towards the viewer
@@ -56,6 +60,7 @@ class Hit:
 
 @wp.func
 def intersect(scene: Scene, origin: wp.vec3, direction: wp.vec3):
+    """The nearest surface along a ray of unit ``direction``."""
     hit = Hit()
     hit.distance = -1.0
     query = wp.mesh_query_ray(scene.mesh, origin, direction, FAR)
@@ -96,6 +101,7 @@ def radiance(scene: Scene, hit: Hit, direction: wp.vec3, lamp: wp.vec3):
 
 @wp.func
 def trace(scene: Scene, origin: wp.vec3, direction: wp.vec3, lamp: wp.vec3):
+    """Light that arrives at ``origin`` from ``direction``, one mirror image included."""
     hit = intersect(scene, origin, direction)
     color = radiance(scene, hit, direction, lamp)
     if hit.paint[3] > 0.5:
@@ -121,6 +127,7 @@ def photograph(
     # out
     image_out: wp.array[wp.vec3],  # [H*W] sRGB 0..1
 ):
+    """One pixel per thread."""
     pixel = wp.tid()
     column, row = float(pixel % camera.width), float(pixel // camera.width)
     total = wp.vec3()
@@ -144,13 +151,14 @@ def bake_openness(
     # out
     openness_out: wp.array[float],  # [V]
 ):
+    """The share of free sky above each vertex; one vertex per thread."""
     vertex = wp.tid()
     normal = scene.normals[vertex]
     side = wp.normalize(
         wp.cross(normal, wp.where(wp.abs(normal[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0)))
     )
     up = wp.cross(normal, side)
-    free = float(0.0)
+    free = wp.float32(0.0)
     for ray in range(OCCLUSION_RAYS):  # cosine-weighted sunflower
         r2 = (float(ray) + 0.5) / float(OCCLUSION_RAYS)
         angle = 2.3999632 * float(ray)
@@ -169,6 +177,7 @@ def measure(
     # out
     distance_out: wp.array[float],  # [R] to the first surface
 ):
+    """One ray per thread."""
     ray = wp.tid()
     distance_out[ray] = wp.mesh_query_ray(scene.mesh, origins[ray], directions[ray], FAR).t
 

@@ -243,7 +243,7 @@ def bin_tiles(means2d, conics, opacities, colors, depths, extents, radii, camera
     )
     ends = places[:, -1]
     ranges = torch.from_numpy(np.stack([ends - counts.sum(0), ends], 1).astype(np.int32))
-    return Bins(order, splats, slot_ends, instances, ranges, _balanced_slices(ends), tiles_x, invalid)
+    return Bins(order, splats, slot_ends, instances, ranges, balanced_slices(ends), tiles_x, invalid)
 
 
 def sort_by_depth(depths: torch.Tensor, radii: torch.Tensor) -> wp.array:
@@ -276,7 +276,7 @@ def _check_count(count: int, camera: Camera, drawn: int) -> None:
         )
 
 
-def _balanced_slices(ends: np.ndarray) -> list[int]:
+def balanced_slices(ends: np.ndarray) -> list[int]:
     """Bounds of slices of tiles with about the same number of instances; an empty tile counts a little, too."""
     work = ends + 32 * np.arange(1, len(ends) + 1)
     parts = SLICES_PER_THREAD * get_threads() if get_threads() > 1 else 1

@@ -83,7 +83,7 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> N
     if not drawn:
         raise InputError("history: expected records with loss, psnr or gaussians, got none.")
     figure = _figure(WIDTH, 2.5, layout="constrained")
-    all_axes = figure.subplots(1, len(drawn), squeeze=False)[0]
+    all_axes = figure.subplots(1, len(drawn), squeeze=False, sharex=True)[0]
     for axes, (key, title, color) in zip(all_axes, drawn, strict=True):
         iterations, values = np.array(series[key], dtype=np.float64).T
         _plain_axes(axes, title)
@@ -95,7 +95,7 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> N
             _label(axes, (iterations[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
         else:
             axes.set_ylim(bottom=0)
-        axes.set_xlabel("iteration", fontsize=9)
+        axes.set_xlabel("iteration", fontsize=9, color=INK)
         axes.yaxis.set_major_formatter(_thousands)
         axes.xaxis.set_major_formatter(_thousands)
     _save(figure, path)
@@ -169,12 +169,12 @@ def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """Running mean over a twentieth of the values, centred, and narrower at the ends."""
+    """Running mean over a twentieth of the values, centred, or what there is of it at the ends."""
     half = len(values) // 40
     sums = np.concatenate([[0.0], np.cumsum(values)])
     index = np.arange(len(values))
-    reach = np.minimum(half, np.minimum(index, len(values) - 1 - index))
-    return (sums[index + reach + 1] - sums[index - reach]) / (2 * reach + 1)
+    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
+    return (sums[last] - sums[first]) / (last - first)
 
 
 def _figure(width: float, height: float, layout: str | None = None) -> Figure:
@@ -208,6 +208,7 @@ def _shorten(name: str, inches: float) -> str:
 def _plain_axes(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
     axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(FAINT)
     axes.tick_params(labelsize=9, labelcolor=INK, color=FAINT)
     axes.grid(axis="y", color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)

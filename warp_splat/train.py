@@ -37,7 +37,7 @@ class Run:
     """What has happened so far."""
 
     folder: Path
-    start: float = field(default_factory=time.perf_counter)
+    start: float  # of the process's work, on time.perf_counter
     history: list[dict[str, float]] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)  # since the last record
     iteration: int = 0
@@ -58,8 +58,8 @@ def train(config: TrainConfig) -> int:
     launch.prepare(config.device, config.threads)
     config.source_path = config.source_path or str(embedded_scene())
     say = (lambda *_: None) if config.quiet else tqdm.write
-    run = Run(model_folder.prepare(config.model_path or model_folder.default_model_path()))
-    say(f"Scene {config.source_path}, output in {run.folder}")
+    started = time.perf_counter()
+    say(f"Scene {config.source_path}")
     scene = load_scene(
         config.source_path,
         images=config.images,
@@ -68,10 +68,11 @@ def train(config: TrainConfig) -> int:
         eval=config.eval,
         report=say,
     )
+    run = Run(model_folder.prepare(config.model_path or model_folder.default_model_path()), started)
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
     say(
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
-        f"{len(scene.points)} points; {launch.get_threads()} threads"
+        f"{len(scene.points)} points; {launch.get_threads()} threads; output in {run.folder}"
     )
     trainer = Trainer(scene, config)
     _write_inputs(run.folder, config, scene)

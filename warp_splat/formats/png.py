@@ -12,6 +12,8 @@ import OpenImageIO as oiio
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
 
+PNG_END = b"IEND\xaeB`\x82"  # the last chunk of every complete file, with its checksum
+
 
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write an image.
@@ -27,11 +29,14 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
     height, width, _ = image.shape
     with atomic_write(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
-        if output is None:
+        if output is None or output.format_name() != "png":
+            oiio.geterror()  # taken, or OpenImageIO prints it at exit
             raise InputError(f"{path}: expected the name of a PNG file, ending in .png.")
         spec = oiio.ImageSpec(width, height, 3, "uint8")
         if not (output.open(str(temporary), spec) and output.write_image(image) and output.close()):
             raise OSError(output.geterror())
+        if not temporary.read_bytes().endswith(PNG_END):  # OpenImageIO 3.2 does not notice a full disk
+            raise OSError("the file was cut short; the disk may be full")
 
 
 def load_png(path: str | Path) -> np.ndarray:
@@ -65,7 +70,8 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
         fps: frames per second.
 
     Raises:
-        InputError: if there are no frames, or a frame has another shape or type than the first; if PyAV is not installed, or the file cannot be written.
+        InputError: if there are no frames, or one differs from the first in shape or type; if PyAV is not installed; if
+            the file cannot be written.
     """
     try:
         import av  # noqa: PLC0415 - optional, and large

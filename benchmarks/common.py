@@ -1,0 +1,46 @@
+"""What the benchmarks share: interleaved timing, the machine's name, and tables."""
+
+import datetime
+import json
+import os
+import platform
+import re
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from warp_splat.report import format_table
+
+
+def interleaved_medians(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median seconds of each run; rounds over all runs, so that a change of the machine's pace hits them alike."""
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for run in runs.values():
+        run()
+    for _ in range(repeats):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def machine() -> str:
+    """Processor, cores, operating system and date."""
+    processor = platform.processor() or platform.machine()
+    try:
+        processor = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())[1]
+    except (OSError, TypeError):
+        pass
+    return f"{processor}, {os.cpu_count()} cores, {platform.system()}, {datetime.date.today()}"
+
+
+def write_table(name: str, out: Path | None, headers: Sequence, rows: Sequence[Sequence], note: str, data: dict) -> None:
+    """Print a table, and write it to ``<out>/<name>.md`` and ``.json`` if a folder is given."""
+    table = format_table(headers, rows)
+    print(f"\n{table}\n\n{note}\n{machine()}")
+    if out:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{name}.md").write_text(f"{table}\n\n{note} Measured by `benchmarks/{name}.py` on {machine()}.\n")
+        (out / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")

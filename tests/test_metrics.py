@@ -1,0 +1,144 @@
+"""PSNR and SSIM against a closed form and an independent torch implementation, and the JSON files."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from warp_splat.errors import InputError
+from warp_splat.formats.png import load_png, save_png
+from warp_splat.metrics import evaluate_folder, psnr, ssim, write_results
+
+
+def images(height, width, noise=20, seed=0):
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (height, width, 3))
+    other = np.clip(image + rng.normal(0, noise, image.shape), 0, 255)
+    return image.astype(np.uint8), other.astype(np.uint8)
+
+
+def torch_ssim(image, reference):
+    """The formula with a dense two-dimensional window, in float64."""
+    x, y = (torch.from_numpy(array).double().permute(2, 0, 1)[None] / 255 for array in (image, reference))
+    taps = torch.tensor([math.exp(-((i - 5) ** 2) / (2 * 1.5**2)) for i in range(11)], dtype=torch.float64)
+    taps = taps / taps.sum()
+    window = torch.outer(taps, taps).expand(3, 1, 11, 11).contiguous()
+
+    def mean(values):
+        return F.conv2d(values, window, padding=5, groups=3)
+
+    a, b = mean(x), mean(y)
+    var_a, var_b, covariance = mean(x * x) - a * a, mean(y * y) - b * b, mean(x * y) - a * b
+    c1, c2 = 0.01**2, 0.03**2
+    return float(((2 * a * b + c1) * (2 * covariance + c2) / ((a * a + b * b + c1) * (var_a + var_b + c2))).mean())
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 40), (11, 11), (37, 53)])
+@pytest.mark.parametrize("noise", [1, 20, 200])
+def test_ssim_agrees_with_torch(height, width, noise):
+    image, reference = images(height, width, noise)
+    assert ssim(image, reference) == pytest.approx(torch_ssim(image, reference), abs=1e-12)
+    assert ssim(image, image) == pytest.approx(1, abs=1e-12)
+
+
+@pytest.mark.parametrize("step", [1, 16, 255])
+def test_psnr_of_a_constant_error(step):
+    black = np.zeros((5, 7, 3), np.uint8)
+    assert psnr(black, black + np.uint8(step)) == pytest.approx(20 * math.log10(255 / step), abs=1e-12)
+    assert psnr(black, black) == math.inf
+
+
+def test_psnr_counts_every_channel_alike():
+    black = np.zeros((4, 4, 3), np.uint8)
+    one = black.copy()
+    one[..., 1] = 255
+    assert psnr(black, one) == pytest.approx(10 * math.log10(3), abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_metrics_check_their_images(metric):
+    image, _ = images(4, 5)
+    for bad in (image[:3], image.astype(np.float32), image[..., 0]):
+        with pytest.raises(InputError, match="image: expected"):
+            metric(image, bad)
+
+
+def test_png_keeps_every_value_and_gives_equal_bytes(tmp_path):
+    image, _ = images(31, 17)
+    save_png(tmp_path / "a.png", image)
+    save_png(tmp_path / "b.png", image[:, ::-1][:, ::-1])
+    np.testing.assert_array_equal(load_png(tmp_path / "a.png"), image)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_png_errors(tmp_path):
+    image, _ = images(31, 17)
+    with pytest.raises(InputError, match="could not be read"):
+        load_png(tmp_path / "none.png")
+    with pytest.raises(InputError, match=r"ending in \.png"):
+        save_png(tmp_path / "a.xyz", image)
+    save_png(tmp_path / "a.png", image)
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:500])
+    with pytest.raises(InputError, match=r"b\.png"):
+        load_png(tmp_path / "b.png")
+
+
+def rendered_folder(folder, pairs):
+    for index, (image, reference) in enumerate(pairs):
+        save_png(folder / "renders" / f"{index:05d}.png", image)
+        save_png(folder / "gt" / f"{index:05d}.png", reference)
+    return folder
+
+
+def test_evaluate_folder_means_the_values_of_the_images(tmp_path):
+    pairs = [images(20, 30, 5, seed=1), images(25, 12, 60, seed=2)]
+    means, per_view = evaluate_folder(rendered_folder(tmp_path, pairs))
+    assert per_view["PSNR"] == {f"{index:05d}.png": psnr(*pair) for index, pair in enumerate(pairs)}
+    assert per_view["SSIM"] == {f"{index:05d}.png": ssim(*pair) for index, pair in enumerate(pairs)}
+    assert means == {
+        "SSIM": pytest.approx(np.mean([ssim(*pair) for pair in pairs])),
+        "PSNR": pytest.approx(np.mean([psnr(*pair) for pair in pairs])),
+    }
+
+
+def test_evaluate_folder_errors(tmp_path):
+    with pytest.raises(InputError, match="found 0 and 0"):
+        evaluate_folder(tmp_path)
+    image, reference = images(20, 30)
+    rendered_folder(tmp_path, [(image, reference[:-1])])
+    with pytest.raises(InputError, match="30x19, found 30x20"):
+        evaluate_folder(tmp_path)
+    save_png(tmp_path / "renders" / "00001.png", image)
+    with pytest.raises(InputError, match="found 2 and 1"):
+        evaluate_folder(tmp_path)
+
+
+def read_strictly(path):
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def test_results_are_json_and_keep_other_methods(tmp_path):
+    other = '{"ours_7000": {"SSIM": 0.5, "PSNR": Infinity}, "ours_30000": {"LPIPS": 0.1}}'
+    (tmp_path / "results.json").write_text(other)  # the reference writes Infinity
+    image, _ = images(12, 12)
+    means, per_view = evaluate_folder(rendered_folder(tmp_path / "test", [(image, image)]))
+    write_results(tmp_path, 30000, means, per_view, {"gaussians": 12, "seconds": 1.5})
+    ours = {"SSIM": means["SSIM"], "PSNR": None, "gaussians": 12, "seconds": 1.5}
+    expected = {"ours_7000": {"SSIM": 0.5, "PSNR": None}, "ours_30000": ours}
+    assert read_strictly(tmp_path / "results.json") == expected
+    views = {"SSIM": {"00000.png": means["SSIM"]}, "PSNR": {"00000.png": None}}
+    assert read_strictly(tmp_path / "per_view.json") == {"ours_30000": views}
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "\xff"])
+def test_results_that_are_not_json_are_left_alone(tmp_path, text):
+    (tmp_path / "results.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=r"results\.json.*move it away"):
+        write_results(tmp_path, 1, {"SSIM": 1.0, "PSNR": 2.0}, {})
+    assert (tmp_path / "results.json").read_bytes() == text.encode("latin-1")

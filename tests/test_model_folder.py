@@ -1,0 +1,141 @@
+"""The model folder: arguments that are never evaluated, cameras, iterations, and folders that cannot be written."""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from warp_splat.camera import Camera
+from warp_splat.errors import InputError
+from warp_splat.formats import model_folder
+from warp_splat.scene.types import View
+
+ARGUMENTS = {
+    "sh_degree": 3,
+    "source_path": "a folder/it's",
+    "model_path": Path("output") / "x",
+    "white_background": False,
+    "test_iterations": [7000, 30000],
+    "position_lr_init": 1.6e-4,
+    "offset": -1,
+    "start_checkpoint": None,
+}
+
+
+def test_cfg_args_round_trip(tmp_path):
+    model_folder.write_cfg_args(tmp_path, ARGUMENTS)
+    assert model_folder.read_cfg_args(tmp_path) == {**ARGUMENTS, "model_path": str(Path("output") / "x")}
+
+
+def test_cfg_args_is_what_argparse_prints(tmp_path):
+    arguments = {name: value for name, value in ARGUMENTS.items() if not isinstance(value, Path)}
+    model_folder.write_cfg_args(tmp_path, arguments)
+    assert (tmp_path / "cfg_args").read_text() == str(argparse.Namespace(**arguments))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Namespace(a=__import__('os').system('touch {marker}'))",
+        "Namespace(a=[].__class__)",
+        "Namespace(**__import__('os').system('touch {marker}'))",
+        "Namespace(__import__('os').system('touch {marker}'))",
+        "__import__('os').system('touch {marker}')",
+        "Namespace(a=1); import os",
+        "Namespace(a=1).__class__",
+        "dict(a=1)",
+        "Namespace(a=1",
+        "Namespace(a=f'{{open}}')",
+        "Namespace(a=[" + "(" * 5000 + ")" * 5000 + "])",
+        "Namespace(a={{[]: 1}})",
+        "",
+        "\0",
+    ],
+)
+def test_cfg_args_refuses_all_but_literals_and_runs_nothing(tmp_path, text):
+    marker = tmp_path / "executed"
+    (tmp_path / "cfg_args").write_text(text.format(marker=marker))
+    with pytest.raises(InputError, match="cfg_args"):
+        model_folder.read_cfg_args(tmp_path)
+    assert not marker.exists()
+
+
+def test_cfg_args_missing_or_not_text(tmp_path):
+    with pytest.raises(InputError, match=r"is .* a model folder"):
+        model_folder.read_cfg_args(tmp_path)
+    (tmp_path / "cfg_args").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="could not be read"):
+        model_folder.read_cfg_args(tmp_path)
+
+
+@pytest.mark.parametrize("value", [object(), float("nan"), float("inf"), np.float32(1)])
+def test_cfg_args_that_could_not_be_read_are_not_written(tmp_path, value):
+    with pytest.raises(InputError, match="literal"):
+        model_folder.write_cfg_args(tmp_path, {"a": value})
+    assert not list(tmp_path.iterdir())
+
+
+def view(name, seed):
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    original = Camera(800, 600, 700, 710, 390, 310, rotation, rng.normal(size=3))
+    return View(name, original.resized(400, 300), np.zeros((300, 400, 3), np.uint8), original)
+
+
+def test_cameras_test_first_at_original_size(tmp_path):
+    test, train = [view("a/1.jpg", 1)], [view("2.jpg", 2), view("3.jpg", 3)]
+    model_folder.write_cameras(tmp_path, test, train)
+    entries = json.loads((tmp_path / "cameras.json").read_text())
+    assert [(entry["id"], entry["img_name"]) for entry in entries] == [(0, "a/1.jpg"), (1, "2.jpg"), (2, "3.jpg")]
+    for entry, expected in zip(entries, test + train, strict=True):
+        assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
+        assert (entry["width"], entry["height"], entry["fx"], entry["fy"]) == (800, 600, 700, 710)
+        camera_from_world = np.eye(4)
+        camera_from_world[:3, :3], camera_from_world[:3, 3] = expected.original.rotation, expected.original.translation
+        world_from_camera = np.linalg.inv(camera_from_world)
+        np.testing.assert_allclose(entry["rotation"], world_from_camera[:3, :3], atol=1e-12)
+        np.testing.assert_allclose(entry["position"], world_from_camera[:3, 3], atol=1e-12)
+
+
+def test_find_iteration_takes_the_largest_number(tmp_path):
+    with pytest.raises(InputError, match="found none"):
+        model_folder.find_iteration(tmp_path)
+    for iteration in (7000, 30000, 999):
+        path = model_folder.ply_path(tmp_path, iteration)
+        path.parent.mkdir(parents=True)
+        path.write_text("ply")
+    (tmp_path / "point_cloud" / "iteration_40000").mkdir()
+    (tmp_path / "point_cloud" / "notes.txt").write_text("")
+    assert model_folder.find_iteration(tmp_path) == 30000
+    assert model_folder.find_iteration(tmp_path, 7000) == 7000
+    with pytest.raises(InputError, match="iteration 8000 was not saved; there are 999, 7000, 30000"):
+        model_folder.find_iteration(tmp_path, 8000)
+
+
+def test_prepare_creates_and_leaves_nothing_behind(tmp_path):
+    folder = model_folder.prepare(tmp_path / "a" / "b")
+    assert folder.is_dir() and not list(folder.iterdir())
+    model_folder.prepare(folder)
+
+
+def test_prepare_refuses_before_training(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "model"):
+        with pytest.raises(InputError, match="choose another model path"):
+            model_folder.prepare(folder)
+
+    def refuse(*_args, **_keywords):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    with pytest.raises(InputError, match="Permission denied"):
+        model_folder.prepare(tmp_path / "model")
+
+
+def test_default_model_path_is_new_each_time():
+    first, second = model_folder.default_model_path(), model_folder.default_model_path()
+    assert first != second
+    assert first.parent == Path("output") and len(first.name) == 10

@@ -1,0 +1,211 @@
+"""PLY files: bytes against the documented layout, other writers' files, damaged files, and full disks."""
+
+import resource
+import struct
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.ply import load_ply, save_ply, save_points
+
+REST = {1: 0, 4: 9, 9: 24, 16: 45}
+
+
+def random_splats(count=7, coefficients=16, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = ((count, 3), (count, coefficients, 3), (count,), (count, 3), (count, 4))
+    return [rng.normal(size=shape).astype(np.float32) for shape in shapes]
+
+
+def reference_names(coefficients):
+    rest = [f"f_rest_{index}" for index in range(REST[coefficients])]
+    dc = ["f_dc_0", "f_dc_1", "f_dc_2"]
+    tail = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    return ["x", "y", "z", "nx", "ny", "nz", *dc, *rest, *tail]
+
+
+def packed(means, sh, opacities, scales, quats, comments=()):
+    """The file as the documentation of the format describes it, one value after the other."""
+    names = reference_names(sh.shape[1])
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header += [f"element vertex {len(means)}", *(f"property float {name}" for name in names), "end_header", ""]
+    data = "\n".join(header).encode()
+    for row in range(len(means)):
+        values = [*means[row], 0, 0, 0, *sh[row, 0]]
+        for channel in range(3):
+            values += [sh[row, k, channel] for k in range(1, sh.shape[1])]
+        values += [opacities[row], *scales[row], *quats[row]]
+        data += struct.pack(f"<{len(names)}f", *values)
+    return data
+
+
+@contextmanager
+def full_disk(limit=100):
+    """Writes beyond ``limit`` bytes of a file fail, as the operating system reports it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("coefficients", REST)
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_bytes_are_the_documented_layout(tmp_path, count, coefficients):
+    splats = random_splats(count, coefficients)
+    save_ply(tmp_path / "a.ply", *splats, comments=("SplatRenderMode: default",))
+    assert (tmp_path / "a.ply").read_bytes() == packed(*splats, comments=("SplatRenderMode: default",))
+    for before, after in zip(splats, load_ply(tmp_path / "a.ply"), strict=True):
+        assert after.dtype == np.float32
+        np.testing.assert_array_equal(before, after)
+
+
+def test_a_reader_that_knows_only_the_62_floats(tmp_path):
+    means, sh, opacities, scales, quats = random_splats()
+    save_ply(tmp_path / "a.ply", means, sh, opacities, scales, quats)
+    body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)[1]
+    assert len(body) == 248 * len(means)
+    rows = np.frombuffer(body, [(name, "<f4") for name in reference_names(16)])
+    rest = np.stack([rows[f"f_rest_{index}"] for index in range(45)], axis=1)
+    np.testing.assert_array_equal(rest.reshape(-1, 3, 15), sh[:, 1:].transpose(0, 2, 1))
+    np.testing.assert_array_equal(rows["rot_0"], quats[:, 0])
+    np.testing.assert_array_equal(rows["opacity"], opacities)
+    assert not rows["nx"].any()
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+def test_reads_by_name_in_any_order_without_normals(tmp_path, text, byte_order):
+    splats = random_splats(5, 4)
+    save_ply(tmp_path / "a.ply", *splats)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    names = [name for name in rows.dtype.names if name[0] != "n"]
+    np.random.default_rng(1).shuffle(names)
+    other = np.empty(len(rows), [(name, "f8") for name in names] + [("label", "u1")])
+    for name in names:
+        other[name] = rows[name]
+    PlyData([PlyElement.describe(other, "vertex")], text=text, byte_order=byte_order).write(str(tmp_path / "b.ply"))
+    for before, after in zip(splats, load_ply(tmp_path / "b.ply"), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_rows_that_are_not_finite_are_left_out_and_counted(tmp_path):
+    means, sh, opacities, scales, quats = random_splats(6, 4)
+    sh[1, 3, 2], scales[4, 0] = np.nan, np.inf
+    save_ply(tmp_path / "a.ply", means, sh, opacities, scales, quats)
+    lines = []
+    loaded = load_ply(tmp_path / "a.ply", report=lines.append)
+    np.testing.assert_array_equal(loaded.means, means[[0, 2, 3, 5]])
+    assert len(lines) == 1 and "2 of 6" in lines[0]
+
+
+def test_points_are_as_the_reference_writes_them(tmp_path):
+    points = np.array([[1.5, -2, 3], [4, 5, 6]])
+    colors = np.array([[0, 128, 255], [1, 2, 3]], np.uint8)
+    save_points(tmp_path / "input.ply", points, colors)
+    names = [
+        "float x",
+        "float y",
+        "float z",
+        "float nx",
+        "float ny",
+        "float nz",
+        "uchar red",
+        "uchar green",
+        "uchar blue",
+    ]
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 2", *(f"property {name}" for name in names)]
+    rows = b"".join(struct.pack("<6f3B", *point, 0, 0, 0, *color) for point, color in zip(points, colors, strict=True))
+    assert (tmp_path / "input.ply").read_bytes() == "\n".join([*header, "end_header", ""]).encode() + rows
+
+
+def test_every_cut_gives_one_sentence(tmp_path):
+    save_ply(tmp_path / "a.ply", *random_splats(2, 1))
+    data = (tmp_path / "a.ply").read_bytes()
+    for length in range(len(data)):
+        (tmp_path / "b.ply").write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"b\.ply"):
+            load_ply(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (b"property float opacity\n", b"property float alpha\n", "properties opacity are missing"),
+        (b"property float scale_2\n", b"", "scale_2"),
+        (b"property float f_rest_8\n", b"", "0, 9, 24 or 45"),
+        (b"f_rest_8\n", b"f_rest_9\n", "f_rest_8"),
+        (b"element vertex 3", b"element point 3", "'vertex'"),
+        (b"element vertex 3", b"element vertex 99999999999999", "cut short"),
+        (b"element vertex 3", b"element vertex -1", "a.ply"),
+        (b"element vertex 3", b"element vertex x", "expected a PLY file"),
+        (b"property float x\n", b"property list uchar float x\n", "a.ply"),
+        (b"ply\n", b"png\n", "expected a PLY file"),
+        (b"property float x\n", b"property \xff x\n", "expected a PLY file"),
+    ],
+)
+def test_bad_headers(tmp_path, old, new, sentence):
+    save_ply(tmp_path / "a.ply", *random_splats(3, 4))
+    data = (tmp_path / "a.ply").read_bytes()
+    assert old in data
+    (tmp_path / "a.ply").write_bytes(data.replace(old, new, 1))
+    with pytest.raises(InputError, match=sentence):
+        load_ply(tmp_path / "a.ply")
+
+
+def test_missing_file_and_folder(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load_ply(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="could not be read"):
+        load_ply(tmp_path)
+
+
+def test_shapes_are_checked(tmp_path):
+    means, sh, opacities, scales, quats = random_splats()
+    with pytest.raises(InputError, match="opacities: expected shape"):
+        save_ply(tmp_path / "a.ply", means, sh, opacities[:, None], scales, quats)
+    with pytest.raises(InputError, match="sh: expected shape"):
+        save_ply(tmp_path / "a.ply", means, sh[:, :5], opacities, scales, quats)
+    with pytest.raises(InputError, match="points, colors"):
+        save_points(tmp_path / "a.ply", means, means[:2])
+    assert not list(tmp_path.iterdir())
+
+
+def test_full_disk_keeps_the_older_file(tmp_path):
+    path = tmp_path / "a.ply"
+    save_ply(path, *random_splats(seed=1))
+    before = path.read_bytes()
+    with full_disk(limit=1500), pytest.raises(InputError, match=r"a\.ply.*untouched"):
+        save_ply(path, *random_splats(seed=2))
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_atomic_write_removes_what_an_error_left(tmp_path, error):
+    path = tmp_path / "new" / "a.txt"
+    with pytest.raises(error), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert not list(path.parent.iterdir())
+
+
+def test_atomic_write_reports_a_full_device(tmp_path):
+    with pytest.raises(InputError, match="No space left"), atomic_write(tmp_path / "a.txt"):
+        with open("/dev/full", "w") as file:
+            file.write("text")
+
+
+def test_atomic_write_reports_a_file_in_the_way(tmp_path):
+    (tmp_path / "file").write_text("a file, not a folder")
+    with (
+        pytest.raises(InputError, match="could not be written"),
+        atomic_write(tmp_path / "file" / "a.txt") as temporary,
+    ):
+        temporary.write_text("text")
+    assert (tmp_path / "file").read_text() == "a file, not a folder"

@@ -1,0 +1,158 @@
+"""Pictures open with the size they should have, films play, tables line up."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from warp_splat import report
+from warp_splat.errors import InputError
+from warp_splat.formats.png import load_png, save_png, save_video
+
+
+def view(name="0001.jpg", height=60, width=80, gap=8):
+    photo = np.zeros((height, width, 3), np.uint8)
+    return name, photo, photo + np.uint8(gap), 30.0
+
+
+@pytest.mark.parametrize(("count", "columns"), [(1, 1), (3, 1), (5, 2), (2, 4)])
+def test_contact_sheet_size(tmp_path, count, columns):
+    report.contact_sheet(tmp_path / "sheet.png", [view() for _ in range(count)], columns=columns)
+    sheet = load_png(tmp_path / "sheet.png")
+    assert sheet.shape[1] == 1600
+    lines = -(-count // columns)
+    cell_height = 1600 / (3 * columns) * 60 / 80
+    assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 80
+
+
+def test_contact_sheet_shows_the_amplified_difference(tmp_path):
+    name, photo, _, psnr = view()
+    render = photo.copy()
+    render[:, :40] = 255
+    report.contact_sheet(tmp_path / "sheet.png", [(name, photo, render, psnr)])
+    sheet = load_png(tmp_path / "sheet.png").astype(int)
+    middle = sheet[sheet.shape[0] // 2]
+    photo_at, render_left, render_right, difference_left, difference_right = middle[[250, 600, 950, 1150, 1450]]
+    assert photo_at.sum() == 0 and render_left.sum() == 765 and render_right.sum() == 0
+    assert difference_left.sum() > 500 and difference_right.sum() < 10
+
+
+def test_contact_sheet_takes_mixed_sizes_long_names_and_jpeg(tmp_path):
+    rows = [view("a/very/long/folder/" * 5 + "0001.jpg"), view(height=80, width=60), view(height=1, width=1)]
+    report.contact_sheet(tmp_path / "sheet.jpg", rows, columns=2)
+    assert load_png(tmp_path / "sheet.jpg").shape[1] == 1600
+
+
+def test_pictures_are_the_same_bytes_each_time(tmp_path):
+    for name in ("a.png", "b.png"):
+        report.contact_sheet(tmp_path / name, [view()])
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "history",
+    [
+        [{"iteration": 1, "loss": 0.3}],
+        [{"iteration": 500 * index, "psnr": 20.0 + index} for index in range(1, 4)],
+        [{"iteration": index, "loss": 1 / index, "gaussians": 10**5 * index} for index in range(1, 200)],
+        [{"iteration": 100, "loss": 0.2, "psnr": 20.0, "gaussians": 1000}, {"iteration": 200, "loss": 0.1}],
+    ],
+)
+def test_plot_training_draws_what_was_recorded(tmp_path, history):
+    report.plot_training(tmp_path / "training.png", history)
+    assert load_png(tmp_path / "training.png").shape == (500, 1600, 3)
+
+
+def test_plot_profile(tmp_path):
+    report.plot_profile(tmp_path / "profile.png", {"project": 1.0, "blend": 20.0, "never ran": 0.0})
+    assert load_png(tmp_path / "profile.png").shape[1] == 1600
+
+
+def test_nothing_to_draw_is_said(tmp_path):
+    for draw, nothing in (
+        (report.contact_sheet, []),
+        (report.plot_training, [{"iteration": 1}]),
+        (report.plot_profile, {}),
+    ):
+        with pytest.raises(InputError, match="expected"):
+            draw(tmp_path / "a.png", nothing)
+    name, photo, render, psnr = view()
+    with pytest.raises(InputError, match="expected a render of shape"):
+        report.contact_sheet(tmp_path / "a.png", [(name, photo, render[1:], psnr)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_running_mean_keeps_constants_and_slopes():
+    np.testing.assert_allclose(report._smooth(np.full(100, 3.0)), 3.0)
+    line = np.arange(400.0)
+    np.testing.assert_allclose(report._smooth(line)[10:-10], line[10:-10])
+
+
+def test_importing_the_report_loads_no_matplotlib():
+    modules = "warp_splat.report, warp_splat.formats.png"
+    program = f"import sys, {modules}; sys.exit(not {{'matplotlib', 'av'}}.isdisjoint(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_format_table():
+    table = report.format_table(["view", "PSNR", "note"], [["0012.jpg", 24.1, "a|b"], ["z", "-", ""]])
+    assert table.splitlines() == [
+        "| view     | PSNR | note |",
+        "| -------- | ---: | ---- |",
+        "| 0012.jpg | 24.1 | a\\|b |",
+        "| z        |    - |      |",
+    ]
+    assert report.format_table(["a"], []).splitlines() == ["| a   |", "| --- |"]
+    with pytest.raises(InputError, match="expected 2 cells"):
+        report.format_table(["a", "b"], [["only one"]])
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 63), (1, 1)])
+def test_video_plays_everywhere(tmp_path, height, width):
+    av = pytest.importorskip("av")
+    colors = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200]], np.uint8)
+    save_video(tmp_path / "a.mp4", (np.full((height, width, 3), color, np.uint8) for color in colors), fps=24)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt, stream.average_rate) == ("h264", "yuv420p", 24)
+        assert (stream.width, stream.height) == (width + width % 2, height + height % 2)
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(stream)]
+    assert len(frames) == 3
+    for frame, color in zip(frames, colors, strict=True):
+        assert np.abs(frame - color).max() <= 4
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+def test_video_errors_leave_no_file(tmp_path, monkeypatch):
+    pytest.importorskip("av")
+    frame = np.zeros((8, 8, 3), np.uint8)
+    for frames, sentence in (([], "at least one"), ([frame, frame[:4]], "each, got"), ([frame[0]], "image: expected")):
+        with pytest.raises(InputError, match=sentence):
+            save_video(tmp_path / "a.mp4", frames, fps=10)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match="pip install av"):
+        save_video(tmp_path / "a.mp4", [frame], fps=10)
+    assert not list(tmp_path.iterdir())
+
+
+def test_full_disk_keeps_the_older_pictures(tmp_path):
+    resource = pytest.importorskip("resource")
+    noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8)
+    writers = {
+        "a.png": lambda path: save_png(path, noise),
+        "b.png": lambda path: report.contact_sheet(path, [("a", noise, noise, 1.0)]),
+        "c.mp4": lambda path: save_video(path, [noise] * 3, fps=10),
+    }
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for name, write in writers.items():
+        (tmp_path / name).write_text("older")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+        try:
+            with pytest.raises(InputError, match="untouched"):
+                write(tmp_path / name)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+        assert (tmp_path / name).read_text() == "older"
+    assert len(list(tmp_path.iterdir())) == len(writers)
