@@ -179,7 +179,7 @@ def _culling(splats, alpha, order, camera):
 
 
 def render(means, quats, scales, opacities, sh, camera, background=(0.0, 0.0, 0.0), sh_degree=None, antialiasing=False):
-    """The image of N Gaussians (float64 tensors, activated values), differentiable in all of them and the background."""
+    """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background."""
     splats = project(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing)
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices

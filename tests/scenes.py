@@ -82,7 +82,7 @@ def cloud(
 ):
     """Random Gaussians over the image and a ``frame`` around it (a share of its size).
 
-    ``sigma``: range of the largest standard deviation on the image [px]; ``aspect``: smallest ratio of the others to it.
+    ``sigma``: range of the largest standard deviation on the image [px]; ``aspect``: least ratio of the others to it.
     """
     rng = np.random.default_rng(seed)
     depth = spread(rng, count, *z)

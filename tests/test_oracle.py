@@ -166,7 +166,7 @@ def test_gradients_match_directional_differences(name):
 def test_means2d_gradient_is_the_images():
     """A shift of every 2D mean is a shift of the principal point: covariance and colours stay."""
     scene = scenes.SCENES["degree1"]().to("cpu", torch.float64)
-    images, leaves = differentiable(scene)
+    _, leaves = differentiable(scene)
     out = oracle.render(*leaves[:5], scene.camera, leaves[5])
     out.means2d.retain_grad()
     out.image.square().sum().backward()

@@ -1,8 +1,8 @@
 """PLY files: bytes against the documented layout, other writers' files, damaged files, and full disks."""
 
-import resource
 import struct
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,6 +46,7 @@ def packed(means, sh, opacities, scales, quats, comments=()):
 @contextmanager
 def full_disk(limit=100):
     """Writes beyond ``limit`` bytes of a file fail, as the operating system reports it."""
+    resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:
@@ -195,6 +196,7 @@ def test_atomic_write_removes_what_an_error_left(tmp_path, error):
     assert not list(path.parent.iterdir())
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_atomic_write_reports_a_full_device(tmp_path):
     with pytest.raises(InputError, match="No space left"), atomic_write(tmp_path / "a.txt"):
         with open("/dev/full", "w") as file:

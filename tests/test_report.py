@@ -16,7 +16,7 @@ def view(name="0001.jpg", height=60, width=80, gap=8):
     return name, photo, photo + np.uint8(gap), 30.0
 
 
-@pytest.mark.parametrize(("count", "columns"), [(1, 1), (3, 1), (5, 2), (2, 4)])
+@pytest.mark.parametrize(("count", "columns"), [(1, 1), (3, 1), (5, 2), (7, 3), (2, 4)])
 def test_contact_sheet_size(tmp_path, count, columns):
     report.contact_sheet(tmp_path / "sheet.png", [view() for _ in range(count)], columns=columns)
     sheet = load_png(tmp_path / "sheet.png")
@@ -145,7 +145,7 @@ def test_full_disk_keeps_the_older_pictures(tmp_path):
         "b.png": lambda path: report.contact_sheet(path, [("a", noise, noise, 1.0)]),
         "c.mp4": lambda path: save_video(path, [noise] * 3, fps=10),
     }
-    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for name, write in writers.items():
         (tmp_path / name).write_text("older")
         resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
@@ -153,6 +153,6 @@ def test_full_disk_keeps_the_older_pictures(tmp_path):
             with pytest.raises(InputError, match="untouched"):
                 write(tmp_path / name)
         finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         assert (tmp_path / name).read_text() == "older"
     assert len(list(tmp_path.iterdir())) == len(writers)

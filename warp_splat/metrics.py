@@ -118,9 +118,9 @@ def write_results(
 
 def _merge(path: Path, key: str, entry: Mapping[str, object]) -> None:
     entries = _read_object(path) if path.exists() else {}
-    entries[key] = _without_infinities(entry)
+    entries[key] = entry
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(entries, indent=1, allow_nan=False), encoding="utf-8")
+        temporary.write_text(json.dumps(_without_infinities(entries), indent=1, allow_nan=False), encoding="utf-8")
 
 
 def _read_object(path: Path) -> dict[str, object]:
@@ -130,10 +130,11 @@ def _read_object(path: Path) -> dict[str, object]:
         raise InputError(f"{path}: could not be read as JSON ({error}); move it away and run again.") from error
     if not isinstance(entries, dict):
         raise InputError(f"{path}: expected a JSON object with entries ours_N; move it away and run again.")
-    return _without_infinities(entries)  # the reference writes the PSNR of equal images as Infinity
+    return entries
 
 
 def _without_infinities(value):
+    """The same JSON value with null for infinities, which older files of other tools may hold too."""
     if isinstance(value, Mapping):
         return {key: _without_infinities(item) for key, item in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -20,7 +20,7 @@ from warp_splat.kernels import tiles
 from warp_splat.kernels.blend import Splat2D
 from warp_splat.kernels.blend_lanes import BLOCKS, make_blend
 from warp_splat.kernels.lanes import vec16
-from warp_splat.kernels.project import CULLED, CameraView, project, quarantine
+from warp_splat.kernels.project import UNSEEN, CameraView, project, quarantine
 from warp_splat.launch import even_slices, get_threads, launch, stage, view
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
@@ -43,7 +43,7 @@ class RenderOutput:
     alpha: torch.Tensor  # [H, W], 1 - transmittance
     depth: torch.Tensor | None  # [H, W] world units, expected z (0 where alpha is 0), if asked for
     means2d: torch.Tensor  # [N, 2] px; 0 if culled
-    radii: torch.Tensor  # [N] int32, px: half the longer side of the box where alpha >= 1/255; 0 if culled
+    radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= 1/255; 0 if culled
     invalid: int  # Gaussians left out because an input was not finite or a quaternion was zero
     dropped: Dropped = field(default_factory=Dropped)
 
@@ -116,8 +116,8 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     cam = CameraView()
     cam.rotation = wp.mat33(*camera.rotation.ravel())
-    cam.translation = wp.vec3(*camera.translation)
-    cam.center = wp.vec3(*camera.center)
+    center = camera.center.astype(np.float32)
+    cam.center, cam.center_low = wp.vec3(*center), wp.vec3(*(camera.center - center))
     cam.focal, cam.principal, cam.size = wp.vec2(*focal), wp.vec2(*principal), wp.vec2(*size)
     cam.slope_min = wp.vec2(*(-principal / focal - margin))
     cam.slope_max = wp.vec2(*((size - principal) / focal + margin))
@@ -148,7 +148,7 @@ class Project(torch.autograd.Function):
         count, new = means.shape[0], means.new_zeros
         inputs = (means, quats, scales, opacities, sh_dc, sh_rest)
         outputs = (new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2))
-        radii = torch.full((count,), int(CULLED), dtype=torch.int32)
+        radii = torch.full((count,), int(UNSEEN), dtype=torch.int32)
         launch(project, count, [cam, *_views3d(inputs)], [*_views2d(outputs), view(radii, wp.int32)])
         ctx.save_for_backward(*inputs, *outputs, radii)
         ctx.cam, ctx.dropped = cam, dropped
@@ -250,13 +250,14 @@ def sort_by_depth(depths: torch.Tensor, radii: torch.Tensor) -> wp.array:
     """Indices of the drawn Gaussians, nearest first, ties by index, [V] int32."""
     drawn = np.flatnonzero(radii.numpy() > 0).astype(np.int32)
     count = len(drawn)
+    if count == 0:
+        return wp.empty(0, dtype=int, device="cpu")
     keys = np.empty(2 * count, dtype=np.float32)  # the sort works in twice the space
     values = np.empty(2 * count, dtype=np.int32)
     keys[:count] = depths.detach().numpy()[drawn]
     values[:count] = drawn
     order = wp.array(values, dtype=int, copy=False, device="cpu")
-    if count:
-        wp.utils.radix_sort_pairs(wp.array(keys, dtype=float, copy=False, device="cpu"), order, count)
+    wp.utils.radix_sort_pairs(wp.array(keys, dtype=float, copy=False, device="cpu"), order, count)
     return order[:count]
 
 

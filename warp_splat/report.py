@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -32,12 +32,12 @@ def contact_sheet(
 ) -> None:
     """Draw views as photograph, render and their absolute difference, 1600 pixels wide.
 
-    The difference is the mean over the channels, amplified fourfold; black means equal.
+    The last is headed "error x 4": the mean over the channels, amplified fourfold; black means equal.
 
     Args:
         path: the file to write, .png, or .jpg for a smaller one.
         rows: for each view its name, photograph and render, [H, W, 3] uint8 of one size, and PSNR in dB.
-        columns: views side by side; more than one suits portrait photographs.
+        columns: views side by side, at most 4; more than one suits portrait photographs.
 
     Raises:
         InputError: if there are no views, or a photograph and its render differ in size; if the file cannot be written.
@@ -60,7 +60,7 @@ def contact_sheet(
                 _place_picture(figure, (left + place * cell, top, cell - gap, height), picture, title)
         top -= gap
     for column in range(min(columns, len(views))):
-        for place, title in enumerate(("photograph", "render", f"{DIFFERENCE_GAIN} x difference")):
+        for place, title in enumerate(("photo", "render", f"error x {DIFFERENCE_GAIN}")):
             x = margin + column * (3 * cell + 2 * gap) + place * cell
             y = figure.get_figheight() - heading + 0.04
             figure.text(x / WIDTH, y / figure.get_figheight(), title, fontsize=9, fontweight="bold", color=INK)
@@ -177,7 +177,7 @@ def _smooth(values: np.ndarray) -> np.ndarray:
     return (sums[last] - sums[first]) / (last - first)
 
 
-def _figure(width: float, height: float, layout: str | None = None) -> Figure:
+def _figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:
     """An empty figure in inches that belongs to no pyplot state and needs no display."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
 

@@ -109,7 +109,7 @@ def _parse_namespace(text: str, path: Path) -> dict[str, object]:
             raise ValueError("no Namespace(...)")
         if call.args or any(keyword.arg is None for keyword in call.keywords):
             raise ValueError("an argument without a name")
-        return {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
+        return {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
         raise InputError(
             f"{path}: expected one line Namespace(name=literal, ...), found something else ({error})."

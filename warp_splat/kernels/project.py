@@ -11,11 +11,11 @@ a sum of positive terms: the usual a c - b^2 loses every digit for needles. No d
 import warp as wp
 
 from warp_splat.config import ALPHA_MIN, BLUR, NEAR
-from warp_splat.kernels.harmonics import evaluate_sh
-from warp_splat.kernels.lanes import CPU_FLAGS
+from warp_splat.kernels.harmonics import MODULE_OPTIONS, evaluate_sh
 
-wp.set_module_options({"optimization_level": 3, "cpu_compiler_flags": CPU_FLAGS})
+wp.set_module_options(MODULE_OPTIONS)
 
+UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
 INVALID = wp.constant(-1)  # an input of the Gaussian is not finite, or its quaternion is zero
 COMPENSATION_MIN = wp.constant(2.5e-5)  # floor of det / det with blur, as in the reference
@@ -26,8 +26,8 @@ class CameraView:
     """What the kernels need of a camera and its options."""
 
     rotation: wp.mat33  # camera_from_world
-    translation: wp.vec3
     center: wp.vec3  # world
+    center_low: wp.vec3  # what float32 cut off the center: far from the origin, all of the accuracy
     focal: wp.vec2  # px
     principal: wp.vec2  # px
     size: wp.vec2  # px, (W, H)
@@ -53,6 +53,19 @@ def rotation_matrix(quat: wp.vec4):
 
 
 @wp.func
+def support(opacity: float, xx: float, xy: float, yy: float):
+    """Half sides of the box where alpha >= ALPHA_MIN, and the distance of its farthest point [px]; no gradient."""
+    reach = 2.0 * wp.log(opacity / ALPHA_MIN)
+    widest = 0.5 * (xx + yy + wp.length(wp.vec2(xx - yy, 2.0 * xy)))  # variance of the long axis
+    return wp.vec3(wp.sqrt(reach * xx), wp.sqrt(reach * yy), wp.sqrt(reach * widest))
+
+
+@wp.func_grad(support)
+def adj_support(opacity: float, xx: float, xy: float, yy: float, adj_ret: wp.vec3):
+    pass
+
+
+@wp.func
 def covers_pixel(mean: float, extent: float, size: float):
     """Whether a pixel centre of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
     first = wp.max(wp.ceil(mean - extent - 0.5), 0.0)
@@ -69,16 +82,19 @@ def project(
     opacities: wp.array[float],  # [N] 0..1
     sh_dc: wp.array2d[wp.vec3],  # [N, 1]
     sh_rest: wp.array2d[wp.vec3],  # [N, K - 1]
-    # out: zero where culled, so the caller clears them
+    # out: zero where culled, so the caller clears them; all but the radii
     means2d_out: wp.array[wp.vec2],  # [N] px
     conics_out: wp.array[wp.vec3],  # [N] 1/px^2, (xx, xy, yy)
     opacities_out: wp.array[float],  # [N] after antialiasing
     colors_out: wp.array[wp.vec3],  # [N]
     depths_out: wp.array[float],  # [N] z in the camera
     extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= ALPHA_MIN
-    radii_out: wp.array[int],  # [N] px, rounded up; CULLED or INVALID if not drawn
+    radii_out: wp.array[int],  # [N] px, farthest point where alpha >= ALPHA_MIN, rounded up; CULLED or INVALID if not drawn; read first
 ):
     i = first + wp.tid()
+    if radii_out[i] <= 0:  # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
+        return
+    radii_out[i] = CULLED
     mean = means[i]
     quat = quats[i]
     scale = scales[i]
@@ -87,7 +103,8 @@ def project(
     if not finite or wp.max(wp.abs(quat)) == 0.0:
         radii_out[i] = INVALID
         return
-    p = camera.rotation * mean + camera.translation
+    offset = (mean - camera.center) - camera.center_low
+    p = camera.rotation * offset
     z = p[2]
     if not z > NEAR:
         return
@@ -110,21 +127,21 @@ def project(
     if not (opacity >= ALPHA_MIN and wp.isfinite(det)):
         return
     mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
-    reach = 2.0 * wp.log(opacity / ALPHA_MIN)
-    extent = wp.vec2(wp.sqrt(reach * (xx + BLUR)), wp.sqrt(reach * (yy + BLUR)))
+    xy = wp.dot(a1, a2)
+    extent = support(opacity, xx + BLUR, xy, yy + BLUR)
     if not (covers_pixel(mean2d[0], extent[0], camera.size[0]) and covers_pixel(mean2d[1], extent[1], camera.size[1])):
         return
-    color = evaluate_sh(camera.sh_degree, wp.normalize(mean - camera.center), sh_dc, sh_rest, i) + wp.vec3(0.5)
+    color = evaluate_sh(camera.sh_degree, wp.normalize(offset), sh_dc, sh_rest, i) + wp.vec3(0.5)
     if not wp.isfinite(color):
         radii_out[i] = INVALID
         return
     means2d_out[i] = mean2d
-    conics_out[i] = wp.vec3(yy + BLUR, -wp.dot(a1, a2), xx + BLUR) / det
+    conics_out[i] = wp.vec3(yy + BLUR, -xy, xx + BLUR) / det
     opacities_out[i] = opacity
     colors_out[i] = wp.max(color, wp.vec3(0.0))
     depths_out[i] = z
-    extents_out[i] = extent
-    radii_out[i] = int(wp.min(wp.ceil(wp.max(extent)), 1.0e9))
+    extents_out[i] = wp.vec2(extent[0], extent[1])
+    radii_out[i] = int(wp.min(wp.ceil(extent[2]), 1.0e9))
 
 
 @wp.kernel(enable_backward=False)
