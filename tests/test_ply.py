@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plyfile import PlyData, PlyElement
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
@@ -79,20 +78,79 @@ def test_a_reader_that_knows_only_the_62_floats(tmp_path):
     assert not rows["nx"].any()
 
 
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize("byte_order", ["<", ">"])
-def test_reads_by_name_in_any_order_without_normals(tmp_path, text, byte_order):
-    splats = random_splats(5, 4)
-    save_ply(tmp_path / "a.ply", *splats)
-    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
-    names = [name for name in rows.dtype.names if name[0] != "n"]
+def named(means, sh, opacities, scales, quats):
+    """The values of each Gaussian by property name, without normals."""
+    for row in range(len(means)):
+        rest = [sh[row, k, channel] for channel in range(3) for k in range(1, sh.shape[1])]
+        values = [*means[row], *sh[row, 0], *rest, opacities[row], *scales[row], *quats[row]]
+        names = [name for name in reference_names(sh.shape[1]) if name[0] != "n"]
+        yield dict(zip(names, map(float, values), strict=True))
+
+
+def foreign(kind, splats, first="", end="\n"):
+    """Another writer's file: doubles in another order, a label among them, and the rows of ``first`` before them."""
+    rows = list(named(*splats))
+    names = list(rows[0])
     np.random.default_rng(1).shuffle(names)
-    other = np.empty(len(rows), [(name, "f8") for name in names] + [("label", "u1")])
-    for name in names:
-        other[name] = rows[name]
-    PlyData([PlyElement.describe(other, "vertex")], text=text, byte_order=byte_order).write(str(tmp_path / "b.ply"))
+    header = ["ply", f"format {kind} 1.0", "comment caf\xe9", "obj_info a tool"]
+    header += ["element camera 2", "property int32 id", "property uint8 kind"] if first else []
+    header += [f"element vertex {len(rows)}", f"property float64 {names[0]}", "property uchar label"]
+    header += [f"property double {name}" for name in names[1:]]
+    header += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    data = end.join(header).encode("latin-1")
+    table = [(row[names[0]], 7, *(row[name] for name in names[1:])) for row in rows]
+    if kind == "ascii":
+        lines = (["-1 2", "3 4"] if first else []) + [" ".join(map(repr, row)) for row in table] + ["3 0 1 2"]
+        return data + end.join(lines).encode()
+    order = "<" if kind == "binary_little_endian" else ">"
+    data += struct.pack(f"{order}iBiB", -1, 2, 3, 4) if first else b""
+    data += b"".join(struct.pack(f"{order}dB{len(names) - 1}d", *row) for row in table)
+    return data + struct.pack(f"{order}B3i", 3, 0, 1, 2)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("first", ["", "camera"])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_reads_by_name_in_any_order_without_normals(tmp_path, kind, first, end):
+    splats = random_splats(5, 4)
+    (tmp_path / "b.ply").write_bytes(foreign(kind, splats, first, end))
     for before, after in zip(splats, load_ply(tmp_path / "b.ply"), strict=True):
+        assert after.dtype == np.float32 and after.dtype.isnative
         np.testing.assert_array_equal(before, after)
+
+
+def ascii_splats(rows, count=None):
+    names = reference_names(1)
+    header = ["ply", "format ascii 1.0", f"element vertex {len(rows) if count is None else count}"]
+    return "\n".join([*header, *(f"property float {name}" for name in names), "end_header", *rows])
+
+
+def test_text_without_rows_or_with_numbers_that_do_not_fit(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_text(ascii_splats(["", ""], 0))
+    assert len(load_ply(path).means) == 0
+    path.write_text(ascii_splats(["1 " * 17, "1 " * 16 + "1e300", "nan " * 17, "-inf " * 17, "2 " * 17]))
+    lines = []
+    np.testing.assert_array_equal(load_ply(path, report=lines.append).means[:, 0], [1, 2])
+    assert len(lines) == 1 and "3 of 5" in lines[0]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        ["1 " * 17, "1 " * 16],
+        ["1 " * 17, "1 " * 18],
+        ["1 " * 17, ""],
+        ["1 " * 17, " " * 40],
+        ["1 " * 40],
+        ["1 " * 17, "1 " * 16 + "one"],
+        ["1 " * 17, "1 " * 16 + "\x00"],
+    ],
+)
+def test_bad_rows_of_a_text(tmp_path, rows):
+    (tmp_path / "a.ply").write_text(ascii_splats(rows, 2))
+    with pytest.raises(InputError, match=r"a\.ply: the file is damaged or cut short"):
+        load_ply(tmp_path / "a.ply")
 
 
 def test_rows_that_are_not_finite_are_left_out_and_counted(tmp_path):
@@ -141,13 +199,26 @@ def test_every_cut_gives_one_sentence(tmp_path):
         (b"property float scale_2\n", b"", "scale_2"),
         (b"property float f_rest_8\n", b"", "0, 9, 24 or 45"),
         (b"f_rest_8\n", b"f_rest_9\n", "f_rest_8"),
-        (b"element vertex 3", b"element point 3", "'vertex'"),
+        (b"element vertex 3", b"element point 3", "'vertex', found none"),
+        (b"element vertex 3", b"element vertex 4", "cut short"),
+        (b"element vertex 3", b"element vertex 1000000000000", "cut short .1000000000000 vertices need"),
         (b"element vertex 3", b"element vertex 99999999999999", "cut short"),
+        (b"element vertex 3", b"element vertex " + b"9" * 5000, "the header line 'element vertex 999"),
         (b"element vertex 3", b"element vertex -1", "a.ply"),
         (b"element vertex 3", b"element vertex x", "expected a PLY file"),
-        (b"property float x\n", b"property list uchar float x\n", "a.ply"),
+        (b"element vertex 3", b"element camera 1000000000000\nproperty int id\nelement vertex 3", "cut short"),
+        (b"element vertex 3", b"element face 1\nproperty list uchar int i\nelement vertex 3", "a list property"),
+        (b"element vertex 3", b"element vertex 3\nelement point 3", "a.ply"),
+        (b"element vertex 3", b"", "the header line 'property float x'"),
+        (b"property float x\n", b"property list uchar float x\n", "a list property"),
+        (b"property float x\n", b"property float x\n" * 2, "the header line 'property float x'"),
         (b"ply\n", b"png\n", "expected a PLY file"),
+        (b"format binary_little_endian 1.0\n", b"", "no line 'format'"),
+        (b"format binary_little_endian", b"format binary_middle_endian", "expected a PLY file"),
+        (b"format binary_little_endian", b"format ascii", "damaged or cut short"),
         (b"property float x\n", b"property \xff x\n", "expected a PLY file"),
+        (b"end_header\n", b"comment\n" * 10**6, "no line 'end_header' within"),
+        (b"end_header\n", b"comment " * 10**6, "no line 'end_header' within"),
     ],
 )
 def test_bad_headers(tmp_path, old, new, sentence):
@@ -157,6 +228,20 @@ def test_bad_headers(tmp_path, old, new, sentence):
     (tmp_path / "a.ply").write_bytes(data.replace(old, new, 1))
     with pytest.raises(InputError, match=sentence):
         load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("count", [10**12, 10**15 - 1])
+def test_a_count_that_lies_fails_at_once_in_a_text(tmp_path, count):
+    (tmp_path / "a.ply").write_text(ascii_splats(["1 " * 17], count))
+    with pytest.raises(InputError, match=rf"a\.ply.*cut short .{count} vertices need"):
+        load_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("comment", ["two\nlines", "caf\xe9"])
+def test_comments_cannot_break_the_header(tmp_path, comment):
+    with pytest.raises(InputError, match=r"a\.ply: expected comments"):
+        save_ply(tmp_path / "a.ply", *random_splats(), comments=(comment,))
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_file_and_folder(tmp_path):

@@ -93,10 +93,10 @@ class TrainConfig:
 #: What the embedded scene changes when no ``-s`` is given: a schedule that ends within a few minutes on two cores.
 EMBEDDED_DEFAULTS: dict[str, Any] = {
     "eval": True,
-    "iterations": 5000,
-    "position_lr_max_steps": 5000,
-    "densify_until_iter": 2500,
-    "opacity_reset_interval": 3000,
+    "iterations": 3000,
+    "position_lr_max_steps": 3000,
+    "densify_until_iter": 2000,
+    "max_gaussians": 50_000,
     "sh_interval": 500,
 }
 

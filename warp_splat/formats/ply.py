@@ -3,16 +3,19 @@
 One element ``vertex`` of little-endian float32: ``x y z nx ny nz f_dc_0..2 f_rest_0..n opacity scale_0..2 rot_0..3``.
 Values are stored before their activation: opacity as a logit, scales as natural logarithms, quaternions w x y z of any
 length. ``f_rest`` is channel-major: all coefficients of red, then of green, then of blue; here they are [N, K, 3].
+
+Own code, since no permissively licensed reader of arbitrary vertex properties is well kept.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyParseError
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
@@ -24,6 +27,15 @@ SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLOR = ("red", "green", "blue")
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
+
+HEADER_BYTES = 64 * 1024  # thirty times the longest header of the reference: no damaged file is searched to its end
+COUNT_DIGITS = 15  # more rows than any disk holds, and sums of such counts stay below 2**63
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+TYPES |= {"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
+LIST = "list"  # in place of a NumPy type
+TYPES_WRITTEN = {"f4": "float", "u1": "uchar"}
 
 
 class SplatArrays(NamedTuple):
@@ -57,7 +69,8 @@ def save_ply(
         comments: lines for the header, ASCII.
 
     Raises:
-        InputError: if a shape disagrees with the others; if the file cannot be written.
+        InputError: if a shape disagrees with the others; if a comment is not one line of ASCII; if the file cannot be
+            written.
     """
     splats = SplatArrays(*(np.asarray(array, np.float32) for array in (means, sh, opacities, scales, quats)))
     _check_shapes(splats)
@@ -127,8 +140,6 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatAr
             f"{path}: expected an uncompressed PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
             "missing; export it as 'PLY (standard)' or train again."
         )
-    if any(vertex.dtype[name].hasobject for name in wanted):
-        raise InputError(f"{path}: expected one number for each property of a Gaussian, found a list.")
     with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
         table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
     finite = np.isfinite(table).all(axis=1)
@@ -168,22 +179,104 @@ def _check_shapes(splats: SplatArrays) -> None:
 
 
 def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
-    element = PlyElement.describe(rows, "vertex")
-    with atomic_write(path) as temporary:
-        PlyData([element], byte_order="<", comments=list(comments)).write(str(temporary))
+    if not all(comment.isascii() and comment.isprintable() for comment in comments):
+        raise InputError(f"{path}: expected comments of one line of ASCII each, got {list(comments)}.")
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    header += [f"element vertex {len(rows)}"]
+    header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code in rows.dtype.descr]
+    header += ["end_header", ""]
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join(header).encode("ascii"))
+        file.write(rows)
+
+
+class _HeaderError(Exception):
+    """What is wrong with a header, as a part of the sentence for the user."""
+
+
+class _Element(NamedTuple):
+    """A table of the file, as the header announces it."""
+
+    name: str
+    count: int  # rows
+    properties: dict[str, str]  # from names to NumPy types without byte order, or LIST
+
+    def least_bytes(self, text: bool) -> int:
+        """Size of the rows; of a text, if each number has one digit and one separator."""
+        return self.count * sum(2 if text else int(code[1]) for code in self.properties.values())
 
 
 def _read_vertices(path: str | Path) -> np.ndarray:
     """The rows of the element ``vertex``, one field for each property."""
     try:
-        return PlyData.read(str(path))["vertex"].data
+        with open(path, "rb") as file:
+            return _read_rows(file, *_read_header(file))
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path and the iteration.") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
-    except KeyError as error:
-        raise InputError(f"{path}: expected a PLY file with an element 'vertex', found none.") from error
-    except PlyElementParseError as error:
+    except MemoryError as error:
+        raise InputError(f"{path}: could not be read ({error}); it needs more memory than there is.") from error
+    except _HeaderError as error:
+        raise InputError(f"{path}: expected a PLY file with an element 'vertex', found {error}.") from error
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: the file is damaged or cut short ({error}); copy or save it again.") from error
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
-        raise InputError(f"{path}: expected a PLY file, found something else ({error}).") from error
+
+
+def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
+    """Read up to the first row: the byte order, "" for a text, and the elements up to ``vertex``."""
+    byte_order = None
+    elements: list[_Element] = []
+    if _header_line(file) != "ply":
+        raise _HeaderError("another first line than 'ply'")
+    while (line := _header_line(file)) != "end_header":
+        match line.split():
+            case ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, "1.0"] if name in BYTE_ORDERS:
+                byte_order = BYTE_ORDERS[name]
+            case ["element", name, count] if count.isdecimal() and len(count) <= COUNT_DIGITS:
+                elements.append(_Element(name, int(count), {}))
+            case ["property", code, name] if elements and code in TYPES and name not in elements[-1].properties:
+                elements[-1].properties[name] = TYPES[code]
+            case ["property", "list", _, _, name] if elements and name not in elements[-1].properties:
+                elements[-1].properties[name] = LIST
+            case _:
+                raise _HeaderError(f"the header line {line[:80]!r}")
+    names = [element.name for element in elements]
+    if byte_order is None or "vertex" not in names:
+        raise _HeaderError("no line 'format'" if byte_order is None else "none")
+    elements = elements[: names.index("vertex") + 1]
+    if any(LIST in element.properties.values() for element in elements):
+        raise _HeaderError("a list property in it or before it; export one number for each property")
+    return byte_order, elements
+
+
+def _header_line(file: BinaryIO) -> str:
+    line = file.readline(HEADER_BYTES - file.tell())
+    if not line.endswith(b"\n"):
+        raise _HeaderError(f"no line 'end_header' within the first {HEADER_BYTES} bytes")
+    return line.decode("latin-1").strip()  # any byte is a character; comments may hold them
+
+
+def _read_rows(file: BinaryIO, byte_order: str, elements: list[_Element]) -> np.ndarray:
+    """Rows of the last element; nothing is allocated before the file is known to be long enough for them."""
+    text = byte_order == ""
+    *before, vertex = elements
+    skipped = sum(element.least_bytes(text) for element in before)
+    needed = skipped + vertex.least_bytes(text)
+    found = os.fstat(file.fileno()).st_size - file.tell()
+    if needed > found + text:  # the last line of a text may lack its end
+        raise ValueError(f"{vertex.count} vertices need at least {needed} bytes, found {found}")
+    dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
+    if text:
+        first = sum(element.count for element in before)
+        lines = islice(file, first, first + vertex.count)
+        with np.errstate(over="ignore"):  # too large for a float32: infinite, as from a double
+            rows = np.fromiter((tuple(line.split()) for line in lines), dtype)
+    else:
+        file.seek(skipped, os.SEEK_CUR)
+        rows = np.fromfile(file, dtype, vertex.count)
+    if len(rows) < vertex.count:
+        raise ValueError(f"found {len(rows)} of {vertex.count} vertices")
+    return rows

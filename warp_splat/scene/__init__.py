@@ -103,6 +103,6 @@ def _require_visible(photos: list[Photo], points: np.ndarray, source: str | Path
             return
     raise InputError(
         f"{source}: expected points in front of the cameras, but none of the {len(photos)} training cameras sees any "
-        f"of the {len(points)} points; the poses' axes are probably mixed up: COLMAP has world to camera in OpenCV axes, "
-        "transforms_train.json camera to world in OpenGL axes."
+        f"of the {len(points)} points; the poses' axes are probably mixed up: COLMAP has world to camera in OpenCV "
+        "axes, transforms_train.json camera to world in OpenGL axes."
     )

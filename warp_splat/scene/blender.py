@@ -46,26 +46,34 @@ def _read_photos(path: Path) -> list[Photo]:
         raise InputError(f"{path}: expected camera_angle_x between 0 and pi radians, got {angle!r}; correct the file.")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: expected a list of at least one frame under the key frames; correct the file.")
-    return [_read_photo(frame, index, angle, path) for index, frame in enumerate(frames)]
+    places = [f"{path}, frame {index}" for index in range(len(frames))]
+    names = [_image_name(frame, where, path.parent) for frame, where in zip(frames, places, strict=True)]
+    missing = [name for name in names if not (path.parent / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{path}: expected the images of its {len(frames)} frames, but {len(missing)} of them cannot be found, "
+            f"the first is {missing[0]!r}; copy them there."
+        )
+    return [
+        _photo(frame, name, angle, path.parent, where) for frame, name, where in zip(frames, names, places, strict=True)
+    ]
 
 
-def _read_photo(frame: Any, index: int, angle: float, path: Path) -> Photo:
-    where = f"{path}, frame {index}"
+def _image_name(frame: Any, where: str, folder: Path) -> str:
     name = _value(frame, "file_path", where)
     if not isinstance(name, str):
         raise InputError(f"{where}: expected a string as file_path, got {name!r}; correct the file.")
     name = Path(name).as_posix()
-    if not (path.parent / name).is_file():
-        name += ".png"  # the synthetic scenes leave the extension out
-    image = path.parent / name
-    if not image.is_file():
-        raise InputError(f"{where}: expected the image {image}, but there is no such file; copy it there.")
-    width, height = images.read_size(image)
+    return name if (folder / name).is_file() else name + ".png"  # the synthetic scenes leave the extension out
+
+
+def _photo(frame: dict, name: str, angle: float, folder: Path, where: str) -> Photo:
+    width, height = images.read_size(folder / name)
     focal = 0.5 * width / np.tan(0.5 * angle)
     rotation, translation = _pose(_value(frame, "transform_matrix", where), where)
     with images.named(where):
         camera = Camera(width, height, focal, focal, width / 2, height / 2, rotation, translation)
-    return Photo(name, image, camera)
+    return Photo(name, folder / name, camera)
 
 
 def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -76,11 +84,10 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
         world_from_camera = np.empty(0)
     if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
         raise InputError(
-            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix)}; correct the file."
+            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix)}; "
+            "correct the file."
         )
-    u, scales, vt = np.linalg.svd(
-        world_from_camera[:3, :3]
-    )  # u @ vt is the nearest rotation; a uniform scale drops out
+    u, scales, vt = np.linalg.svd(world_from_camera[:3, :3])  # u @ vt is the nearest rotation, without the scale
     is_scaled_rotation = np.linalg.det(u @ vt) > 0 and scales[2] > 0 and scales[0] - scales[2] <= TOLERANCE * scales[0]
     if not is_scaled_rotation or not np.allclose(world_from_camera[3], (0, 0, 0, 1)):
         raise InputError(

@@ -44,26 +44,7 @@ def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[li
             f"{where}: expected a COLMAP model with registered images, found none; run COLMAP's mapper again."
         )
     points, colors = _points(where, model, report)
-    root = source / folder
-    missing = [image.name for image in registered if not (root / image.name).is_file()]
-    if missing:
-        raise InputError(
-            f"{root}: expected the {len(registered)} images of {where}, but {len(missing)} are missing, the first is "
-            f"{missing[0]!r}; copy them there or choose another folder with --images."
-        )
-    sampling = functools.lru_cache(maxsize=images.THREADS)(_sampling)  # lives as long as the photos
-    sizes = [images.read_size(root / image.name) for image in registered]
-    photos = [_photo(image, root / image.name, size, sampling) for image, size in zip(registered, sizes, strict=True)]
-    lenses = [image.camera.model_name for image, photo in zip(registered, photos, strict=True) if photo.sampling]
-    if lenses:
-        names = ", ".join(sorted(set(lenses)))
-        report(f"Undistorting {len(lenses)} of {len(photos)} images to pinhole cameras (models: {names}).")
-    scaled = sum(
-        size != (image.camera.width, image.camera.height) for image, size in zip(registered, sizes, strict=True)
-    )
-    if scaled:
-        report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {folder}.")
-    return photos, points, colors
+    return _photos(where, registered, source / folder, report), points, colors
 
 
 def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path, pycolmap.Reconstruction]:
@@ -87,13 +68,26 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
         if (folder / name).is_file():
             _check_length(folder / name, end)
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
+        if not (folder / "images.bin").is_file():
+            _restore_names(model, folder / "images.txt")
+        return model
     except Exception as error:  # pycolmap raises many types, IndexError and ValueError among them
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
             f"{folder}: expected a COLMAP model, but pycolmap cannot read it ({reason}); export it again, "
             f"for COLMAP {pycolmap.__version__} or older."
         ) from error
+
+
+def _restore_names(model: pycolmap.Reconstruction, path: Path) -> None:
+    """Put back the names with spaces: from text, pycolmap 4.2 takes only what is in front of the first space."""
+    with path.open(encoding="utf-8") as lines:
+        for line in lines:
+            if line.strip() and not line.startswith("#"):
+                image, *_, name = line.split(maxsplit=9)
+                model.image(int(image)).name = name.strip()
+                next(lines, None)  # the line of its keypoints, which may be empty
 
 
 def _check_length(path: Path, end: Callable[[bytes], int]) -> None:
@@ -155,10 +149,32 @@ def _points(
     return points[finite], colors[finite]
 
 
+def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: Callable[[str], object]) -> list[Photo]:
+    missing = [image.name for image in registered if not (root / image.name).is_file()]
+    if missing:
+        raise InputError(
+            f"{root}: expected the {len(registered)} images of {where}, but {len(missing)} of them cannot be found, "
+            f"the first is {missing[0]!r}; copy them there or choose another folder with --images."
+        )
+    sampling = functools.lru_cache(maxsize=images.THREADS)(_sampling)  # lives as long as the photos
+    photos, scaled, distorted = [], 0, []
+    for image in registered:
+        size = images.read_size(root / image.name)
+        photos.append(_photo(image, root / image.name, size, sampling))
+        scaled += size != (image.camera.width, image.camera.height)
+        distorted += [] if photos[-1].sampling is None else [image.camera.model_name]
+    if scaled:
+        report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {root.name}.")
+    if distorted:
+        models = ", ".join(sorted(set(distorted)))
+        report(f"Undistorting {len(distorted)} of {len(photos)} images to pinhole cameras (models: {models}).")
+    return photos
+
+
 def _photo(image: pycolmap.Image, path: Path, size: tuple[int, int], sampling: Callable[..., np.ndarray]) -> Photo:
     lens = image.camera
     # The same factor for both sides, up to the rounding of either to whole pixels.
-    if abs(size[0] / lens.width - size[1] / lens.height) >= 1 / lens.width + 1 / lens.height:
+    if abs(size[0] * lens.height - size[1] * lens.width) >= lens.width + lens.height:
         raise InputError(
             f"{path}: expected {lens.width} x {lens.height} pixels as its COLMAP camera has, or both scaled by one "
             f"factor, got {size[0]} x {size[1]}; use the images that COLMAP saw."

@@ -100,8 +100,9 @@ def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     """
     padded = np.pad(image, ((WARP_PAD, WARP_PAD), (WARP_PAD, WARP_PAD), (0, 0)), "edge")
     st = (sampling + WARP_PAD) / (padded.shape[1], padded.shape[0])
-    buffers = oiio.ImageBuf(padded), oiio.ImageBuf(st.astype(np.float32))
-    return _pixels(oiio.ImageBufAlgo.st_warp(*buffers, "catmull-rom", nthreads=1))[1:-1, 1:-1]
+    roi = _roi(st.shape[1], st.shape[0])  # without it the result has the size of the source
+    warped = oiio.ImageBufAlgo.st_warp(_buffer(padded), _buffer(st), "catmull-rom", roi=roi, nthreads=1)
+    return _pixels(warped)[1:-1, 1:-1]
 
 
 def load_views(photos: list[Photo], resolution: int, white_background: bool) -> list[View]:
@@ -117,8 +118,8 @@ def load_views(photos: list[Photo], resolution: int, white_background: bool) -> 
             image = undistort(image, photo.sampling())
         camera = photo.camera.resized(*target_size(photo.camera.width, photo.camera.height, resolution))
         if (camera.height, camera.width) != image.shape[:2]:
-            roi = oiio.ROI(0, camera.width, 0, camera.height, 0, 1, 0, 3)
-            image = _pixels(oiio.ImageBufAlgo.resize(oiio.ImageBuf(image), roi=roi, nthreads=1))
+            roi = _roi(camera.width, camera.height)
+            image = _pixels(oiio.ImageBufAlgo.resize(_buffer(image), roi=roi, nthreads=1))
         quantized = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)  # the filters overshoot
         return View(photo.name, camera, quantized, photo.camera)
 
@@ -138,6 +139,14 @@ def _open(path: Path) -> oiio.ImageInput:
 def _unreadable(path: Path, error: str) -> InputError:
     reason = " ".join(error.split()).rstrip(".") or "no reason given"
     return InputError(f"{path}: expected a complete image file, but it cannot be read ({reason}); replace this file.")
+
+
+def _buffer(array: np.ndarray) -> oiio.ImageBuf:
+    return oiio.ImageBuf(np.ascontiguousarray(array, np.float32))  # refuses arrays in Fortran's order
+
+
+def _roi(width: int, height: int) -> oiio.ROI:
+    return oiio.ROI(0, width, 0, height, 0, 1, 0, 3)
 
 
 def _pixels(buffer: oiio.ImageBuf) -> np.ndarray:

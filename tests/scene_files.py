@@ -1,0 +1,116 @@
+"""Small scenes in files, for the tests of the loader: COLMAP models as text, nerf-synthetic folders, images."""
+
+import json
+
+import numpy as np
+import OpenImageIO as oiio
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from warp_splat.scene import load_scene
+
+WIDTH, HEIGHT = 48, 32
+PINHOLE = f"PINHOLE {WIDTH} {HEIGHT} 40 44 22.5 17.25"
+POINTS = np.random.default_rng(1).uniform(-1, 1, (20, 3))
+COLORS = np.random.default_rng(2).integers(0, 256, (20, 3))
+
+
+def pose(index):
+    """A camera_from_world that sees the unit cube at the origin."""
+    return Rotation.from_euler("xyz", (0.1, 0.25 * index, -0.05)).as_matrix(), np.array((0.1, -0.1, 5.0 + 0.1 * index))
+
+
+def write_image(path, pixels, attributes=()):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], str(pixels.dtype))
+    if pixels.shape[2] in (2, 4):
+        spec.channelnames = "YA" if pixels.shape[2] == 2 else "RGBA"
+        spec.alpha_channel = pixels.shape[2] - 1
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    for name, value in attributes:
+        spec.attribute(name, value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels) and output.close(), output.geterror()
+
+
+def texture(width=WIDTH, height=HEIGHT, channels=3, dtype=np.uint8):
+    noise = np.random.default_rng(3).integers(0, np.iinfo(dtype).max + 1, (height, width, channels))
+    return noise.astype(dtype)
+
+
+def write_model(folder, names, camera=PINHOLE, points=POINTS, binary=False):
+    """A COLMAP model in the documented text format; pycolmap turns it into a binary one."""
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text(f"# cameras\n1 {camera}\n")
+    lines = ["# images"]
+    for index, name in enumerate(names):
+        rotation, translation = pose(index)
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+        numbers = " ".join(repr(float(value)) for value in (w, x, y, z, *translation))
+        lines += [f"{index + 1} {numbers} 1 {name}", ""]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = [
+        " ".join(map(str, (i + 1, *map(float, point), *map(int, color), 0.5)))
+        for i, (point, color) in enumerate(zip(points, COLORS, strict=False))
+    ]
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+    if binary:
+        model = pycolmap.Reconstruction(folder)
+        for index, name in enumerate(names):
+            model.image(index + 1).name = name  # pycolmap's text reader cuts it at a space
+        for path in folder.iterdir():
+            path.unlink()
+        model.write_binary(folder)
+
+
+def write_colmap(root, names=("a.png", "b.png", "c.png"), pixels=None, images="images", **model):
+    write_model(root / "sparse" / "0", names, **model)
+    for name in names:
+        write_image(root / images / name, texture() if pixels is None else pixels)
+    return root
+
+
+def look_at_origin(center):
+    """world_from_camera in OpenGL axes (x right, y up, z backward), the world's z up."""
+    backward = center / np.linalg.norm(center)
+    right = np.cross((0, 0, 1), backward)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([right, np.cross(backward, right), backward, center])
+    return matrix
+
+
+def write_blender(root, train=2, test=1, pixels=None):
+    for split, count in (("train", train), ("test", test)):
+        frames = []
+        for index in range(count):
+            write_image(root / split / f"r_{index}.png", texture() if pixels is None else pixels)
+            matrix = look_at_origin(np.array((4.0, -1.0 + index, 1.5)))
+            frames.append({"file_path": f"./{split}/r_{index}", "transform_matrix": matrix.tolist()})
+        content = {"camera_angle_x": 0.7, "frames": frames}
+        if count:
+            (root / f"transforms_{split}.json").write_text(json.dumps(content))
+    return root
+
+
+def project(camera, points):
+    x, y, z = camera.rotation @ np.asarray(points, float).T + camera.translation[:, None]
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+
+
+def load(root, **options):
+    lines = []
+    return load_scene(root, report=lines.append, **options), lines
+
+
+def change_json(root, change):
+    path = root / "transforms_train.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def scale_axes(content, factors):
+    matrix = np.array(content["frames"][0]["transform_matrix"])
+    matrix[:3, :3] *= factors
+    content["frames"][0]["transform_matrix"] = matrix.tolist()

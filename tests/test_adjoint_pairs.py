@@ -1,0 +1,71 @@
+"""Every piece `f` of the mathematics that has an `adj_f` beside it, against central differences. Pieces run in Python."""
+
+import inspect
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_splat.kernels import blend
+
+PAIRS = {name: (getattr(blend, name), getattr(blend, f"adj_{name}")) for name in dir(blend) if hasattr(blend, f"adj_{name}")}
+
+
+def test_pairs_are_found():
+    assert set(PAIRS) == {"alpha_of"}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_against_central_differences(name):
+    forward, adjoint = PAIRS[name]
+    step = 1e-3
+    for value in (0.001, 0.1, 0.5, 0.97, 1.5):  # below the cut, between, above the clamp; none at a threshold
+        slope = (forward(value + step) - forward(value - step)) / (2 * step)
+        assert adjoint(value, 2.5) == pytest.approx(2.5 * slope, abs=1e-3)
+
+
+def test_a_blended_pixel_against_float64():
+    """Forward recursion and its inverse on one pixel: colors, transmittance, and dL/dalpha from the recovered states."""
+    rng = np.random.default_rng(0)
+    alphas, colors, up = rng.uniform(0.02, 0.5, 12), rng.uniform(0, 1, 12), 0.7
+
+    def pixel(values):
+        front = np.concatenate([[1.0], np.cumprod(1 - values)])
+        return (values * front[:-1] * colors).sum(), front[-1]
+
+    t = 1.0
+    total = 0.0
+    for alpha, color in zip(alphas, colors, strict=True):
+        total += blend.weight(t, float(alpha)) * color
+        t = blend.advance(t, float(alpha))
+    assert (total, t) == pytest.approx(pixel(alphas), rel=1e-5)
+    behind = 0.0
+    for k in reversed(range(12)):
+        inverse = blend.recover(float(alphas[k]))
+        t = t * inverse
+        lit = float(colors[k] * up)
+        found = blend.adj_alpha_blend(t, inverse, behind, lit)
+        behind += float(alphas[k]) * t * lit
+        nudge = np.where(np.arange(12) == k, 1e-6, 0.0)
+        expected = up * (pixel(alphas + nudge)[0] - pixel(alphas - nudge)[0]) / 2e-6
+        assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+def test_a_pixel_stops_before_the_gaussian_that_would_darken_it():
+    t = blend.advance(2e-4, 0.6)
+    assert t == pytest.approx(-2e-4) and blend.weight(2e-4, 0.6) == 0.0
+    assert blend.advance(t, 0.5) == pytest.approx(-2e-4) and blend.weight(t, 0.5) == 0.0
+
+
+def test_exp_negative():
+    x = np.linspace(-6, 0, 2001)
+    error = [blend.exp_negative(float(value)) / np.exp(value) - 1 for value in x]
+    assert np.abs(error).max() < 2e-6
+    assert blend.exp_negative(-50.0) == blend.exp_negative(-6.0)
+
+
+def test_adjoint_stands_behind_its_forward():
+    source = Path(inspect.getfile(blend)).read_text()
+    for name in PAIRS:
+        after = source[source.index(f"def {name}(") :].split("\ndef ")[1]
+        assert after.startswith(f"adj_{name}(")

@@ -1,0 +1,183 @@
+"""Growing, pruning and Adam's moments, against what the reference prescribes (torch's own Adam where it decides)."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from warp_splat.config import TrainConfig
+from warp_splat.densify import Densifier, rotate
+from warp_splat.gaussians import GaussianModel
+from warp_splat.optimizer import Optimizer
+
+EXTENT = 10.0
+
+
+def setup(count=6, **options):
+    rng = np.random.default_rng(0)
+    config = TrainConfig(**options)
+    model = GaussianModel.from_points(rng.uniform(-1, 1, (count, 3)), rng.integers(0, 255, (count, 3)), sh_degree=1)
+    optimizer = Optimizer(model, config, EXTENT)
+    return model, optimizer, Densifier(model, optimizer, config, EXTENT)
+
+
+def observe(densifier, gradients, width=100, height=50):
+    """One view in which Gaussian i has the 2D gradient (gradients[i], 0) and is drawn where that is not None."""
+    drawn = torch.tensor([value is not None for value in gradients])
+    grad = torch.tensor([[value or 0.0, 0.0] for value in gradients])
+    out = SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=drawn.int() * 7)
+    densifier.observe(out, width, height)
+
+
+def set_rows(model, **rows):
+    with torch.no_grad():
+        for name, values in rows.items():
+            model.parameters[name][:] = torch.as_tensor(values, dtype=torch.float32).reshape(model.parameters[name].shape)
+
+
+def test_initial_scale_is_the_distance_to_three_neighbors():
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 50, 50]], dtype=np.float32)
+    model = GaussianModel.from_points(points, np.full((5, 3), 128, np.uint8), sh_degree=3)
+    _, quats, scales, opacities, sh_dc, sh_rest = model.activated()
+    assert torch.allclose(scales[0], torch.tensor(((1 + 4 + 9) / 3) ** 0.5).expand(3))
+    assert torch.allclose(opacities, torch.tensor(0.1)) and (quats == torch.tensor([1.0, 0, 0, 0])).all()
+    assert torch.allclose(0.28209479 * sh_dc + 0.5, torch.tensor(128 / 255)) and sh_rest.shape == (5, 15, 3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_scene_of_few_points_starts(count):
+    model = GaussianModel.from_points(np.eye(3, dtype=np.float32)[:count], np.zeros((count, 3), np.uint8), 0)
+    assert all(torch.isfinite(tensor).all() for tensor in model.activated())
+
+
+def test_gradients_are_averaged_over_views_in_ndc_units():
+    model, _, densifier = setup(3)
+    threshold = 0.0002 / 50  # px of an image 100 wide
+    observe(densifier, [1.9 * threshold, 0.9 * threshold, 1.1 * threshold])
+    observe(densifier, [0.0, 0.9 * threshold, None])
+    assert densifier._choose().tolist() == [2]
+
+
+def test_small_ones_are_cloned_and_large_ones_split():
+    model, optimizer, densifier = setup(4)
+    set_rows(model, scales=[[-4.0] * 3, [1.0, -2, -2], [-4.0] * 3, [1.0] * 3], opacities=[0.0] * 4)
+    means, sh = model.parameters["means"].detach().clone(), model.parameters["sh_dc"].detach().clone()
+    observe(densifier, [1.0, 1.0, 0.0, 0.0])
+    change = densifier.update(600)
+    assert (change.cloned, change.split, change.pruned) == (1, 1, 0)
+    raw = {name: tensor.detach() for name, tensor in model.parameters.items()}
+    assert len(model) == 4 + 1 + 2 - 1
+    assert torch.equal(raw["means"][:4], means[[0, 2, 3, 0]])  # survivors in order, then the clone
+    assert torch.equal(raw["sh_dc"][4:], sh[[1, 1]]) or torch.equal(raw["sh_dc"][3:], sh[[0, 1, 1]])
+    assert torch.allclose(raw["scales"][4:], torch.tensor([1.0, -2, -2]) - np.log(1.6))
+    offsets = (raw["means"][4:] - means[1]).abs()
+    assert (offsets > 0).all() and (offsets[:, 1:] < 5 * np.exp(-2)).all()
+
+
+def test_faint_ones_are_pruned_and_large_ones_only_after_a_reset():
+    model, _, densifier = setup(4)
+    set_rows(model, opacities=[-6.0, 0, 0, 0], scales=[[-3.0] * 3, [0.1] * 3, [-3.0] * 3, [-3.0] * 3])
+    assert densifier.update(600).pruned == 1 and len(model) == 3
+    assert densifier.update(3100).pruned == 1 and len(model) == 2  # exp(0.1) > 0.1 x extent
+
+
+def test_pruning_never_empties_the_scene():
+    model, _, densifier = setup(5)
+    set_rows(model, opacities=[-9.0] * 5)
+    assert densifier.update(600).pruned == 0 and len(model) == 5
+
+
+@pytest.mark.parametrize(("limit", "pruned"), [(0, 0), (6, 2), (7, 0)])
+def test_screen_size_prunes_only_on_request(limit, pruned):
+    model, _, densifier = setup(3, prune_screen_size=limit)
+    set_rows(model, opacities=[0.0] * 3, scales=[[-3.0] * 3] * 3)
+    observe(densifier, [0.0, 0.0, None])  # radius 7 where drawn
+    densifier.radius[2] = 1
+    assert densifier.update(3100).pruned == pruned and len(model) == 3 - pruned
+
+
+def test_growth_stops_at_the_limit_with_the_largest_gradients():
+    model, _, densifier = setup(6, max_gaussians=8)
+    set_rows(model, scales=[[-4.0] * 3] * 6, opacities=[0.0] * 6)
+    means = model.parameters["means"].detach().clone()
+    observe(densifier, [1.0, 5.0, 2.0, 4.0, 3.0, 0.0])
+    densifier.update(600)
+    assert len(model) == 8 and torch.equal(model.parameters["means"].detach()[6:], means[[1, 3]])
+
+
+def test_schedule():
+    model, _, densifier = setup(4)
+    assert densifier.update(500) is None and densifier.update(650) is None and densifier.update(15_000) is None
+    assert densifier.update(700) is not None
+    set_rows(model, opacities=[2.0] * 4)
+    densifier.update(3000)
+    assert torch.allclose(torch.sigmoid(model.parameters["opacities"].detach()), torch.tensor(0.01))
+    white, _, densifier = setup(4, white_background=True)
+    set_rows(white, opacities=[2.0] * 4)
+    densifier.update(500)
+    assert torch.allclose(torch.sigmoid(white.parameters["opacities"].detach()), torch.tensor(0.01))
+
+
+def step(model, optimizer, gradient, radii=None):
+    for tensor in model.parameters.values():
+        tensor.grad = torch.full_like(tensor, gradient)
+    optimizer.step(torch.ones(len(model), dtype=torch.int32) if radii is None else radii)
+
+
+def test_moments_follow_their_gaussians():
+    """A survivor moves on exactly as in a run where the set never changed; a new one starts from zero moments."""
+    model, optimizer, _ = setup(5)
+    alone, other, _ = setup(5)
+    for _ in range(3):
+        step(model, optimizer, 0.5)
+        step(alone, other, 0.5)
+    added = {name: tensor.detach()[:1].clone() for name, tensor in model.parameters.items()}
+    optimizer.replace(torch.tensor([1, 4]), added)
+    step(model, optimizer, -0.25)
+    step(alone, other, -0.25)
+    for name, tensor in model.parameters.items():
+        assert torch.equal(tensor.detach()[:2], alone.parameters[name].detach()[[1, 4]])
+        state = optimizer.adam.state[tensor]
+        assert torch.allclose(state["exp_avg"][2], torch.full_like(state["exp_avg"][2], 0.1 * -0.25))
+
+
+def test_reset_forgets_the_opacities_moments_only():
+    model, optimizer, _ = setup(4)
+    step(model, optimizer, 0.5)
+    optimizer.reset_opacities(0.01)
+    moments = {name: optimizer.adam.state[tensor]["exp_avg"] for name, tensor in model.parameters.items()}
+    assert (moments["opacities"] == 0).all() and all((m != 0).all() for name, m in moments.items() if name != "opacities")
+
+
+def test_rate_of_the_means_decays_exponentially():
+    model, optimizer, _ = setup(2, position_lr_init=1e-2, position_lr_final=1e-4, position_lr_max_steps=100)
+    for iteration, rate in ((0, 1e-2), (50, 1e-3), (100, 1e-4), (200, 1e-4)):
+        optimizer.set_iteration(iteration)
+        assert optimizer.adam.param_groups[0]["lr"] == pytest.approx(rate * EXTENT)
+
+
+def test_sparse_adam_moves_only_what_was_drawn():
+    """Against the formula in float64: no bias correction, rows out of view keep value and moments."""
+    model, optimizer, _ = setup(4, optimizer_type="sparse_adam")
+    start = {name: tensor.detach().clone() for name, tensor in model.parameters.items()}
+    for gradient, radii in ((0.5, [3, 0, 1, 0]), (-0.2, [3, 3, 0, 0])):
+        step(model, optimizer, gradient, torch.tensor(radii, dtype=torch.int32))
+    moved = model.parameters["scales"].detach() - start["scales"]
+    change = {}
+    for history in ((0.5, -0.2), (-0.2,), (0.5,)):
+        m = v = total = 0.0
+        for g in history:
+            m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+            total -= 0.005 * m / (v**0.5 + 1e-15)
+        change[history] = total
+    expected = torch.tensor([change[0.5, -0.2], change[-0.2,], change[0.5,], 0.0])
+    assert torch.allclose(moved, expected[:, None].expand(4, 3), atol=1e-6)
+
+
+def test_rotation_against_scipy():
+    rng = np.random.default_rng(1)
+    quats, vectors = rng.normal(size=(20, 4)), rng.normal(size=(20, 3))
+    expected = Rotation.from_quat(quats, scalar_first=True).apply(vectors)
+    assert np.allclose(rotate(torch.tensor(quats), torch.tensor(vectors)).numpy(), expected)

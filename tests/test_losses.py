@@ -1,0 +1,87 @@
+"""The loss against a float64 torch implementation written from the formula."""
+
+import pytest
+import torch
+
+from warp_splat import InputError, set_threads
+from warp_splat.launch import get_threads
+from warp_splat.losses import image_loss
+
+
+def oracle(x, y, share):
+    """(1 - share) L1 + share (1 - SSIM) by 2D convolution, zero padding."""
+    x, y = (image.double().permute(2, 0, 1)[:, None] for image in (x, y))
+    bell = torch.exp(-((torch.arange(11.0, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
+    window = (torch.outer(bell, bell) / bell.sum() ** 2)[None, None]
+    blur = lambda image: torch.nn.functional.conv2d(image, window, padding=5)  # noqa: E731
+    mean_x, mean_y = blur(x), blur(y)
+    var_x, var_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
+    cov = blur(x * y) - mean_x * mean_y
+    ssim = (2 * mean_x * mean_y + 1e-4) * (2 * cov + 9e-4) / ((mean_x**2 + mean_y**2 + 1e-4) * (var_x + var_y + 9e-4))
+    return (1 - share) * (x - y).abs().mean() + share * (1 - ssim.mean())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (7, 3), (11, 16), (33, 50), (100, 67)])
+def test_value_and_gradient(size, share):
+    generator = torch.Generator().manual_seed(sum(size))
+    image = torch.rand(*size, 3, generator=generator).requires_grad_()
+    target = torch.rand(*size, 3, generator=generator)
+    loss = image_loss(image, target, share)
+    loss.backward()
+    exact = image.detach().double().requires_grad_()
+    expected = oracle(exact, target, share)
+    expected.backward()
+    assert abs(loss.item() - expected.item()) < 1e-6
+    assert (image.grad - exact.grad).norm() < 1e-5 * exact.grad.norm()
+
+
+def test_bytes_are_divided_by_255():
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(20, 30, 3, generator=generator)
+    target = (255 * torch.rand(20, 30, 3, generator=generator)).to(torch.uint8)
+    assert abs(image_loss(image, target).item() - oracle(image, target / 255.0, 0.2).item()) < 1e-6
+
+
+def test_equal_images_have_no_loss_and_no_gradient():
+    image = torch.rand(24, 35, 3, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    loss = image_loss(image, image.detach())
+    loss.backward()
+    assert abs(loss.item()) < 1e-6
+    assert image.grad.abs().max() < 1e-6 / 24
+
+
+def test_smooth_images_match_as_well():
+    """Nearly constant windows: variances are differences of nearly equal numbers."""
+    ramp = torch.linspace(0.4, 0.6, 64)[None, :, None].expand(40, 64, 3)
+    image = (ramp + 0.01).clone().requires_grad_()
+    loss = image_loss(image, ramp.contiguous())
+    loss.backward()
+    exact = image.detach().double().requires_grad_()
+    expected = oracle(exact, ramp, 0.2)
+    expected.backward()
+    assert abs(loss.item() - expected.item()) < 1e-5
+    assert (image.grad - exact.grad).norm() < 1e-3 * exact.grad.norm()
+
+
+def test_the_number_of_threads_changes_no_bit():
+    image = torch.rand(50, 70, 3, generator=torch.Generator().manual_seed(2))
+    target = torch.rand(50, 70, 3, generator=torch.Generator().manual_seed(3))
+    threads, results = get_threads(), []
+    try:
+        for count in (1, 2, 3):
+            set_threads(count)
+            leaf = image.clone().requires_grad_()
+            loss = image_loss(leaf, target)
+            loss.backward()
+            results.append((loss.item(), leaf.grad))
+    finally:
+        set_threads(threads)
+    for loss, grad in results[1:]:
+        assert loss == results[0][0] and torch.equal(grad, results[0][1])
+
+
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 4), (21, 30, 3)])
+def test_other_shapes_are_refused(shape):
+    with pytest.raises(InputError, match=r"\[H, W, 3\]"):
+        image_loss(torch.zeros(20, 30, 3), torch.zeros(shape))

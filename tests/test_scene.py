@@ -1,0 +1,341 @@
+"""Scene loading against files written by hand, analytic patterns and formulas that share nothing with the loader."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scene_files import (
+    COLORS,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    change_json,
+    load,
+    pose,
+    project,
+    scale_axes,
+    texture,
+    write_blender,
+    write_colmap,
+    write_image,
+    write_model,
+)
+
+from warp_splat.scene.images import target_size
+
+ROOT = Path(__file__).resolve().parent.parent
+FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
+FOX_TEST = ["0001.jpg", "0012.jpg", "0027.jpg", "0042.jpg", "0073.jpg", "0089.jpg", "0110.jpg"]
+
+
+# COLMAP ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_colmap_cameras_points_and_pixels(tmp_path, binary):
+    scene, lines = load(write_colmap(tmp_path, ["c.png", "a.png", "b.png"], binary=binary))
+    assert [view.name for view in scene.train] == ["a.png", "b.png", "c.png"]
+    assert not scene.test
+    assert not lines
+    for view, index in zip(scene.train, (1, 2, 0), strict=True):
+        camera = view.camera
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 44, 22.5, 17.25)
+        rotation, translation = pose(index)
+        np.testing.assert_allclose(camera.rotation, rotation, atol=1e-12)
+        np.testing.assert_allclose(camera.translation, translation, atol=1e-12)
+        np.testing.assert_array_equal(view.image, texture())
+        assert view.original.fx == camera.fx
+    np.testing.assert_array_equal(scene.points, POINTS.astype(np.float32))
+    np.testing.assert_array_equal(scene.colors, COLORS)
+    assert (scene.points.dtype, scene.colors.dtype) == (np.float32, np.uint8)
+
+
+def test_simple_pinhole_and_model_directly_in_sparse(tmp_path):
+    write_model(tmp_path / "sparse", ["a.png"], camera=f"SIMPLE_PINHOLE {WIDTH} {HEIGHT} 41 20 15")
+    write_image(tmp_path / "images" / "a.png", texture())
+    camera = load(tmp_path)[0].train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41, 41, 20, 15)
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_names_with_spaces_and_folders(tmp_path, binary):
+    names = ["left side/my photo 1.png", "right/x.png"]
+    scene, _ = load(write_colmap(tmp_path, names, binary=binary))
+    assert [view.name for view in scene.train] == names
+
+
+def test_largest_of_several_models(tmp_path):
+    names = [f"{index}.png" for index in range(4)]
+    write_colmap(tmp_path, names)
+    write_model(tmp_path / "sparse" / "small", names[:3], binary=True)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "zz")
+    scene, lines = load(tmp_path)
+    assert len(scene.train) == 4
+    assert len(lines) == 1 and "taking sparse/zz" in lines[0]
+
+
+def test_points_that_are_not_finite_are_dropped(tmp_path):
+    root = write_colmap(tmp_path, binary=True)
+    path = root / "sparse" / "0" / "points3D.bin"
+    data = bytearray(path.read_bytes())
+    data[16:24] = np.float64(np.nan).tobytes()  # x of the first point: after the count and its id
+    path.write_bytes(data)
+    scene, lines = load(root)
+    assert len(scene.points) == len(scene.colors) == len(POINTS) - 1
+    assert np.isfinite(scene.points).all()
+    assert "1 of 20 points" in lines[0]
+
+
+def test_smaller_images_scale_the_cameras(tmp_path):
+    root = write_colmap(tmp_path, images="images_2", pixels=texture(WIDTH // 2, HEIGHT // 2))
+    scene, lines = load(root, images="images_2")
+    camera = scene.train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 22, 11.25, 8.625)
+    assert len(lines) == 1 and "images_2" in lines[0]
+
+
+@pytest.mark.parametrize("count", [2, 8, 9, 17])
+def test_eval_holds_out_every_eighth(tmp_path, count):
+    names = [f"{index:02}.png" for index in range(count)]
+    scene, _ = load(write_colmap(tmp_path, names[::-1]), eval=True)
+    assert [view.name for view in scene.test] == names[::8]
+    assert [view.name for view in scene.train] == [name for name in names if name not in names[::8]]
+
+
+# undistortion ------------------------------------------------------------------------------------
+
+
+def radial(x, y, k1, k2=0.0, p1=0.0, p2=0.0):
+    """COLMAP's (and OpenCV's) radial and tangential distortion of normalized coordinates."""
+    r2 = x * x + y * y
+    factor = 1 + k1 * r2 + k2 * r2 * r2
+    dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    dy = 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    return x * factor + dx, y * factor + dy
+
+
+def fisheye(x, y, k1, k2, k3, k4):
+    """OpenCV's equidistant fisheye model."""
+    r = np.hypot(x, y)
+    t = np.arctan(r)
+    bent = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8)
+    return x * bent / r, y * bent / r
+
+
+def pattern(x, y):
+    """A smooth picture on the plane at depth 1, 0..1."""
+    return np.stack([0.5 + 0.4 * np.sin(9 * x), 0.5 + 0.4 * np.cos(8 * y), 0.5 + 0.4 * np.sin(6 * (x + y))], axis=-1)
+
+
+def distorted_picture(distort, params, width, height, fx, fy, cx, cy):
+    v, u = np.mgrid[:height, :width] + 0.5
+    goal = (u - cx) / fx, (v - cy) / fy
+    x, y = goal
+    for _ in range(200):  # the fixed point of x = x + goal - distort(x)
+        bent = distort(x, y, *params)
+        x, y = x + goal[0] - bent[0], y + goal[1] - bent[1]
+    np.testing.assert_allclose(distort(x, y, *params), goal, atol=1e-9)
+    return np.rint(pattern(x, y) * 65535).astype(np.uint16)
+
+
+@pytest.mark.parametrize("scale", [1, 2], ids=["same-size", "half-size"])
+@pytest.mark.parametrize(
+    ("model", "distort", "focal", "params"),
+    [
+        ("SIMPLE_RADIAL", radial, (150, 150), (-0.12,)),
+        ("RADIAL", radial, (150, 150), (0.1, -0.03)),
+        ("OPENCV", radial, (150, 156), (-0.15, 0.04, 0.002, -0.003)),
+        ("OPENCV_FISHEYE", fisheye, (110, 112), (0.02, -0.01, 0.003, 0.0)),
+    ],
+)
+def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, focal, params, scale):
+    width, height, cx, cy = 160, 120, 83.2, 58.6
+    focals = focal[:1] if "RADIAL" in model else focal
+    numbers = (width, height, *focals, cx, cy, *params)
+    k = np.array((*focal, cx, cy)) / scale
+    pixels = distorted_picture(distort, params, width // scale, height // scale, *k)
+    root = write_colmap(tmp_path, ["a.png"], pixels, camera=" ".join(map(str, (model, *numbers))))
+    scene, lines = load(root)
+    view = scene.train[0]
+    camera = view.camera
+    assert view.image.shape == (camera.height, camera.width, 3)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    ideal = pattern((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy) * 255
+    error = np.abs(view.image - ideal)
+    assert error[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
+    assert error.max() < 3  # the outermost pixels may lie half a pixel outside of the file
+    assert any(model in line for line in lines)
+
+
+def test_zero_distortion_changes_nothing(tmp_path):
+    root = write_colmap(tmp_path, camera=f"OPENCV {WIDTH} {HEIGHT} 40 44 22.5 17.25 0 0 0 0")
+    scene, lines = load(root)
+    np.testing.assert_array_equal(scene.train[0].image, texture())
+    assert not lines
+
+
+# images ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sixteen_bits_and_gray(tmp_path, suffix, channels):
+    pixels = texture(channels=channels, dtype=np.uint16)
+    image = load(write_colmap(tmp_path, [f"a.{suffix}"], pixels))[0].train[0].image
+    assert (image.dtype, image.shape) == (np.uint8, (HEIGHT, WIDTH, 3))
+    np.testing.assert_array_equal(image, np.broadcast_to(np.rint(pixels / 257.0), image.shape))
+
+
+def test_sixteen_bits_survive_until_after_the_resize(tmp_path):
+    pixels = np.full((HEIGHT, WIDTH, 3), 100 * 257 + 120, np.uint16)  # 100.47 of 255, dithered by its neighbors
+    pixels[:, ::2] += 20  # mean 100.506: rounds up only if no column was rounded before
+    image = load(write_colmap(tmp_path, ["a.png"], pixels), resolution=2)[0].train[0].image
+    assert (image[:, 2:-2] == 101).all()
+
+
+def test_jpeg(tmp_path):
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    pixels = np.stack([x * 4, y * 6, 60 + x + y], axis=-1).astype(np.uint8)
+    write_model(tmp_path / "sparse" / "0", ["a.jpg"])
+    write_image(tmp_path / "images" / "a.jpg", pixels, [("Compression", "jpeg:98"), ("Orientation", 6)])
+    image = load(tmp_path)[0].train[0].image
+    assert image.shape == pixels.shape  # as stored: not rotated by the orientation tag
+    assert np.abs(image.astype(int) - pixels).mean() < 3
+
+
+@pytest.mark.parametrize("white", [False, True], ids=["black", "white"])
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("channels", [2, 4])
+def test_alpha_is_composited_on_the_background(tmp_path, white, suffix, channels):
+    pixels = texture(channels=channels)
+    pixels[0, :, -1], pixels[1, :, -1] = 0, 255
+    root = write_colmap(tmp_path, [f"a.{suffix}"], pixels)
+    image = load(root, white_background=white)[0].train[0].image
+    alpha = pixels[..., -1:] / 255.0
+    expected = pixels[..., :-1] * alpha + 255.0 * white * (1 - alpha)
+    assert np.abs(image - expected).max() <= 0.5 + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("size", "resolution", "expected"),
+    [
+        ((540, 960), -1, (540, 960)),
+        ((1600, 7), -1, (1600, 7)),
+        ((3200, 1801), -1, (1600, 900)),
+        ((541, 959), 1, (541, 959)),
+        ((541, 959), 2, (270, 480)),  # Python rounds halves to even, and so does the reference
+        ((541, 959), 4, (135, 240)),
+        ((541, 959), 8, (68, 120)),
+        ((540, 960), 270, (270, 480)),
+        ((1000, 333), 500, (500, 166)),
+        ((4, 3), 8, (1, 1)),
+    ],
+)
+def test_resolution_rules(size, resolution, expected):
+    assert target_size(*size, resolution) == expected
+
+
+def test_resize_keeps_smooth_pictures_and_scales_k(tmp_path):
+    def wave(width, height):
+        y, x = (np.mgrid[:height, :width] + 0.5) / (height, width)[0]
+        return np.stack([127 + 100 * np.sin(4 * x), 127 + 100 * np.cos(3 * y), 127 + 60 * np.sin(5 * x * y)], axis=-1)
+
+    root = write_colmap(tmp_path, ["a.png"], np.rint(wave(WIDTH, HEIGHT)).astype(np.uint8))
+    view = load(root, resolution=2)[0].train[0]
+    assert np.abs(view.image - wave(WIDTH // 2, HEIGHT // 2))[2:-2, 2:-2].max() < 2
+    assert (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy) == (20, 22, 11.25, 8.625)
+    assert (view.original.width, view.original.fx) == (WIDTH, 40)
+
+
+def test_resize_does_not_wrap_around_at_sharp_edges(tmp_path):
+    pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    pixels[:, WIDTH // 2 - 1 :] = 255
+    image = load(write_colmap(tmp_path, ["a.png"], pixels), resolution=2)[0].train[0].image
+    assert image[:, : WIDTH // 4 - 2].max() < 40  # an overshoot below 0 would become 2xx
+    assert image[:, WIDTH // 4 + 2 :].min() > 215
+
+
+# Blender -----------------------------------------------------------------------------------------
+
+
+def test_blender_axes_and_intrinsics(tmp_path):
+    camera = load(write_blender(tmp_path, train=1, test=0))[0].train[0].camera
+    focal = 0.5 * WIDTH / np.tan(0.35)
+    np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (focal, focal, WIDTH / 2, HEIGHT / 2))
+    center = np.array((4.0, -1.0, 1.5))
+    np.testing.assert_allclose(camera.center, center)
+    np.testing.assert_allclose(project(camera, [(0, 0, 0)]), [(WIDTH / 2, HEIGHT / 2)], atol=1e-9)
+    (above,) = project(camera, [(0, 0, 0.5)])  # the world's z is up, so in the image it has a smaller y
+    np.testing.assert_allclose(above[0], WIDTH / 2, atol=1e-9)
+    assert above[1] < HEIGHT / 2 - 2
+    right = np.cross(-center, (0, 0, 1))
+    (beside,) = project(camera, [0.5 * right / np.linalg.norm(right)])
+    np.testing.assert_allclose(beside, (WIDTH / 2 + 0.5 * focal / np.linalg.norm(center), HEIGHT / 2), atol=1e-9)
+
+
+def test_blender_splits(tmp_path):
+    root = write_blender(tmp_path, train=3, test=2)
+    scene, _ = load(root)
+    assert [view.name for view in scene.train] == [f"train/r_{i}.png" for i in range(3)] + [
+        f"test/r_{i}.png" for i in range(2)
+    ]
+    assert not scene.test
+    scene, _ = load(root, eval=True)
+    assert [view.name for view in scene.test] == ["test/r_0.png", "test/r_1.png"]
+    assert len(scene.train) == 3
+
+
+def test_blender_without_test_file(tmp_path):
+    root = write_blender(tmp_path, train=9, test=0)
+    assert len(load(root)[0].train) == 9
+    scene, lines = load(root, eval=True)
+    assert [view.name for view in scene.test] == ["train/r_0.png", "train/r_8.png"]
+    assert len(lines) == 1
+
+
+def test_blender_points_and_background(tmp_path):
+    pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    root = write_blender(tmp_path, pixels=pixels)
+    scene, _ = load(root, white_background=True)
+    assert (scene.train[0].image == 255).all()
+    assert scene.points.shape == scene.colors.shape == (100_000, 3)
+    assert np.abs(scene.points).max() <= 1.3
+    np.testing.assert_allclose(scene.points.mean(0), 0, atol=0.02)
+    assert np.abs(scene.colors.astype(int) - 127).max() <= 1
+    np.testing.assert_array_equal(scene.points, load(root)[0].points)
+
+
+def test_blender_pose_with_uniform_scale(tmp_path):
+    root = write_blender(tmp_path, train=1, test=0)
+    expected = load(root)[0].train[0].camera
+    change_json(root, lambda content: scale_axes(content, (1.7, 1.7, 1.7)))
+    camera = load(root)[0].train[0].camera
+    np.testing.assert_allclose(camera.rotation, expected.rotation, atol=1e-9)
+    np.testing.assert_allclose(camera.center, expected.center, atol=1e-9)
+
+
+# fox ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not (FOX / "sparse").is_dir(), reason="the fox scene is not here; WARP_SPLAT_FOX names its folder")
+def test_fox():
+    scene, _ = load(FOX, eval=True, resolution=4)
+    assert [view.name for view in scene.test] == FOX_TEST
+    assert len(scene.train) == 43
+    assert scene.train[0].image.shape == (240, 135, 3)
+    observations = pycolmap.Reconstruction(FOX / "sparse" / "0")
+    for view in scene.train + scene.test:
+        seen = [p for p in observations.find_image_with_name(view.name).points2D if p.has_point3D()]
+        points = np.array([observations.point3D(p.point3D_id).xyz for p in seen])
+        error = np.linalg.norm(project(view.original, points) - [p.xy for p in seen], axis=1)
+        assert error.mean() < 1
+
+
+def test_import_stays_light():
+    code = "import sys, warp_splat.scene; sys.exit(any(name in sys.modules for name in ('pycolmap', 'OpenImageIO')))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

@@ -1,0 +1,214 @@
+"""Whole runs from the command line, on the embedded scene made small: what they write, repeat, and survive."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_splat.cli import main
+from warp_splat.formats.model_folder import ply_path, read_cfg_args
+from warp_splat.formats.ply import load_ply
+from warp_splat.formats.png import load_png
+from warp_splat.metrics import psnr
+
+ROOT = Path(__file__).parents[1]
+SCENE = ROOT / "assets" / "still_life"
+FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
+#: Densifies, prunes, resets opacities and raises the SH degree within 60 steps.
+SHORT = (
+    "--eval -r 4 --iterations 60 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 55 "
+    "--opacity_reset_interval 30 --sh_interval 15 --densify_grad_threshold 0.00005 --quiet"
+).split()
+
+
+def train(folder, *options):
+    return main(["train", "-s", str(SCENE), "-m", str(folder), *SHORT, *options])
+
+
+def fails(capsys, *arguments):
+    """The one sentence of a failing command."""
+    assert main(list(arguments)) == 1
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("warp-splat: error: ") and "Traceback" not in message
+    return message
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    assert train(folder, "--test_iterations", "30", "--save_iterations", "40", "--profile", "20") == 0
+    return folder
+
+
+def test_output_folder(trained):
+    for name in ("cfg_args", "cameras.json", "input.ply", "results.json", "per_view.json", "contact_sheet.png"):
+        assert (trained / name).is_file()
+    for name in ("training.png", "profile.png", "preview.png"):
+        assert load_png(trained / name).std() > 1
+    assert ply_path(trained, 40).is_file() and ply_path(trained, 60).is_file()
+    assert len(load_ply(ply_path(trained, 60)).means) > 4500
+    entry = json.loads((trained / "results.json").read_text())["ours_60"]
+    assert entry["iterations"] == 60 and entry["split"] == "test" and entry["seconds"] > 0
+    assert entry["dropped"] == {"pixels": 0, "gradients": 0, "gaussians": 0}
+    assert read_cfg_args(trained)["sh_degree"] == 3
+
+
+def test_metrics_are_those_of_the_saved_images(trained):
+    folder = trained / "test" / "ours_60"
+    names = sorted(path.name for path in (folder / "renders").iterdir())
+    assert names == [f"{index:05d}.png" for index in range(7)]
+    values = [psnr(load_png(folder / "renders" / name), load_png(folder / "gt" / name)) for name in names]
+    results = json.loads((trained / "results.json").read_text())["ours_60"]
+    assert results["PSNR"] == pytest.approx(np.mean(values)) and results["PSNR"] > 12
+
+
+def test_render_repeats_the_pictures_of_training(trained, capsys):
+    before = {path.name: path.read_bytes() for path in (trained / "test" / "ours_60" / "renders").iterdir()}
+    assert main(["render", "-m", str(trained), "--quiet"]) == 0
+    after = {path.name: path.read_bytes() for path in (trained / "test" / "ours_60" / "renders").iterdir()}
+    assert after == before
+    assert len(list((trained / "train" / "ours_60" / "gt").iterdir())) == 43
+    assert main(["render", "-m", str(trained), "--iteration", "40", "--skip_train", "--quiet"]) == 0
+    assert set(json.loads((trained / "results.json").read_text())) == {"ours_40", "ours_60"}
+
+
+def test_orbit(trained, tmp_path, capsys):
+    options = ["--orbit", "--orbit_center", "focus", "--orbit_output", str(tmp_path / "orbit"), "--quiet"]
+    assert main(["render", "-m", str(trained), *options]) == 0
+    assert "frames per second" in capsys.readouterr().out
+    frames = sorted((tmp_path / "orbit").iterdir())
+    first, half = load_png(frames[0]), load_png(frames[50])
+    assert len(frames) == 100 and first.shape == (545, 980, 3) and first.std() > 5 and (first != half).mean() > 0.3
+
+
+def test_one_seed_one_result_for_any_number_of_threads(trained, tmp_path):
+    """Byte-identical PLY files: a second run, and one with another number of threads, in fresh processes."""
+    expected = ply_path(trained, 60).read_bytes()
+    for threads in ("1", "2"):
+        command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-m", tmp_path / threads, *SHORT, "--threads", threads]
+        subprocess.run(command, check=True, capture_output=True)
+        assert ply_path(tmp_path / threads, 60).read_bytes() == expected
+
+
+def test_another_seed_is_another_result(trained, tmp_path):
+    assert train(tmp_path, "--seed", "1") == 0
+    assert ply_path(tmp_path, 60).read_bytes() != ply_path(trained, 60).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--optimizer_type", "sparse_adam"),
+        ("--random_background",),
+        ("--white_background", "--sh_degree", "0"),
+        ("--antialiasing", "--sh_degree", "1"),
+        ("--max_gaussians", "5000"),
+        ("--prune_screen_size", "20"),
+        ("--no-eval", "--lambda_dssim", "0"),
+    ],
+    ids=" ".join,
+)
+def test_options(options, tmp_path):
+    assert train(tmp_path, *options) == 0
+    results = json.loads((tmp_path / "results.json").read_text())["ours_60"]
+    assert results["PSNR"] > 11 and (options[0] != "--max_gaussians" or results["gaussians"] <= 5000)
+
+
+def test_ctrl_c_saves_the_model(tmp_path):
+    command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-r", "4", "-m", tmp_path, "--iterations", "100000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "input.ply").exists() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    for line in process.stderr or ():
+        if "Kernels ready" in line or "it/s" in line or "?it" in line:
+            break
+    time.sleep(3)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    assert "Interrupted; saved" in out and "Traceback" not in err
+    (saved,) = (tmp_path / "point_cloud").glob("*/point_cloud.ply")
+    assert str(saved) in out and len(load_ply(saved).means) >= 4500
+
+
+def test_help_answers_without_torch_or_warp():
+    code = (
+        "import sys; from warp_splat.cli import main\n"
+        "try: main(['train', '--help'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "assert not {'torch', 'warp', 'numpy'} & set(sys.modules)"
+    )
+    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    assert "--densify_grad_threshold" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--iterations", "0"), ("--iterations", "at least 1", "0")),
+        (("--device", "cuda"), ("--device cuda", "CPU")),
+        (("--start_checkpoint", "x.pth"), ("--start_checkpoint", "not")),
+        (("--iteratons", "5"), ("--iteratons", "--iterations")),
+        (("--lambda_dssim", "2"), ("--lambda_dssim", "0 to 1")),
+        (("--feature_lr", "nan"), ("--feature_lr", "nan")),
+        (("--threads", "-1"), ("--threads", "-1")),
+        (("-s", "/no/such/scene"), ("/no/such/scene",)),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_bad_options(options, words, tmp_path, capsys):
+    message = fails(capsys, "train", "-s", str(SCENE), "-m", str(tmp_path / "model"), *options)
+    assert all(word in message for word in words)
+    assert not (tmp_path / "model").exists()
+
+
+def test_output_folder_that_cannot_be_written(tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    message = fails(capsys, "train", "-s", str(SCENE), "-m", str(tmp_path / "file" / "model"))
+    assert str(tmp_path / "file") in message
+
+
+def test_render_without_a_model(tmp_path, capsys):
+    assert "-m" in fails(capsys, "render")
+    assert str(tmp_path) in fails(capsys, "render", "-m", str(tmp_path))
+
+
+def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, capsys):
+    """The save fails; the model goes to the folder for temporary files instead."""
+    from warp_splat import gaussians  # noqa: PLC0415
+    from warp_splat.errors import InputError  # noqa: PLC0415
+
+    save = gaussians.save_ply
+
+    def full(path, *arrays, **options):
+        if "point_cloud" in str(path):
+            raise InputError(f"{path}: could not be written (no space left on device).")
+        save(path, *arrays, **options)
+
+    monkeypatch.setattr(gaussians, "save_ply", full)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert train(tmp_path / "model", "--iterations", "5") == 0
+    (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
+    assert str(saved) in capsys.readouterr().err and len(load_ply(saved).means) == 4500
+
+
+@pytest.mark.slow
+def test_the_embedded_scene_reaches_its_quality(tmp_path):
+    assert main(["train", "-m", str(tmp_path), "--quiet"]) == 0
+    assert json.loads((tmp_path / "results.json").read_text())["ours_3000"]["PSNR"] > 25
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FOX.is_dir(), reason="the photographs of data/fox may not be shipped; set WARP_SPLAT_FOX")
+def test_real_photographs(tmp_path):
+    """The best CPU trainer known reaches 23.3 dB after 500 steps of this scene at half size."""
+    options = ["-s", str(FOX), "-m", str(tmp_path), "--eval", "-r", "2", "--iterations", "500", "--quiet"]
+    assert main(["train", *options]) == 0
+    assert json.loads((tmp_path / "results.json").read_text())["ours_500"]["PSNR"] > 23.3
