@@ -18,7 +18,6 @@ from scenes import BlendScene, blend_scene
 from warp_splat import launch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels import tiles
 from warp_splat.kernels.blend import Splat2D
 from warp_splat.rasterize import Bins, Blend, Dropped, balanced_slices
 
@@ -55,8 +54,16 @@ class Scalar:
         shape = (scene.height, scene.width)
         to = lambda array, dtype: wp.array(array, dtype=dtype, device="cpu")  # noqa: E731
         self.shape = shape
-        self.inputs = [scene.tiles_x, to(scene.ranges, wp.vec2i), to(scene.instances, wp.vec2i), to(scene.splats, Splat2D)]
-        self.image, self.final = wp.zeros(shape, dtype=wp.vec3, device="cpu"), wp.zeros(shape, dtype=float, device="cpu")
+        self.inputs = [
+            scene.tiles_x,
+            to(scene.ranges, wp.vec2i),
+            to(scene.instances, wp.vec2i),
+            to(scene.splats, Splat2D),
+        ]
+        self.image, self.final = (
+            wp.zeros(shape, dtype=wp.vec3, device="cpu"),
+            wp.zeros(shape, dtype=float, device="cpu"),
+        )
         self.last = wp.zeros(shape, dtype=int, device="cpu")
         self.upstream = to(upstream.numpy(), wp.vec3)
         self.grads = wp.zeros(len(scene.splats), dtype=vec9, device="cpu")

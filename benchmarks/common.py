@@ -36,7 +36,9 @@ def machine() -> str:
     return f"{processor}, {os.cpu_count()} cores, {platform.system()}, {datetime.date.today()}"
 
 
-def write_table(name: str, out: Path | None, headers: Sequence, rows: Sequence[Sequence], note: str, data: dict) -> None:
+def write_table(
+    name: str, out: Path | None, headers: Sequence, rows: Sequence[Sequence], note: str, data: dict
+) -> None:
     """Print a table, and write it to ``<out>/<name>.md`` and ``.json`` if a folder is given."""
     table = format_table(headers, rows)
     print(f"\n{table}\n\n{note}\n{machine()}")

@@ -33,7 +33,7 @@ def blend(
 ):
     y, x = wp.tid()
     span = ranges[(y // TILE) * tiles_x + x // TILE]
-    t = float(1.0)
+    t = 1.0
     c = wp.vec3(0.0)
     last = span[0]
     for k in range(span[0], span[1]):
@@ -70,7 +70,7 @@ def adj_blend(
     first = ranges[(y // TILE) * tiles_x + x // TILE][0]
     up = adj_image[y, x]
     t = final[y, x]
-    behind = float(0.0)
+    behind = 0.0
     for back in range(last[y, x] - first):
         i = instances[last[y, x] - 1 - back][0]
         splat = splats[i]

@@ -54,4 +54,6 @@ def _bin(splats: np.ndarray, radius: np.ndarray, width: int, height: int) -> Ble
     ends = np.searchsorted(tile[slot], np.arange(tiles.prod()), "right")
     ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], 1)
     instances = np.stack([splat[slot], slot], 1)
-    return BlendScene(width, height, int(tiles[0]), splats, ranges.astype(np.int32), instances.astype(np.int32), np.cumsum(counts))
+    return BlendScene(
+        width, height, int(tiles[0]), splats, ranges.astype(np.int32), instances.astype(np.int32), np.cumsum(counts)
+    )

@@ -123,7 +123,7 @@ def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antiali
     opacity = opacities
     if antialiasing:
         ratio = torch.linalg.det(sharp) / torch.linalg.det(cov2d)
-        opacity = opacities * ratio.clamp_min(1e-30).sqrt()
+        opacity = opacities * ratio.clamp_min(2.5e-5).sqrt()  # the floor is the reference's
 
     centre = torch.as_tensor(camera.center, dtype=torch.float64)
     degree = int(sh.shape[1] ** 0.5) - 1

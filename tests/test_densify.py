@@ -34,7 +34,9 @@ def observe(densifier, gradients, width=100, height=50):
 def set_rows(model, **rows):
     with torch.no_grad():
         for name, values in rows.items():
-            model.parameters[name][:] = torch.as_tensor(values, dtype=torch.float32).reshape(model.parameters[name].shape)
+            model.parameters[name][:] = torch.as_tensor(values, dtype=torch.float32).reshape(
+                model.parameters[name].shape
+            )
 
 
 def test_initial_scale_is_the_distance_to_three_neighbors():
@@ -53,7 +55,7 @@ def test_a_scene_of_few_points_starts(count):
 
 
 def test_gradients_are_averaged_over_views_in_ndc_units():
-    model, _, densifier = setup(3)
+    _, _, densifier = setup(3)
     threshold = 0.0002 / 50  # px of an image 100 wide
     observe(densifier, [1.9 * threshold, 0.9 * threshold, 1.1 * threshold])
     observe(densifier, [0.0, 0.9 * threshold, None])
@@ -61,7 +63,7 @@ def test_gradients_are_averaged_over_views_in_ndc_units():
 
 
 def test_small_ones_are_cloned_and_large_ones_split():
-    model, optimizer, densifier = setup(4)
+    model, _, densifier = setup(4)
     set_rows(model, scales=[[-4.0] * 3, [1.0, -2, -2], [-4.0] * 3, [1.0] * 3], opacities=[0.0] * 4)
     means, sh = model.parameters["means"].detach().clone(), model.parameters["sh_dc"].detach().clone()
     observe(densifier, [1.0, 1.0, 0.0, 0.0])
@@ -148,11 +150,13 @@ def test_reset_forgets_the_opacities_moments_only():
     step(model, optimizer, 0.5)
     optimizer.reset_opacities(0.01)
     moments = {name: optimizer.adam.state[tensor]["exp_avg"] for name, tensor in model.parameters.items()}
-    assert (moments["opacities"] == 0).all() and all((m != 0).all() for name, m in moments.items() if name != "opacities")
+    assert (moments["opacities"] == 0).all() and all(
+        (m != 0).all() for name, m in moments.items() if name != "opacities"
+    )
 
 
 def test_rate_of_the_means_decays_exponentially():
-    model, optimizer, _ = setup(2, position_lr_init=1e-2, position_lr_final=1e-4, position_lr_max_steps=100)
+    _, optimizer, _ = setup(2, position_lr_init=1e-2, position_lr_final=1e-4, position_lr_max_steps=100)
     for iteration, rate in ((0, 1e-2), (50, 1e-3), (100, 1e-4), (200, 1e-4)):
         optimizer.set_iteration(iteration)
         assert optimizer.adam.param_groups[0]["lr"] == pytest.approx(rate * EXTENT)

@@ -10,7 +10,7 @@ LAYERS = [
     {"errors", "config"},
     {"kernels"},
     {"camera", "launch", "formats", "scene.types"},
-    {"checks", "rasterize", "losses", "metrics", "scene"},
+    {"checks", "binning", "rasterize", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
     {"trainer", "report", "evaluate"},
     {"train", "render"},
@@ -30,7 +30,9 @@ def layer_of(module: str) -> int:
 def imported(path: Path):
     """(module of this package, whole dotted name) of each import that runs."""
     tree = ast.parse(path.read_text())
-    typing_only = [node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)]
+    typing_only = [
+        node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+    ]
     skipped = {id(inner) for node in typing_only for inner in ast.walk(node)}
     for node in ast.walk(tree):
         if id(node) in skipped or not isinstance(node, ast.ImportFrom | ast.Import):
@@ -50,7 +52,9 @@ def test_imports_point_downwards(path):
     for name in imported(path):
         parts = name.split(".")
         if parts[0] != "warp_splat" or len(parts) == 1:
-            assert not (level == 0 and parts[0] in ("torch", "warp", "numpy")), f"{path} must import the standard library only"
+            assert not (level == 0 and parts[0] in ("torch", "warp", "numpy")), (
+                f"{path} must import the standard library only"
+            )
             assert not (parts[0] == "torch" and "kernels" in path.parts), f"{path}: kernels never see torch"
             continue
         module = "scene.types" if parts[1:3] == ["scene", "types"] else parts[1]

@@ -25,7 +25,7 @@ from scene_files import (
     write_model,
 )
 
-from warp_splat.scene.images import target_size
+from warp_splat.scene.images import read_rgb, target_size
 
 ROOT = Path(__file__).resolve().parent.parent
 FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
@@ -219,6 +219,8 @@ def test_alpha_is_composited_on_the_background(tmp_path, white, suffix, channels
     alpha = pixels[..., -1:] / 255.0
     expected = pixels[..., :-1] * alpha + 255.0 * white * (1 - alpha)
     assert np.abs(image - expected).max() <= 0.5 + 1e-3
+    unrounded = read_rgb(root / "images" / f"a.{suffix}", float(white)) * 255
+    np.testing.assert_allclose(unrounded, np.broadcast_to(expected, image.shape), atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -256,8 +258,9 @@ def test_resize_does_not_wrap_around_at_sharp_edges(tmp_path):
     pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     pixels[:, WIDTH // 2 - 1 :] = 255
     image = load(write_colmap(tmp_path, ["a.png"], pixels), resolution=2)[0].train[0].image
-    assert image[:, : WIDTH // 4 - 2].max() < 40  # an overshoot below 0 would become 2xx
-    assert image[:, WIDTH // 4 + 2 :].min() > 215
+    edge = WIDTH // 4 - 1  # this column averages both sides
+    assert image[:, :edge].max() < 40  # an overshoot below 0 would become 2xx
+    assert image[:, edge + 1 :].min() > 215
 
 
 # Blender -----------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """Bad scenes: every mistake of a user gets one sentence that names the file."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scene_files import (

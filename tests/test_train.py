@@ -39,6 +39,12 @@ def fails(capsys, *arguments):
     return message
 
 
+def learns(folder):
+    """Whether PSNR rose before the opacities were reset, and again after."""
+    quality = {record["iteration"]: record["psnr"] for record in json.loads((folder / "history.json").read_text())}
+    return quality[9] > quality[3] + 0.2 and quality[60] > quality[33] + 0.5
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
@@ -65,7 +71,11 @@ def test_metrics_are_those_of_the_saved_images(trained):
     assert names == [f"{index:05d}.png" for index in range(7)]
     values = [psnr(load_png(folder / "renders" / name), load_png(folder / "gt" / name)) for name in names]
     results = json.loads((trained / "results.json").read_text())["ours_60"]
-    assert results["PSNR"] == pytest.approx(np.mean(values)) and results["PSNR"] > 12
+    assert results["PSNR"] == pytest.approx(np.mean(values))
+
+
+def test_training_learns(trained):
+    assert learns(trained)
 
 
 def test_render_repeats_the_pictures_of_training(trained, capsys):
@@ -91,7 +101,17 @@ def test_one_seed_one_result_for_any_number_of_threads(trained, tmp_path):
     """Byte-identical PLY files: a second run, and one with another number of threads, in fresh processes."""
     expected = ply_path(trained, 60).read_bytes()
     for threads in ("1", "2"):
-        command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-m", tmp_path / threads, *SHORT, "--threads", threads]
+        command = [
+            sys.executable,
+            ROOT / "train.py",
+            "-s",
+            SCENE,
+            "-m",
+            tmp_path / threads,
+            *SHORT,
+            "--threads",
+            threads,
+        ]
         subprocess.run(command, check=True, capture_output=True)
         assert ply_path(tmp_path / threads, 60).read_bytes() == expected
 
@@ -117,7 +137,8 @@ def test_another_seed_is_another_result(trained, tmp_path):
 def test_options(options, tmp_path):
     assert train(tmp_path, *options) == 0
     results = json.loads((tmp_path / "results.json").read_text())["ours_60"]
-    assert results["PSNR"] > 11 and (options[0] != "--max_gaussians" or results["gaussians"] <= 5000)
+    assert learns(tmp_path)
+    assert results["gaussians"] <= 5000 or options[0] != "--max_gaussians"
 
 
 def test_ctrl_c_saves_the_model(tmp_path):
@@ -161,7 +182,7 @@ def test_help_answers_without_torch_or_warp():
         (("--threads", "-1"), ("--threads", "-1")),
         (("-s", "/no/such/scene"), ("/no/such/scene",)),
     ],
-    ids=lambda value: " ".join(value),
+    ids=" ".join,
 )
 def test_bad_options(options, words, tmp_path, capsys):
     message = fails(capsys, "train", "-s", str(SCENE), "-m", str(tmp_path / "model"), *options)

@@ -18,7 +18,16 @@ _HOMES = {
     "rasterize": "rasterize",
     "set_threads": "launch",
 }
-__all__ = ["Camera", "InputError", "RasterOptions", "RenderOutput", "get_threads", "load_scene", "rasterize", "set_threads"]
+__all__ = [
+    "Camera",
+    "InputError",
+    "RasterOptions",
+    "RenderOutput",
+    "get_threads",
+    "load_scene",
+    "rasterize",
+    "set_threads",
+]
 
 if TYPE_CHECKING:
     from warp_splat.camera import Camera

@@ -45,7 +45,9 @@ class Camera:
         for name in ("fx", "fy", "cx", "cy"):
             value = float(getattr(self, name))
             if not np.isfinite(value) or (name in ("fx", "fy") and value <= 0):
-                raise InputError(f"Camera {name}: expected a {'positive' if name[0] == 'f' else 'finite'} number, got {value}.")
+                raise InputError(
+                    f"Camera {name}: expected a {'positive' if name[0] == 'f' else 'finite'} number, got {value}."
+                )
             object.__setattr__(self, name, value)
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
             value = np.array(getattr(self, name), dtype=np.float64)

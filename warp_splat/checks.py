@@ -24,7 +24,11 @@ def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -
 
 
 def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, ...]:
-    """Shapes, dtypes and devices; returns (means, quats, scales, opacities, sh_dc, sh_rest), contiguous where needed."""
+    """The arguments as the renderer reads them: (means, quats, scales, opacities, sh_dc, sh_rest).
+
+    Raises:
+        InputError: naming the first argument whose type, shape, dtype, device or range is not as it should be.
+    """
     _check_tensor("means", means, (None, 3))
     count = means.shape[0]
     _check_tensor("quats", quats, (count, 4))
@@ -53,7 +57,9 @@ def _check_tensor(name: str, tensor, shape: tuple[int | None, ...]) -> None:
     if not fits:
         raise InputError(f"{name}: expected shape {wanted}, got {list(tensor.shape)}.")
     if tensor.dtype != torch.float32:
-        raise InputError(f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float().")
+        raise InputError(
+            f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float()."
+        )
     if tensor.device.type != "cpu":
         raise InputError(f"{name}: expected a tensor on the CPU, got one on {tensor.device}; move it with .cpu().")
 

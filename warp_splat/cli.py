@@ -6,7 +6,7 @@ import argparse
 import difflib
 import os
 import sys
-from dataclasses import MISSING, fields
+from dataclasses import fields
 
 from warp_splat import __version__
 from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, RenderConfig, TrainConfig
@@ -20,8 +20,9 @@ COMMANDS = {
 
 def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
     """A flag for each field of the configuration, with its default and help."""
+    defaults = config_type()
     for item in fields(config_type):
-        default = item.default if item.default is not MISSING else item.default_factory()
+        default = getattr(defaults, item.name)
         note = "" if default in ("", [], False) else f" (default: {default})"
         options: dict = {"default": argparse.SUPPRESS, "help": item.metadata["help"].replace("%", "%%") + note}
         if isinstance(default, bool):

@@ -43,7 +43,7 @@ def flag(default: Any, help: str, *names: str, choices: tuple | None = None, man
 
 @dataclass
 class TrainConfig:
-    """Training options; names and defaults of the reference implementation (train.py, October 2024) where it has them."""
+    """Training options; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
     source_path: str = flag("", "scene folder (COLMAP or nerf-synthetic); without it, the embedded scene", "-s")
     model_path: str = flag("", "output folder; default: output/<random name>", "-m")
@@ -79,7 +79,9 @@ class TrainConfig:
     densify_until_iter: int = flag(15_000, "last step of densification")
     densification_interval: int = flag(100, "steps between two densifications")
     densify_grad_threshold: float = flag(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
-    percent_dense: float = flag(0.01, "share of the scene's extent above which a Gaussian splits instead of being cloned")
+    percent_dense: float = flag(
+        0.01, "share of the scene's extent above which a Gaussian splits instead of being cloned"
+    )
     opacity_reset_interval: int = flag(3000, "steps between two resets of all opacities to 0.01")
     max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
     prune_screen_size: int = flag(
@@ -111,7 +113,11 @@ class RenderConfig:
     skip_train: bool = flag(False, "no images of the training views")
     skip_test: bool = flag(False, "no images of the test views")
     orbit: bool = flag(False, "time an orbit of 100 frames at 980 x 545 instead of rendering the views")
-    orbit_center: str = flag("origin", "what the orbit goes around: the world's origin, or the point that the cameras look at", choices=("origin", "focus"))
+    orbit_center: str = flag(
+        "origin",
+        "what the orbit goes around: the world's origin, or the point that the cameras look at",
+        choices=("origin", "focus"),
+    )
     orbit_output: str = flag("", "keep the orbit's frames: an .mp4 file, or a folder for PNG files")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")

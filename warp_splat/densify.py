@@ -1,4 +1,4 @@
-"""Growing and pruning the set (Kerbl et al. 2023, section 5.2), as the reference prescribes. No kernels: index logic."""
+"""Growing and pruning the set (Kerbl et al. 2023, section 5.2), as the reference does it. Index logic, no kernels."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ index only; hence the result does not depend on the slices, bit for bit.
 from __future__ import annotations
 
 import ctypes
+import itertools
 import os
 import time
 from collections import defaultdict
@@ -82,7 +83,9 @@ def even_slices(dim: int) -> list[int]:
     return [dim * part // parts for part in range(parts + 1)]
 
 
-def launch(kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Sequence = (), *, bounds: list[int] | None = None, **adjoint):
+def launch(
+    kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Sequence = (), *, bounds: list[int] | None = None, **adjoint
+):
     """Launch ``kernel`` on ``dim`` indices, sliced over the threads.
 
     Args:
@@ -96,7 +99,7 @@ def launch(kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Sequence = ()
     if dim == 0:
         return
     bounds = bounds or even_slices(dim)
-    slices = iter([(low, high) for low, high in zip(bounds, bounds[1:], strict=False) if high > low])
+    slices = iter([(low, high) for low, high in itertools.pairwise(bounds) if high > low])
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
 

@@ -12,19 +12,16 @@ import numpy as np
 import torch
 import warp as wp
 
+from warp_splat.binning import Bins, bin_tiles, views2d
 from warp_splat.camera import Camera
 from warp_splat.checks import check_gaussians, check_options, explain_invalid
-from warp_splat.config import FRUSTUM_MARGIN, TILE, RasterOptions
+from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
-from warp_splat.kernels.blend import Splat2D
 from warp_splat.kernels.blend_lanes import BLOCKS, make_blend
 from warp_splat.kernels.lanes import vec16
 from warp_splat.kernels.project import UNSEEN, CameraView, project, quarantine
-from warp_splat.launch import even_slices, get_threads, launch, stage, view
-
-MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
-SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
+from warp_splat.launch import launch, stage, view
 
 
 @dataclass
@@ -90,7 +87,9 @@ def rasterize(
     return out
 
 
-def render(gaussians: tuple[torch.Tensor, ...], camera: Camera, background: torch.Tensor, options: RasterOptions) -> RenderOutput:
+def render(
+    gaussians: tuple[torch.Tensor, ...], camera: Camera, background: torch.Tensor, options: RasterOptions
+) -> RenderOutput:
     """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted."""
     dropped = Dropped()
     with stage("project"):
@@ -105,7 +104,9 @@ def render(gaussians: tuple[torch.Tensor, ...], camera: Camera, background: torc
         )
     if options.depth:
         depth = depth / alpha.clamp_min(1e-10)
-    return RenderOutput(image, alpha, depth if options.depth else None, means2d, radii.clamp_min(0), bins.invalid, dropped)
+    return RenderOutput(
+        image, alpha, depth if options.depth else None, means2d, radii.clamp_min(0), bins.invalid, dropped
+    )
 
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView:
@@ -149,7 +150,7 @@ class Project(torch.autograd.Function):
         inputs = (means, quats, scales, opacities, sh_dc, sh_rest)
         outputs = (new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2))
         radii = torch.full((count,), int(UNSEEN), dtype=torch.int32)
-        launch(project, count, [cam, *_views3d(inputs)], [*_views2d(outputs), view(radii, wp.int32)])
+        launch(project, count, [cam, *_views3d(inputs)], [*views2d(outputs), view(radii, wp.int32)])
         ctx.save_for_backward(*inputs, *outputs, radii)
         ctx.cam, ctx.dropped = cam, dropped
         ctx.mark_non_differentiable(outputs[5], radii)
@@ -167,9 +168,9 @@ class Project(torch.autograd.Function):
                 project,
                 len(radii),
                 [ctx.cam, *_views3d(inputs)],
-                [*_views2d(outputs), view(radii, wp.int32)],
+                [*views2d(outputs), view(radii, wp.int32)],
                 adj_inputs=[ctx.cam, *adj_views],
-                adj_outputs=[*_views2d(adj_outputs), None, None],
+                adj_outputs=[*views2d(adj_outputs), None, None],
             )
             bad = torch.zeros_like(radii)
             launch(quarantine, len(radii), [view(radii, wp.int32)], [*adj_views, view(bad, wp.int32)])
@@ -181,108 +182,6 @@ class Project(torch.autograd.Function):
 def _views3d(tensors) -> list:
     types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3)
     return [view(tensor, dtype) for tensor, dtype in zip(tensors, types, strict=True)]
-
-
-def _views2d(tensors) -> list:
-    types = (wp.vec2, wp.vec3, wp.float32, wp.vec3, wp.float32, wp.vec2)
-    return [view(tensor, dtype) for tensor, dtype in zip(tensors, types, strict=False)]
-
-
-@dataclass
-class Bins:
-    """Tile lists: V Gaussians drawn, M tile instances, T tiles."""
-
-    order: wp.array  # [V] Gaussian, nearest first
-    splats: wp.array  # [V] Splat2D
-    slot_ends: wp.array  # [V] int64, inclusive scan of a Gaussian's instances
-    instances: torch.Tensor  # [M, 2] int32 (rank, slot), by tile, nearest first
-    ranges: torch.Tensor  # [T, 2] int32, first and last instance
-    slices: list[int]  # bounds of slices of tiles with about equal work
-    tiles_x: int
-    invalid: int
-
-
-def bin_tiles(means2d, conics, opacities, colors, depths, extents, radii, camera: Camera) -> Bins:
-    """Sort the drawn Gaussians by depth (ties by index) and list those of each tile."""
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    tile_count = tiles_x * tiles_y
-    invalid = int(np.count_nonzero(radii.numpy() < 0))
-    order = sort_by_depth(depths, radii)
-    drawn = len(order)
-    splats = wp.empty(drawn, dtype=Splat2D, device="cpu")
-    row_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
-    slot_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
-    tensors = _views2d((means2d, conics, opacities, colors, depths, extents))
-    launch(tiles.pack, drawn, [order, *tensors, camera.height], [splats, row_ends])
-    rows = _scan(row_ends)
-    _check_count(rows, camera, drawn)
-    spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
-    launch(
-        tiles.find_spans, drawn, [splats, row_ends, camera.width, camera.height, tiles_x], [spans, slot_ends]
-    )
-    count = _scan(slot_ends)
-    _check_count(count, camera, drawn)
-    # bands of Gaussians, one per thread: each counts its instances of every tile, then writes them after those of
-    # the bands before it
-    ranks = np.array(even_slices(drawn), dtype=np.int32)
-    bands = len(ranks) - 1
-    ends = np.concatenate([[0], row_ends.numpy()])
-    band_rows = wp.array(ends[ranks].astype(np.int32), dtype=int, device="cpu")
-    counts = np.zeros((bands, tile_count), dtype=np.int32)
-    one_each = list(range(bands + 1))
-    launch(tiles.count_tiles, bands, [band_rows, spans], [wp.array(counts, dtype=int, copy=False, device="cpu")], bounds=one_each)
-    places = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
-    cursor = wp.array((places - counts.T).T.astype(np.int32), dtype=int, device="cpu")
-    instances = torch.empty((count, 2), dtype=torch.int32)
-    launch(
-        tiles.scatter,
-        bands,
-        [wp.array(ranks, dtype=int, device="cpu"), spans, row_ends, slot_ends],
-        [cursor, view(instances, wp.vec2i)],
-        bounds=one_each,
-    )
-    ends = places[:, -1]
-    ranges = torch.from_numpy(np.stack([ends - counts.sum(0), ends], 1).astype(np.int32))
-    return Bins(order, splats, slot_ends, instances, ranges, balanced_slices(ends), tiles_x, invalid)
-
-
-def sort_by_depth(depths: torch.Tensor, radii: torch.Tensor) -> wp.array:
-    """Indices of the drawn Gaussians, nearest first, ties by index, [V] int32."""
-    drawn = np.flatnonzero(radii.numpy() > 0).astype(np.int32)
-    count = len(drawn)
-    if count == 0:
-        return wp.empty(0, dtype=int, device="cpu")
-    keys = np.empty(2 * count, dtype=np.float32)  # the sort works in twice the space
-    values = np.empty(2 * count, dtype=np.int32)
-    keys[:count] = depths.detach().numpy()[drawn]
-    values[:count] = drawn
-    order = wp.array(values, dtype=int, copy=False, device="cpu")
-    wp.utils.radix_sort_pairs(wp.array(keys, dtype=float, copy=False, device="cpu"), order, count)
-    return order[:count]
-
-
-def _scan(counts: wp.array) -> int:
-    """Inclusive scan in place, in 64 bits (a 32-bit one wraps without a word); returns the total."""
-    if not len(counts):
-        return 0
-    wp.utils.array_scan(counts, counts, inclusive=True)
-    return int(counts.numpy()[-1])
-
-
-def _check_count(count: int, camera: Camera, drawn: int) -> None:
-    if count > MAX_INSTANCES:
-        raise InputError(
-            f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times, more "
-            f"than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
-        )
-
-
-def balanced_slices(ends: np.ndarray) -> list[int]:
-    """Bounds of slices of tiles with about the same number of instances; an empty tile counts a little, too."""
-    work = ends + 32 * np.arange(1, len(ends) + 1)
-    parts = SLICES_PER_THREAD * get_threads() if get_threads() > 1 else 1
-    inner = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
-    return [0, *inner.tolist(), len(ends)]
 
 
 class Blend(torch.autograd.Function):
@@ -319,15 +218,18 @@ class Blend(torch.autograd.Function):
             launch(
                 make_blend(options.depth).adjoint,
                 len(bins.ranges),
-                [*_blend_inputs(bins, background), view(final, vec16), view(count, vec16)]
-                + _pixel_views(adj_image, adj_alpha, adj_depth),
+                [
+                    *_blend_inputs(bins, background),
+                    *(view(final, vec16), view(count, vec16)),
+                    *_pixel_views(adj_image, adj_alpha, adj_depth),
+                ],
                 [view(slots, wp.float32), view(adj_background, wp.float32), view(bad, wp.int32)],
                 bounds=bins.slices,
             )
             ctx.dropped.pixels += int(bad.numpy().sum())
             rows, new = ctx.gaussian_count, slots.new_zeros
             grads = (new(rows, 2), new(rows, 3), new(rows), new(rows, 3), new(rows))
-            launch(tiles.gather, len(bins.order), [bins.order, bins.slot_ends, view(slots, wp.float32)], _views2d(grads))
+            launch(tiles.gather, len(bins.order), [bins.order, bins.slot_ends, view(slots, wp.float32)], views2d(grads))
             adj_background = torch.from_numpy(adj_background.numpy().sum(0))
         return *grads, adj_background, None, None, None, None
 

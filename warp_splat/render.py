@@ -139,7 +139,8 @@ def _orbit(picture: Callable[[Camera], np.ndarray], scene: Scene | None, output:
     start = time.perf_counter()
     frames = [picture(camera) for camera in cameras]
     seconds = time.perf_counter() - start
-    print(f"{FRAMES} frames at {ORBIT_SIZE[0]} x {ORBIT_SIZE[1]} in {seconds:.2f} s: {FRAMES / seconds:.1f} frames per second")
+    size = f"{ORBIT_SIZE[0]} x {ORBIT_SIZE[1]}"
+    print(f"{FRAMES} frames at {size} in {seconds:.2f} s: {FRAMES / seconds:.1f} frames per second")
     if not any(frame.max() != frame.min() for frame in frames):
         print("Every frame is empty: no Gaussian lies on the orbit's way; try --orbit_center focus.")
     if output:

@@ -124,7 +124,9 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
     checks |= {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
     saves = set(config.save_iterations) - {config.iterations}
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
-    bar = tqdm(total=config.iterations, disable=config.quiet, unit="it", mininterval=pause, maxinterval=pause, miniters=0)
+    bar = tqdm(
+        total=config.iterations, disable=config.quiet, unit="it", mininterval=pause, maxinterval=pause, miniters=0
+    )
     profiled, before_profile = max(config.iterations - config.profile, 0), 0.0
     with bar, launch.profile(config.profile > 0) as stages:
         for iteration in range(1, config.iterations + 1):
@@ -204,7 +206,8 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
         "gaussians": len(trainer.model),
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // (1024 * (1024 if sys.platform == "darwin" else 1)),
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        // (1024 * (1024 if sys.platform == "darwin" else 1)),
         "dropped": asdict(trainer.quarantine),
     }
     means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)

@@ -198,12 +198,12 @@ class _Element(NamedTuple):
     """A table of the file, as the header announces it."""
 
     name: str
-    count: int  # rows
+    rows: int
     properties: dict[str, str]  # from names to NumPy types without byte order, or LIST
 
     def least_bytes(self, text: bool) -> int:
         """Size of the rows; of a text, if each number has one digit and one separator."""
-        return self.count * sum(2 if text else int(code[1]) for code in self.properties.values())
+        return self.rows * sum(2 if text else int(code[1]) for code in self.properties.values())
 
 
 def _read_vertices(path: str | Path) -> np.ndarray:
@@ -267,16 +267,16 @@ def _read_rows(file: BinaryIO, byte_order: str, elements: list[_Element]) -> np.
     needed = skipped + vertex.least_bytes(text)
     found = os.fstat(file.fileno()).st_size - file.tell()
     if needed > found + text:  # the last line of a text may lack its end
-        raise ValueError(f"{vertex.count} vertices need at least {needed} bytes, found {found}")
+        raise ValueError(f"{vertex.rows} vertices need at least {needed} bytes, found {found}")
     dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
     if text:
-        first = sum(element.count for element in before)
-        lines = islice(file, first, first + vertex.count)
+        first = sum(element.rows for element in before)
+        lines = islice(file, first, first + vertex.rows)
         with np.errstate(over="ignore"):  # too large for a float32: infinite, as from a double
             rows = np.fromiter((tuple(line.split()) for line in lines), dtype)
     else:
         file.seek(skipped, os.SEEK_CUR)
-        rows = np.fromfile(file, dtype, vertex.count)
-    if len(rows) < vertex.count:
-        raise ValueError(f"found {len(rows)} of {vertex.count} vertices")
+        rows = np.fromfile(file, dtype, vertex.rows)
+    if len(rows) < vertex.rows:
+        raise ValueError(f"found {len(rows)} of {vertex.rows} vertices")
     return rows

@@ -1,0 +1,1 @@
+"""Everything that Warp compiles. Kernels never see torch, allocate, or launch."""

@@ -23,7 +23,7 @@ from warp_splat.kernels.blend import (
     recover,
     weight,
 )
-from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, MODULE_OPTIONS, fill, times, total, vec16, where_less
+from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, MODULE_OPTIONS, times, total, vec16, where_less
 
 BLOCKS = TILE * TILE // LANES  # per tile
 STRIDE = 32  # instances between two looks at whether the whole tile has stopped
@@ -48,6 +48,8 @@ def reach(mean: wp.vec2, extent: wp.vec2, x0: float, y0: float):
 
 
 class BlendKernels(NamedTuple):
+    """A forward kernel and the adjoint that belongs to it."""
+
     forward: wp.Kernel
     adjoint: wp.Kernel
 

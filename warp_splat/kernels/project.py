@@ -89,7 +89,9 @@ def project(
     colors_out: wp.array[wp.vec3],  # [N]
     depths_out: wp.array[float],  # [N] z in the camera
     extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= ALPHA_MIN
-    radii_out: wp.array[int],  # [N] px, farthest point where alpha >= ALPHA_MIN, rounded up; CULLED or INVALID if not drawn; read first
+    radii_out: wp.array[
+        int
+    ],  # [N] px, farthest point where alpha >= ALPHA_MIN, rounded up; CULLED or INVALID if not drawn; read first
 ):
     i = first + wp.tid()
     if radii_out[i] <= 0:  # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
@@ -112,8 +114,12 @@ def project(
     u = wp.clamp(slope[0], camera.slope_min[0], camera.slope_max[0])
     v = wp.clamp(slope[1], camera.slope_min[1], camera.slope_max[1])
     toward = wp.vec3(camera.rotation[2, 0], camera.rotation[2, 1], camera.rotation[2, 2])
-    j1 = (camera.focal[0] / z) * (wp.vec3(camera.rotation[0, 0], camera.rotation[0, 1], camera.rotation[0, 2]) - u * toward)
-    j2 = (camera.focal[1] / z) * (wp.vec3(camera.rotation[1, 0], camera.rotation[1, 1], camera.rotation[1, 2]) - v * toward)
+    j1 = (camera.focal[0] / z) * (
+        wp.vec3(camera.rotation[0, 0], camera.rotation[0, 1], camera.rotation[0, 2]) - u * toward
+    )
+    j2 = (camera.focal[1] / z) * (
+        wp.vec3(camera.rotation[1, 0], camera.rotation[1, 1], camera.rotation[1, 2]) - v * toward
+    )
     axes = rotation_matrix(quat)
     a1 = wp.cw_mul(scale, j1 * axes)
     a2 = wp.cw_mul(scale, j2 * axes)

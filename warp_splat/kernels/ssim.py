@@ -1,5 +1,6 @@
-"""Structural similarity and its adjoint (Wang et al. 2004), with the reference's window: 11 pixels, sigma 1.5, zeros
-outside the image.
+"""Structural similarity and its adjoint (Wang et al. 2004).
+
+The window is the reference's: 11 pixels, sigma 1.5, zeros outside the image.
 
 An image is a matrix of rows of interleaved channels; rows are padded by zeros, so that a tap k pixels away lies k
 times ``channels`` floats away and sixteen neighbouring floats fill a register whatever channel they belong to. With

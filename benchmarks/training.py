@@ -1,0 +1,75 @@
+"""Train a scene of photographs twice and tell what came of it: quality on held-out views against time and memory.
+
+Runs `-r 2` for 1,000 iterations and full size for 7,000 with the reference's schedule; a run whose results are there
+already is not repeated.
+
+    python benchmarks/training.py -s path/to/fox --models output/fox [--out docs/benchmarks]
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from common import machine, write_table
+
+ROOT = Path(__file__).parents[1]
+RUNS = {"half": ["-r", "2", "--iterations", "1000"], "full": ["-r", "1", "--iterations", "7000"]}
+STATED = (1000, 3000, 7000)
+
+
+def run(scene: Path, model: Path, flags: list[str]) -> None:
+    """Train, and evaluate the models saved on the way."""
+    if (model / "results.json").is_file():
+        return
+    last = int(flags[-1])
+    saved = [str(iteration) for iteration in STATED if iteration <= last]
+    train = ["train", "-s", scene, "-m", model, "--eval", *flags, "--save_iterations", *saved]
+    subprocess.run([sys.executable, "-m", "warp_splat", *train, "--test_iterations", *saved], check=True, cwd=ROOT)
+    for iteration in saved[:-1]:
+        render = ["render", "-m", model, "--iteration", iteration, "--skip_train", "--quiet"]
+        subprocess.run([sys.executable, "-m", "warp_splat", *render], check=True, cwd=ROOT)
+
+
+def rows_of(name: str, model: Path) -> list[tuple]:
+    """A row for each stated iteration: quality of the saved model, time until then, speed, memory."""
+    results = json.loads((model / "results.json").read_text())
+    history = {record["iteration"]: record for record in json.loads((model / "history.json").read_text())}
+    rows = []
+    for iteration in (iteration for iteration in STATED if f"ours_{iteration}" in results):
+        entry, record = results[f"ours_{iteration}"], history[iteration]
+        whole = iteration == max(history)
+        rows.append(
+            (
+                name,
+                iteration,
+                f"{entry['PSNR']:.2f}",
+                f"{entry['SSIM']:.4f}",
+                f"{record['seconds']:.0f}",
+                f"{iteration / record['seconds']:.1f}",
+                record["gaussians"],
+                f"{entry['seconds']:.0f}" if whole else "",
+                f"{entry['peak_memory_mb'] / 1024:.1f}" if whole else "",
+            )
+        )
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-s", "--scene", type=Path, required=True)
+    parser.add_argument("--models", type=Path, required=True, help="folder for the two models")
+    parser.add_argument("--out", type=Path, help="folder for training.md and training.json")
+    arguments = parser.parse_args()
+    rows = []
+    for name, flags in RUNS.items():
+        run(arguments.scene.resolve(), (arguments.models / name).resolve(), flags)
+        rows += rows_of(name, arguments.models / name)
+    headers = ("size", "iteration", "PSNR dB", "SSIM", "s of steps", "it/s", "Gaussians", "wall s", "peak GB")
+    note = "Held-out views (every 8th). Wall time holds loading, kernels, evaluations, pictures and plots as well."
+    write_table("training", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()})
+
+
+if __name__ == "__main__":
+    main()
