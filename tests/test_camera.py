@@ -64,3 +64,9 @@ def test_bad_value_is_named(field, value):
         Camera(**{**FIELDS, field: value})
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, -3, 2.5])
+def test_size_that_is_no_size(value):
+    with pytest.raises(InputError, match="width"):
+        Camera(value, 10, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))

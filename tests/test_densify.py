@@ -88,7 +88,8 @@ def test_faint_ones_are_pruned_and_large_ones_only_after_a_reset():
 def test_pruning_never_empties_the_scene():
     model, _, densifier = setup(5)
     set_rows(model, opacities=[-9.0] * 5)
-    assert densifier.update(600).pruned == 0 and len(model) == 5
+    change = densifier.update(600)
+    assert change.refused and change.pruned == 0 and len(model) == 5
 
 
 @pytest.mark.parametrize(("limit", "pruned"), [(0, 0), (6, 2), (7, 0)])

@@ -61,7 +61,7 @@ def test_output_folder(trained):
     assert len(load_ply(ply_path(trained, 60)).means) > 4500
     entry = json.loads((trained / "results.json").read_text())["ours_60"]
     assert entry["iterations"] == 60 and entry["split"] == "test" and entry["seconds"] > 0
-    assert entry["dropped"] == {"pixels": 0, "gradients": 0, "gaussians": 0}
+    assert entry["dropped"] == {"pixels": 0, "gradients": 0, "gaussians": 0, "prunings": 0}
     assert read_cfg_args(trained)["sh_degree"] == 3
 
 

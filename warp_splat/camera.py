@@ -39,7 +39,7 @@ class Camera:
     def __post_init__(self):
         for name in ("width", "height"):
             value = getattr(self, name)
-            if int(value) != value or value < 1:
+            if not np.isfinite(value) or int(value) != value or value < 1:
                 raise InputError(f"Camera {name}: expected a whole number of pixels, at least 1, got {value}.")
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):

@@ -24,6 +24,7 @@ class Change:
     cloned: int
     split: int
     pruned: int
+    refused: bool = False  # pruning would have left nothing, so nothing was pruned
 
 
 class Densifier:
@@ -75,7 +76,8 @@ class Densifier:
         keep[split] = False
         pruned = len(keep) + len(keep_added) - int(keep.sum()) - int(keep_added.sum()) - len(split)
         if not bool(keep.any()) and not bool(keep_added.any()):  # an empty scene could never recover
-            keep[:], keep_added[:], pruned = True, False, 0
+            self._clear()
+            return Change(0, 0, 0, refused=True)
         self.optimizer.replace(keep.nonzero()[:, 0], {name: rows[keep_added] for name, rows in added.items()})
         self._clear()
         return Change(len(clone), len(split), pruned)

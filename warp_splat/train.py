@@ -232,6 +232,8 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
     for name, where in lines:
         print(f"  {name:9s} {where}")
     dropped = trainer.quarantine
+    if dropped.prunings:
+        print(f"  warning   {dropped.prunings} prunings would have removed every Gaussian and were refused")
     if dropped.pixels or dropped.gradients or dropped.gaussians:
         print(
             f"  kept from spreading: {dropped.pixels} pixels and {dropped.gradients} Gaussians with gradients, and "

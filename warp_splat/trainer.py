@@ -27,6 +27,7 @@ class Quarantine:
     pixels: int = 0  # with an upstream gradient that was not finite
     gradients: int = 0  # of Gaussians, not finite: no update in that step
     gaussians: int = 0  # left out of an image because a parameter was not finite (once per image)
+    prunings: int = 0  # refused, because they would have emptied the scene
 
 
 class Trainer:
@@ -84,6 +85,7 @@ class Trainer:
         """Densify or take a step of Adam. A new set has no gradients yet: no step then, as in the reference."""
         with stage("densify"):
             changed = self.densifier.update(iteration)
+        self.quarantine.prunings += changed is not None and changed.refused
         with stage("Adam"):
             if changed is None:
                 self.optimizer.step(self._radii)

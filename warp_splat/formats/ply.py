@@ -28,7 +28,7 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLOR = ("red", "green", "blue")
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
 
-HEADER_BYTES = 64 * 1024  # thirty times the longest header of the reference: no damaged file is searched to its end
+HEADER_BYTES = 64 * 1024  # forty times the longest header of the reference: no damaged file is searched to its end
 COUNT_DIGITS = 15  # more rows than any disk holds, and sums of such counts stay below 2**63
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
@@ -183,11 +183,11 @@ def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
         raise InputError(f"{path}: expected comments of one line of ASCII each, got {list(comments)}.")
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element vertex {len(rows)}"]
-    header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code in rows.dtype.descr]
+    header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code, *_ in rows.dtype.descr]
     header += ["end_header", ""]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(header).encode("ascii"))
-        file.write(rows)
+        file.write(rows.data)
 
 
 class _HeaderError(Exception):
@@ -220,7 +220,9 @@ def _read_vertices(path: str | Path) -> np.ndarray:
     except _HeaderError as error:
         raise InputError(f"{path}: expected a PLY file with an element 'vertex', found {error}.") from error
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: the file is damaged or cut short ({error}); copy or save it again.") from error
+        raise InputError(
+            f"{path}: the file is damaged or cut short ({error!s:.200}); copy or save it again."
+        ) from error
 
 
 def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:

@@ -28,6 +28,13 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """1.1 x the largest distance of a training camera's centre from their mean (the reference's getNerfppNorm)."""
+        """1.1 x the largest distance of a training camera's centre from their mean (the reference's getNerfppNorm).
+
+        Where all cameras stand at one place that is 0, and nothing could learn: then 1.1 x the median distance of the
+        points from there.
+        """
         centers = np.stack([view.camera.center for view in self.train])
-        return float(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
+        extent = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+        if extent < 1e-6 * np.abs(centers).max() or extent == 0:
+            extent = np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))
+        return float(1.1 * extent)
