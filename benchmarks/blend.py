@@ -16,10 +16,11 @@ from scalar_blend import adj_blend, blend, vec9
 from scenes import BlendScene, blend_scene
 
 from warp_splat import launch
+from warp_splat.binning import Bins, balanced_slices
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.blend import Splat2D
-from warp_splat.rasterize import Bins, Blend, Dropped, balanced_slices
+from warp_splat.rasterize import Blend, Dropped
 
 
 class Lanes:
@@ -27,7 +28,8 @@ class Lanes:
 
     def __init__(self, scene: BlendScene, upstream: torch.Tensor):
         splats = scene.splats
-        fields = ("mean", "conic", "opacity", "color", "depth")
+        # the blend takes their values from the splats; tensors are there to receive gradients (of conics for roots)
+        fields = ("mean", "root", "opacity", "color", "depth")
         self.tensors = [torch.from_numpy(splats[name].copy()).requires_grad_() for name in fields]
         self.camera = Camera(scene.width, scene.height, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))
         self.scene, self.upstream = scene, upstream

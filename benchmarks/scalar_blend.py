@@ -16,8 +16,9 @@ vec9 = wp.types.vector(length=9, dtype=float)
 
 @wp.func
 def exponential(splat: Splat2D, dx: float, dy: float):
-    q = splat.conic
-    return wp.exp(-0.5 * (q[0] * dx * dx + q[2] * dy * dy) - q[1] * dx * dy)
+    u = splat.root[0] * dx + splat.root[1] * dy
+    v = splat.root[2] * dy
+    return wp.exp(-u * u - v * v)
 
 
 @wp.kernel
@@ -33,7 +34,7 @@ def blend(
 ):
     y, x = wp.tid()
     span = ranges[(y // TILE) * tiles_x + x // TILE]
-    t = 1.0
+    t = float(1.0)
     c = wp.vec3(0.0)
     last = span[0]
     for k in range(span[0], span[1]):
@@ -70,7 +71,7 @@ def adj_blend(
     first = ranges[(y // TILE) * tiles_x + x // TILE][0]
     up = adj_image[y, x]
     t = final[y, x]
-    behind = 0.0
+    behind = float(0.0)
     for back in range(last[y, x] - first):
         i = instances[last[y, x] - 1 - back][0]
         splat = splats[i]
@@ -87,10 +88,10 @@ def adj_blend(
         behind += alpha * t * lit
         grad = vec9(0.0)
         if raw < ALPHA_MAX:
-            q = splat.conic
             adj_q = -raw * adj_alpha
-            grad[0] = adj_q * (q[0] * dx + q[1] * dy)
-            grad[1] = adj_q * (q[1] * dx + q[2] * dy)
+            u = 2.0 * adj_q * (splat.root[0] * dx + splat.root[1] * dy)
+            grad[0] = splat.root[0] * u
+            grad[1] = splat.root[1] * u + 2.0 * adj_q * splat.root[2] * splat.root[2] * dy
             grad[2] = 0.5 * adj_q * dx * dx
             grad[3] = adj_q * dx * dy
             grad[4] = 0.5 * adj_q * dy * dy

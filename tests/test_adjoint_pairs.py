@@ -62,11 +62,11 @@ def test_a_pixel_stops_before_the_gaussian_that_would_darken_it():
     assert blend.advance(t, 0.5) == pytest.approx(-2e-4) and blend.weight(t, 0.5) == 0.0
 
 
-def test_exp_negative():
-    x = np.linspace(-6, 0, 2001)
-    error = [blend.exp_negative(float(value)) / np.exp(value) - 1 for value in x]
+def test_exp_minus():
+    q = np.linspace(0, 6, 2001)
+    error = [blend.exp_minus(float(value)) / np.exp(-value) - 1 for value in q]
     assert np.abs(error).max() < 2e-6
-    assert blend.exp_negative(-50.0) == blend.exp_negative(-6.0)
+    assert blend.exp_minus(50.0) == blend.exp_minus(6.0)
 
 
 def test_adjoint_stands_behind_its_forward():

@@ -25,7 +25,7 @@ class RasterOptions:
         depth: also return the expected depth per pixel.
         sh_degree: highest spherical-harmonics degree to evaluate (0 to 3); None evaluates all that ``sh`` holds.
         antialiasing: scale each opacity by the share of its area that the low-pass filter added (Mip-Splatting, Yu
-            et al. 2024), so that small Gaussians do not grow brighter.
+            et al. 2024), so that small Gaussians do not grow brighter; by no less than 0.005, as in the reference.
     """
 
     depth: bool = False

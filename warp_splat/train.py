@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import signal
 import sys
@@ -56,7 +57,7 @@ def train(config: TrainConfig) -> int:
     if problem:
         raise InputError(problem)
     launch.prepare(config.device, config.threads)
-    config.source_path = config.source_path or str(embedded_scene())
+    config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
     say = (lambda *_: None) if config.quiet else tqdm.write
     started = time.perf_counter()
     say(f"Scene {config.source_path}")

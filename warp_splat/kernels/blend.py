@@ -2,7 +2,7 @@
 
 A pixel blends Gaussians k = 0..n-1 front to back (Kerbl et al. 2023, eq. 2 and 3):
 
-    q_k     = d' conic_k d / 2,  d = mean_k - pixel centre
+    q_k     = d' conic_k d / 2 = |root_k d|^2,  d = mean_k - pixel centre,  root_k upper triangular
     raw_k   = opacity_k exp(-q_k)
     alpha_k = 0 if raw_k < ALPHA_MIN, else min(raw_k, ALPHA_MAX)
     w_k     = alpha_k T_k,  T_{k+1} = T_k - w_k = T_k (1 - alpha_k)
@@ -14,6 +14,9 @@ behind_k = sum_{j > k} w_j (color_j . u) + T_n dL/dT_n:
 
     dL/dcolor_k = w_k u
     dL/dalpha_k = T_k (color_k . u) - behind_k / (1 - alpha_k)
+
+The square root of the conic keeps needles right: the terms of d' conic d are as large as (d / short axis)^2 and cancel
+along the long axis, those of root d only as large as d / short axis.
 
 The gradient is zero where alpha is cut to 0 or clamped to ALPHA_MAX (the reference passes it through the clamp).
 """
@@ -34,36 +37,43 @@ class Splat2D:
 
     mean: wp.vec2  # px
     extent: wp.vec2  # px, half sides of the box where alpha >= ALPHA_MIN
-    conic: wp.vec3  # 1/px^2, (xx, xy, yy) of the inverse 2D covariance
+    root: wp.vec3  # 1/px, (xx, xy, yy) of the upper triangular root with root' root = conic / 2
     opacity: float
     color: wp.vec3
     depth: float
 
 
 @wp.func
-def exp_negative(x: Any):
-    """exp(x) for x in [-6, 0], relative error 1.7e-6; below -6 as at -6 (there alpha < ALPHA_MIN for any opacity).
+def exp_minus(q: Any):
+    """exp(-q) for q in [0, 6], relative error 1.7e-6; above 6 as at 6 (there alpha < ALPHA_MIN for any opacity).
 
-    (p(x / 8))^8 with a fitted polynomial of degree 6: wp.exp is a scalar libm call, which defeats the vectoriser,
+    (p(-q / 8))^8 with a fitted polynomial of degree 6: wp.exp is a scalar libm call, which defeats the vectoriser,
     and a Taylor polynomial of this degree is 200 times worse at the cut.
     """
-    y = wp.max(x, fill(-6.0, x)) * 0.125
-    p = fill(0.00789773333, x) + y * 0.000949784813
-    p = fill(0.041443443, x) + times(y, p)
-    p = fill(0.166606608, x) + times(y, p)
-    p = fill(0.499992159, x) + times(y, p)
-    p = fill(0.999999608, x) + times(y, p)
-    p = fill(0.999999997, x) + times(y, p)
+    y = wp.min(q, fill(6.0, q)) * -0.125
+    p = fill(0.00789773333, q) + y * 0.000949784813
+    p = fill(0.041443443, q) + times(y, p)
+    p = fill(0.166606608, q) + times(y, p)
+    p = fill(0.499992159, q) + times(y, p)
+    p = fill(0.999999608, q) + times(y, p)
+    p = fill(0.999999997, q) + times(y, p)
     p = times(p, p)
     p = times(p, p)
     return times(p, p)
 
 
 @wp.func
-def falloff(dx: Any, dy: Any, conic: wp.vec3):
+def falloff(dx: Any, dy: Any, root: wp.vec3):
     """exp(-q) at offset (dx, dy) [px] from pixel centre to mean."""
-    power = times(dx, dx * (-0.5 * conic[0]) - dy * conic[1]) - times(dy, dy * (0.5 * conic[2]))
-    return exp_negative(power)
+    u = dx * root[0] + dy * root[1]
+    v = dy * root[2]
+    return exp_minus(times(u, u) + times(v, v))
+
+
+@wp.func
+def reach_of(opacity: float):
+    """2 q at which alpha has fallen to ALPHA_MIN; above 0, so that what is divided by an extent stays finite."""
+    return wp.max(2.0 * wp.log(opacity / ALPHA_MIN), 1.0e-6)
 
 
 @wp.func

@@ -97,7 +97,7 @@ def make_blend(depth: bool) -> BlendKernels:
                 for bx in range(box[0], box[1] + 1):
                     block = 4 * by + bx
                     dx = vec16(splat.mean[0] - x0 - float(4 * bx)) - LANE_X
-                    alpha = alpha_of(falloff(dx, dy, splat.conic) * splat.opacity)
+                    alpha = alpha_of(falloff(dx, dy, splat.root) * splat.opacity)
                     w = weight(t[block], alpha)
                     for channel in range(3):
                         c[block * CHANNELS + channel] = c[block * CHANNELS + channel] + w * splat.color[channel]
@@ -203,7 +203,7 @@ def make_blend(depth: bool) -> BlendKernels:
                 for bx in range(box[0], box[1] + 1):
                     block = 4 * by + bx
                     dx = vec16(splat.mean[0] - x0 - float(4 * bx)) - LANE_X
-                    fall = falloff(dx, dy, splat.conic)
+                    fall = falloff(dx, dy, splat.root)
                     raw = where_less(here, walked[block], fall * splat.opacity, vec16(0.0))
                     alpha = alpha_of(raw)
                     inverse = recover(alpha)
@@ -229,10 +229,12 @@ def make_blend(depth: bool) -> BlendKernels:
                     m[4] = m[4] + times(adj_y, dy)
                     m[5] = m[5] + adj_fall
             slot = instances[k][1]
-            sx = -splat.opacity * total(m[0])
-            sy = -splat.opacity * total(m[1])
-            slots_out[slot, 0] = sx * splat.conic[0] + sy * splat.conic[1]
-            slots_out[slot, 1] = sx * splat.conic[1] + sy * splat.conic[2]
+            sx = total(m[0])
+            sy = total(m[1])
+            adj_u = -2.0 * splat.opacity * (splat.root[0] * sx + splat.root[1] * sy)
+            adj_v = -2.0 * splat.opacity * splat.root[2] * sy
+            slots_out[slot, 0] = splat.root[0] * adj_u
+            slots_out[slot, 1] = splat.root[1] * adj_u + splat.root[2] * adj_v
             slots_out[slot, 2] = -0.5 * splat.opacity * total(m[2])
             slots_out[slot, 3] = -splat.opacity * total(m[3])
             slots_out[slot, 4] = -0.5 * splat.opacity * total(m[4])

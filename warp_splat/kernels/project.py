@@ -11,6 +11,7 @@ a sum of positive terms: the usual a c - b^2 loses every digit for needles. No d
 import warp as wp
 
 from warp_splat.config import ALPHA_MIN, BLUR, NEAR
+from warp_splat.kernels.blend import reach_of
 from warp_splat.kernels.harmonics import MODULE_OPTIONS, evaluate_sh
 
 wp.set_module_options(MODULE_OPTIONS)
@@ -55,7 +56,7 @@ def rotation_matrix(quat: wp.vec4):
 @wp.func
 def support(opacity: float, xx: float, xy: float, yy: float):
     """Half sides of the box where alpha >= ALPHA_MIN, and the distance of its farthest point [px]; no gradient."""
-    reach = 2.0 * wp.log(opacity / ALPHA_MIN)
+    reach = reach_of(opacity)
     widest = 0.5 * (xx + yy + wp.length(wp.vec2(xx - yy, 2.0 * xy)))  # variance of the long axis
     return wp.vec3(wp.sqrt(reach * xx), wp.sqrt(reach * yy), wp.sqrt(reach * widest))
 

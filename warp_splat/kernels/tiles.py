@@ -8,8 +8,8 @@ two kernels can round differently. Slots, where the adjoint writes, number the i
 
 import warp as wp
 
-from warp_splat.config import ALPHA_MIN, TILE
-from warp_splat.kernels.blend import Splat2D
+from warp_splat.config import TILE
+from warp_splat.kernels.blend import Splat2D, reach_of
 from warp_splat.kernels.lanes import MODULE_OPTIONS
 
 wp.set_module_options(MODULE_OPTIONS)
@@ -46,8 +46,10 @@ def pack(
     splat = Splat2D()
     splat.mean = means2d[i]
     splat.extent = extents[i]
-    splat.conic = conics[i]
+    # root' root = conic / 2; the last term is sqrt((yy - xy^2 / xx) / 2) without the difference, by the box's height
+    root = wp.sqrt(0.5 * conics[i][0])
     splat.opacity = opacities[i]
+    splat.root = wp.vec3(root, 0.5 * conics[i][1] / root, wp.sqrt(0.5 * reach_of(splat.opacity)) / splat.extent[1])
     splat.color = colors[i]
     splat.depth = depths[i]
     splats_out[rank] = splat
@@ -74,11 +76,10 @@ def find_spans(
     begin = int(0)
     if rank > 0:
         begin = int(row_ends[rank - 1])
-    # at height dy the ellipse q <= reach spans dx = slope dy +- half(dy); its right end is farthest at dy = turn
-    reach = 2.0 * wp.log(splat.opacity / ALPHA_MIN)
-    slope = -splat.conic[1] / splat.conic[0]
-    half = wp.sqrt(reach / splat.conic[0])
-    turn = -splat.conic[1] / splat.conic[2] * splat.extent[0]
+    # at height dy the ellipse 2 q <= reach spans dx = slope dy +- half sqrt(1 - (dy / extent y)^2)
+    slope = -splat.root[1] / splat.root[0]
+    half = wp.sqrt(0.5 * reach_of(splat.opacity)) / splat.root[0]
+    turn = slope * splat.extent[1] * splat.extent[1] / splat.extent[0]  # dy at its right end
     found = int(0)
     for row in range(end - begin):
         low = float((top + row) * TILE) + 0.5 - splat.mean[1] - MARGIN
