@@ -20,7 +20,7 @@ from warp_splat.binning import Bins, balanced_slices
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.blend import Splat2D
-from warp_splat.rasterize import Blend, Dropped
+from warp_splat.renderer import Blend, Dropped
 
 
 class Lanes:
@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for blend.md and blend.json")
     parser.add_argument("--repeats", type=int, default=5)
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
+    launch.prepare("cpu", 0)
     scene = blend_scene()
     upstream = torch.from_numpy(np.random.default_rng(1).normal(size=(scene.height, scene.width, 3)).astype(np.float32))
     lanes, scalar = Lanes(scene, upstream), Scalar(scene, upstream)

@@ -8,9 +8,9 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE
 from warp_splat.kernels.blend import Splat2D
-from warp_splat.kernels.lanes import MODULE_OPTIONS
+from warp_splat.kernels.build import FORWARD_ONLY
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(FORWARD_ONLY)
 vec9 = wp.types.vector(length=9, dtype=float)
 
 

@@ -68,7 +68,9 @@ def main() -> None:
         rows += rows_of(name, arguments.models / name)
     headers = ("size", "iteration", "PSNR dB", "SSIM", "s of steps", "it/s", "Gaussians", "wall s", "peak GB")
     note = "Held-out views (every 8th). Wall time holds loading, kernels, evaluations, pictures and plots as well."
-    write_table("training", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()})
+    write_table(
+        "training", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()}
+    )
 
 
 if __name__ == "__main__":

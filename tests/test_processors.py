@@ -13,18 +13,17 @@ CODE = """
 import sys
 sys.path.insert(0, "tests")
 import numpy as np, torch
-from warp_splat.kernels import harmonics, lanes
-
-for options in (lanes.MODULE_OPTIONS, harmonics.MODULE_OPTIONS):  # before any kernel module reads them
-    options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", sys.argv[1])
-lanes.wp.set_module_options(lanes.MODULE_OPTIONS, module=lanes)
-harmonics.wp.set_module_options(harmonics.MODULE_OPTIONS, module=harmonics)
 import warp_splat
+from warp_splat.kernels import build
+
+for options in (build.DIFFERENTIABLE, build.FORWARD_ONLY):  # before any kernel module reads them
+    options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", sys.argv[1])
 from warp_splat.losses import image_loss
 from scenes import SCENES
 
 scene = SCENES["degree3"]()
-tensors = [tensor.clone().requires_grad_() for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)]
+names = ("means", "quats", "scales", "opacities", "sh")
+tensors = [getattr(scene, name).clone().requires_grad_() for name in names]
 out = warp_splat.rasterize(*tensors, scene.camera)
 image_loss(out.image, torch.zeros_like(out.image)).backward()
 np.savez(sys.argv[2], out.image.detach().numpy(), *(tensor.grad.numpy() for tensor in tensors))

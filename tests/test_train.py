@@ -154,7 +154,7 @@ def test_ctrl_c_saves_the_model(tmp_path):
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
-    assert "Interrupted; saved" in out and "Traceback" not in err
+    assert "Interrupted after" in out and "Traceback" not in err
     (saved,) = (tmp_path / "point_cloud").glob("*/point_cloud.ply")
     assert str(saved) in out and len(load_ply(saved).means) >= 4500
 

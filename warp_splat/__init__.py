@@ -12,10 +12,10 @@ _HOMES = {
     "Camera": "camera",
     "InputError": "errors",
     "RasterOptions": "config",
-    "RenderOutput": "rasterize",
+    "RenderOutput": "renderer",
     "get_threads": "launch",
     "load_scene": "scene",
-    "rasterize": "rasterize",
+    "rasterize": "renderer",
     "set_threads": "launch",
 }
 __all__ = [
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from warp_splat.config import RasterOptions
     from warp_splat.errors import InputError
     from warp_splat.launch import get_threads, set_threads
-    from warp_splat.rasterize import RenderOutput, rasterize
+    from warp_splat.renderer import RenderOutput, rasterize
     from warp_splat.scene import load_scene
 
 

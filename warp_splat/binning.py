@@ -16,6 +16,7 @@ from warp_splat.kernels.blend import Splat2D
 from warp_splat.launch import even_slices, get_threads, launch, view
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
+MAX_TILE = 2**24  # instances of one tile: the lanes count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 
 
@@ -71,6 +72,12 @@ def _sort_by_tile(
     to = lambda array: wp.array(array, dtype=int, copy=False, device="cpu")  # noqa: E731
     launch(tiles.count_tiles, bands, [to(rows), spans], [to(counts)], bounds=one_each)
     places = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
+    longest = int(counts.sum(0).max(initial=0))
+    if longest > MAX_TILE:
+        raise InputError(
+            f"rasterize: one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {MAX_TILE} that fit; "
+            "render fewer Gaussians."
+        )
     cursor = np.ascontiguousarray((places - counts.T).T, dtype=np.int32)
     instances = torch.empty((count, 2), dtype=torch.int32)
     launch(

@@ -38,19 +38,22 @@ class Camera:
 
     def __post_init__(self):
         for name in ("width", "height"):
-            value = getattr(self, name)
+            value = _number(name, getattr(self, name))
             if not np.isfinite(value) or int(value) != value or value < 1:
                 raise InputError(f"Camera {name}: expected a whole number of pixels, at least 1, got {value}.")
             object.__setattr__(self, name, int(value))
         for name in ("fx", "fy", "cx", "cy"):
-            value = float(getattr(self, name))
+            value = _number(name, getattr(self, name))
             if not np.isfinite(value) or (name in ("fx", "fy") and value <= 0):
                 raise InputError(
                     f"Camera {name}: expected a {'positive' if name[0] == 'f' else 'finite'} number, got {value}."
                 )
             object.__setattr__(self, name, value)
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
-            value = np.array(getattr(self, name), dtype=np.float64)
+            try:
+                value = np.array(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"Camera {name}: expected numbers of shape {shape}, got something else.") from error
             if value.shape != shape:
                 raise InputError(f"Camera {name}: expected shape {shape}, got {value.shape}.")
             if not np.isfinite(value).all():
@@ -76,3 +79,10 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+
+def _number(name: str, value) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"Camera {name}: expected a number, got {value!r}.") from error

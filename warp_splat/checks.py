@@ -42,7 +42,12 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
         _check_tensor("sh", sh, (count, None, 3))
         sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
     if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
-        raise InputError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {1 + sh_rest.shape[1]}.")
+        raise InputError(
+            f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {sh_dc.shape[1] + sh_rest.shape[1]}."
+        )
+    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh_dc, "sh ": sh_rest}
+    for name, tensor in named.items():
+        _check_finite(name.strip(), tensor.detach())
     check_range("scales", scales, bool((scales <= 0).any()), "positive values (activated, not their logarithm)")
     outside = bool(((opacities < 0) | (opacities > 1)).any())
     check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
@@ -76,14 +81,20 @@ def _dense(tensor: torch.Tensor) -> torch.Tensor:
     return tensor if tensor.dim() < 2 or tensor.stride(-1) == 1 or tensor.numel() == 0 else tensor.contiguous()
 
 
-def explain_invalid(means, quats, scales, opacities, sh_dc, sh_rest) -> None:
-    """Raise InputError naming the argument that holds NaN or infinity, if one does (a zero quaternion is no error)."""
-    named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh_dc, "sh ": sh_rest}
-    for name, tensor in named.items():
-        bad = ~torch.isfinite(tensor.detach())
-        if bool(bad.any()):
-            row = int(bad.flatten(1).any(1).nonzero()[0]) if tensor.dim() > 1 else int(bad.nonzero()[0])
-            raise InputError(
-                f"{name.strip()}: expected finite numbers, got {int(bad.sum())} that are NaN or infinite, the first in "
-                f"Gaussian {row}; remove those Gaussians."
-            )
+def _check_finite(name: str, tensor: torch.Tensor) -> None:
+    bad = ~torch.isfinite(tensor)
+    if bool(bad.any()):
+        raise InputError(
+            f"{name}: expected finite numbers, got {int(bad.sum())} that are NaN or infinite, the first in Gaussian "
+            f"{int(bad.nonzero()[0, 0])}; remove those Gaussians."
+        )
+
+
+def explain_invalid(invalid: int, quats: torch.Tensor) -> None:
+    """Raise InputError if Gaussians with good inputs could not be drawn (a zero quaternion is merely left out)."""
+    too_large = invalid - int((quats == 0).all(1).sum())
+    if too_large > 0:
+        raise InputError(
+            f"scales: {too_large} Gaussians are too large on this image for float32 (over about 4e9 px); "
+            "remove them or move the camera away."
+        )

@@ -90,8 +90,13 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         print(f"warp-splat: error: {error}", file=sys.stderr)
         return 1
+    except OSError as error:
+        if os.environ.get("WARP_SPLAT_TRACEBACK"):
+            raise
+        print(f"warp-splat: error: {error.filename or 'file'}: {error.strerror or error}.", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
-        print("warp-splat: interrupted; nothing more was saved.", file=sys.stderr)
+        print("warp-splat: interrupted; what was saved before stays.", file=sys.stderr)
         return 130
 
 

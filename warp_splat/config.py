@@ -165,6 +165,8 @@ def check_train(config: TrainConfig) -> str | None:
     for name, low in at_least.items():
         if getattr(config, name) < low:
             return f"--{name}: expected at least {low}, got {getattr(config, name)}."
+    if not 0 <= config.seed < 2**63:
+        return f"--seed: expected 0 to 2^63 - 1, got {config.seed}."
     for item in fields(config):
         value = getattr(config, item.name)
         if isinstance(value, float) and not 0 <= value < float("inf"):

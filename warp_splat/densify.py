@@ -9,7 +9,7 @@ import torch
 from warp_splat.config import TrainConfig
 from warp_splat.gaussians import GaussianModel
 from warp_splat.optimizer import Optimizer
-from warp_splat.rasterize import RenderOutput
+from warp_splat.renderer import RenderOutput
 
 PRUNE_OPACITY = 0.005
 RESET_OPACITY = 0.01
@@ -45,7 +45,7 @@ class Densifier:
         if out.means2d.grad is None:
             return
         x, y = (0.5 * size * out.means2d.grad[:, axis] for axis, size in enumerate((width, height)))
-        self.gradient += torch.sqrt(x * x + y * y)
+        self.gradient += torch.nan_to_num(torch.sqrt(x * x + y * y), 0.0, 0.0, 0.0)
         self.views += out.radii > 0
         if self.config.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
@@ -103,6 +103,8 @@ class Densifier:
 
     def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
         keep = torch.sigmoid(raw["opacities"]) >= PRUNE_OPACITY
+        for tensor in raw.values():  # one that is not finite is left out of every image and would never be pruned else
+            keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
         if prune_large:
             keep &= torch.exp(raw["scales"]).amax(1) <= PRUNE_EXTENT * self.extent
         return keep

@@ -16,17 +16,16 @@ from warp_splat.scene.types import View
 def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
     """Write ``renders/00000.png`` and ``gt/00000.png`` ... in ``folder``; returns the renders.
 
-    Images of an earlier run are removed first: metrics are taken over all that lie there.
+    Surplus images of an earlier run are removed: metrics are taken over all that lie there.
     """
     renders = []
-    for kind in ("renders", "gt"):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-        for old in (folder / kind).glob("*.png"):
-            old.unlink()
     for index, view in enumerate(views):
         renders.append(picture(view.camera))
         save_png(folder / "renders" / f"{index:05d}.png", renders[-1])
         save_png(folder / "gt" / f"{index:05d}.png", view.image)
+    for old in (*folder.glob("renders/*.png"), *folder.glob("gt/*.png")):
+        if old.stem.isdigit() and int(old.stem) >= len(views):
+            old.unlink()
     return renders
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.atomic import write_json
 from warp_splat.formats.png import load_png
 
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
@@ -99,8 +99,8 @@ def write_results(
 ) -> None:
     """Put the metrics of one iteration into ``results.json`` and ``per_view.json``, under ``ours_<iteration>``.
 
-    The entry of this iteration is replaced, those of others stay. JSON has no infinity: a value that is not finite,
-    such as the PSNR of equal images, is written as ``null``.
+    Entries of other iterations stay, and so does what training said of this one (seconds, memory, ...); its metrics are
+    replaced. JSON has no infinity: a value that is not finite, such as the PSNR of equal images, becomes ``null``.
 
     Args:
         model_folder: the model folder.
@@ -112,18 +112,16 @@ def write_results(
     Raises:
         InputError: if an older file is not a JSON object (it is left alone), or a file cannot be written.
     """
-    _merge(Path(model_folder) / "results.json", f"ours_{iteration}", {**means, **(extra or {})})
-    _merge(Path(model_folder) / "per_view.json", f"ours_{iteration}", per_view)
+    results_path, views_path = Path(model_folder) / "results.json", Path(model_folder) / "per_view.json"
+    results, views, name = _read_object(results_path), _read_object(views_path), f"ours_{iteration}"
+    figures = {key: value for key, value in results.get(name, {}).items() if not key.isupper()}  # no old LPIPS
+    write_json(results_path, {**results, name: {**figures, **means, **(extra or {})}})
+    write_json(views_path, {**views, name: per_view})
 
 
-def _merge(path: Path, key: str, entry: Mapping[str, object]) -> None:
-    entries = _read_object(path) if path.exists() else {}
-    entries[key] = entry
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(_without_infinities(entries), indent=1, allow_nan=False), encoding="utf-8")
-
-
-def _read_object(path: Path) -> dict[str, object]:
+def _read_object(path: Path) -> dict:
+    if not path.exists():
+        return {}
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -131,13 +129,6 @@ def _read_object(path: Path) -> dict[str, object]:
     if not isinstance(entries, dict):
         raise InputError(f"{path}: expected a JSON object with entries ours_N; move it away and run again.")
     return entries
-
-
-def _without_infinities(value):
-    """The same JSON value with null for infinities, which older files of other tools may hold too."""
-    if isinstance(value, Mapping):
-        return {key: _without_infinities(item) for key, item in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

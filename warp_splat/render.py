@@ -17,7 +17,7 @@ from warp_splat.evaluate import evaluate_views, write_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rasterize import render as render_gaussians
+from warp_splat.renderer import render as render_gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
 from warp_splat.trainer import to_bytes
@@ -41,7 +41,7 @@ def render(config: RenderConfig) -> int:
     folder = Path(config.model_path)
     iteration = model_folder.find_iteration(folder, config.iteration)
     model = GaussianModel.load(model_folder.ply_path(folder, iteration))
-    trained = model_folder.read_cfg_args(folder)
+    trained = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() or not config.orbit else {}
     picture = make_picture(model, bool(trained.get("white_background")), bool(trained.get("antialiasing")))
     say(f"{len(model)} Gaussians from iteration {iteration} of {folder}")
     if config.orbit:
@@ -132,6 +132,8 @@ def _orbit(picture: Callable[[Camera], np.ndarray], scene: Scene | None, output:
         center, up, distance = focus_point(scene)
         first = scene.train[0].camera.center - center
         level = first - np.dot(first, up) * up
+        if not (distance > 1e-6 and np.linalg.norm(level) > 1e-6 * distance):
+            raise InputError("--orbit_center focus: the cameras look at no common point; use --orbit_center origin.")
         start = center + distance * level / np.linalg.norm(level)
     cameras = orbit_cameras(center, up, start, FRAMES)
     for camera in cameras[:WARM_UP]:

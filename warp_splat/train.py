@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
-import resource
 import signal
 import sys
 import tempfile
+import threading
 import time
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -21,10 +20,11 @@ from warp_splat.config import TrainConfig, check_train
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views
 from warp_splat.formats import model_folder
+from warp_splat.formats.atomic import write_json
 from warp_splat.formats.ply import save_points
 from warp_splat.formats.png import save_png
 from warp_splat.scene import load_scene
-from warp_splat.scene.types import Scene, View
+from warp_splat.scene.types import Scene
 from warp_splat.trainer import Trainer
 
 EVALUATIONS = 20  # over the run, besides --test_iterations
@@ -82,9 +82,12 @@ def train(config: TrainConfig) -> int:
     trainer.warm_up()
     say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
     with _interruptible() as interrupted:
-        _loop(trainer, run, interrupted)
+        try:
+            _loop(trainer, run, interrupted)
+        finally:  # whatever happened, the model comes first
+            print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")
     _finish(trainer, run, say)
-    return 130 if interrupted else 0
+    return 130 if run.iteration < config.iterations else 0
 
 
 def embedded_scene() -> Path:
@@ -97,38 +100,40 @@ def embedded_scene() -> Path:
 
 
 def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
-    model_folder.write_cfg_args(folder, {**asdict(config), "model_path": str(folder), "data_device": "cpu"})
+    model_folder.write_cfg_args(
+        folder,
+        {**asdict(config), "model_path": str(folder), "data_device": "cpu", "depths": "", "train_test_exp": False},
+    )
     model_folder.write_cameras(folder, scene.test, scene.train)
     save_points(folder / "input.ply", scene.points, scene.colors)
 
 
 @contextmanager
 def _interruptible():
-    """Ctrl-C ends the loop after the step at hand, so that the model is whole; a second one ends at once."""
+    """Ctrl-C (and SIGTERM) ends the loop after the step at hand, so that the model is whole, and is then saved."""
     interrupted: list[int] = []
-
-    def handle(number, frame):
-        if interrupted:
-            raise KeyboardInterrupt
-        interrupted.append(number)
-
-    previous = signal.signal(signal.SIGINT, handle)
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield interrupted
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = [signal.signal(number, lambda number, frame: interrupted.append(number)) for number in numbers]
     try:
         yield interrupted
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in zip(numbers, previous, strict=True):
+            signal.signal(number, handler)
 
 
 def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
     config = trainer.config
-    checks = set(config.test_iterations) | {config.iterations}
-    checks |= {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
+    checks = {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
+    whole_checks = {*config.test_iterations, config.iterations}
     saves = set(config.save_iterations) - {config.iterations}
+    profiled, before_profile = max(config.iterations - config.profile, 0), 0.0
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     bar = tqdm(
         total=config.iterations, disable=config.quiet, unit="it", mininterval=pause, maxinterval=pause, miniters=0
     )
-    profiled, before_profile = max(config.iterations - config.profile, 0), 0.0
     with bar, launch.profile(config.profile > 0) as stages:
         for iteration in range(1, config.iterations + 1):
             if iteration == profiled + 1:
@@ -137,35 +142,31 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
             start = time.perf_counter()
             run.losses.append(trainer.differentiate(iteration))
             run.iteration = iteration
-            spent = time.perf_counter() - start
-            if iteration in checks or interrupted:
+            run.seconds += time.perf_counter() - start
+            stop = bool(interrupted) or iteration == config.iterations
+            if iteration in checks | whole_checks or stop:
                 with launch.profile(False):
-                    _check(trainer, run, bar)
-            if iteration in saves:
-                _save(trainer, run)
-            if iteration == config.iterations or interrupted:
-                run.seconds += spent
-                bar.update()
+                    _check(trainer, run, bar, whole=iteration in whole_checks)
+            if iteration in saves and not stop:
+                _save_or_warn(trainer, run)
+            bar.update()
+            if stop:
                 break
             start = time.perf_counter()
             trainer.update(iteration)
-            run.seconds += spent + time.perf_counter() - start
-            bar.update()
-        if config.profile:
-            steps = max(run.iteration - profiled, 1)
-            times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
-            step = 1e3 * (run.seconds - before_profile) / steps
-            run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
+            run.seconds += time.perf_counter() - start
+    steps = run.iteration - profiled
+    if config.profile and steps > 0:
+        times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
+        step = 1e3 * (run.seconds - before_profile) / steps
+        run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
 
 
-def _progress_views(scene: Scene) -> tuple[str, list[View]]:
-    views = scene.test or scene.train
-    return "test" if scene.test else "train", views[:: -(-len(views) // PROGRESS_VIEWS)]
-
-
-def _check(trainer: Trainer, run: Run, bar: tqdm) -> None:
-    """Measure PSNR, note it, show it, and refresh the preview."""
-    split, views = _progress_views(trainer.scene)
+def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
+    """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
+    split, views = trainer.scene.evaluated
+    if not whole:
+        views = views[:: -(-len(views) // PROGRESS_VIEWS)]
     record = {
         "iteration": run.iteration,
         "loss": float(np.mean(run.losses)),
@@ -180,7 +181,14 @@ def _check(trainer: Trainer, run: Run, bar: tqdm) -> None:
     if time.perf_counter() - run.preview > PREVIEW_SECONDS:
         run.preview = time.perf_counter()
         view = views[len(views) // 2]
-        save_png(run.folder / "preview.png", np.concatenate([view.image, trainer.picture(view.camera)], 1))
+        try:
+            save_png(run.folder / "preview.png", np.concatenate([view.image, trainer.picture(view.camera)], 1))
+        except InputError as error:
+            _warn(error)
+
+
+def _warn(error: Exception) -> None:
+    tqdm.write(f"warning: {error}", file=sys.stderr)
 
 
 def _save(trainer: Trainer, run: Run) -> Path:
@@ -189,26 +197,32 @@ def _save(trainer: Trainer, run: Run) -> Path:
     try:
         trainer.model.save(path)
     except InputError as error:
+        _warn(error)
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
         trainer.model.save(path)
-        tqdm.write(f"warning: {error} The model was saved as {path} instead.", file=sys.stderr)
+        tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     return path
 
 
+def _save_or_warn(trainer: Trainer, run: Run) -> None:
+    """Save on the way: training goes on if that fails."""
+    try:
+        _save(trainer, run)
+    except (InputError, OSError) as error:
+        _warn(error)
+
+
 def _finish(trainer: Trainer, run: Run, say) -> None:
-    """Save the model first, then everything that is made from it."""
-    path = _save(trainer, run)
+    """Pictures, curves and numbers of the saved model, and where they lie."""
     wall = time.perf_counter() - run.start
-    lines = [("model", path)]
-    split, views = ("test", trainer.scene.test) if trainer.scene.test else ("train", trainer.scene.train)
+    split, views = trainer.scene.evaluated
     extra = {
         "split": split,
         "iterations": run.iteration,
         "gaussians": len(trainer.model),
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        // (1024 * (1024 if sys.platform == "darwin" else 1)),
+        "peak_memory_mb": _peak_memory(),
         "dropped": asdict(trainer.quarantine),
     }
     means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)
@@ -217,15 +231,15 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
     portrait = chosen[0][1].shape[0] > chosen[0][1].shape[1]
     report.contact_sheet(sheet, chosen, columns=2 if portrait else 1)
     report.plot_training(plot, run.history)
-    (run.folder / "history.json").write_text(json.dumps(run.history, indent=1))
-    lines += [("pictures", sheet), ("curves", plot), ("numbers", run.folder / "results.json")]
+    write_json(run.folder / "history.json", run.history)
+    lines = [("pictures", sheet), ("curves", plot), ("numbers", run.folder / "results.json")]
     if run.stages:
         report.plot_profile(run.folder / "profile.png", run.stages)
         lines += [("profile", run.folder / "profile.png")]
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(report.format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    state = "Interrupted; saved" if run.iteration < trainer.config.iterations else "Done"
+    state = "Interrupted" if run.iteration < trainer.config.iterations else "Done"
     print(
         f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
         f"{split} PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f}, {len(trainer.model)} Gaussians"
@@ -240,3 +254,13 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
             f"  kept from spreading: {dropped.pixels} pixels and {dropped.gradients} Gaussians with gradients, and "
             f"{dropped.gaussians} Gaussians with parameters, that were not finite"
         )
+
+
+def _peak_memory() -> int | None:
+    """Largest resident size of the process so far, in MiB; None where the system does not tell."""
+    try:
+        import resource  # noqa: PLC0415 - not on Windows
+    except ImportError:
+        return None
+    unit = 1024 * 1024 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // unit

@@ -16,7 +16,7 @@ from warp_splat.launch import stage
 from warp_splat.losses import image_loss
 from warp_splat.metrics import psnr
 from warp_splat.optimizer import Optimizer
-from warp_splat.rasterize import render
+from warp_splat.renderer import render
 from warp_splat.scene.types import Scene, View
 
 
@@ -39,9 +39,6 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: TrainConfig):
-        # one thread: torch's elementwise work here is bound by memory (Adam on 200k Gaussians: 6.7 ms against 5.7 ms
-        # with two), its sums would depend on the number of threads, and its idle threads would spin beside ours
-        torch.set_num_threads(1)
         self.scene, self.config = scene, config
         extent = scene.extent
         self.model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
@@ -70,7 +67,8 @@ class Trainer:
             background = torch.rand(3, generator=self._background_random)
         out = self._render(view.camera, background)
         out.means2d.retain_grad()
-        loss = image_loss(out.image, torch.from_numpy(view.image), config.lambda_dssim)
+        # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
+        loss = image_loss(out.image.clamp(0.0, 1.0), torch.from_numpy(view.image), config.lambda_dssim)
         loss.backward()
         if iteration < config.densify_until_iter:
             with stage("densify"):
@@ -82,12 +80,12 @@ class Trainer:
         return loss.item()
 
     def update(self, iteration: int) -> None:
-        """Densify or take a step of Adam. A new set has no gradients yet: no step then, as in the reference."""
+        """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
         with stage("densify"):
             changed = self.densifier.update(iteration)
         self.quarantine.prunings += changed is not None and changed.refused
         with stage("Adam"):
-            if changed is None:
+            if changed is None or changed.refused:
                 self.optimizer.step(self._radii)
 
     def warm_up(self) -> None:

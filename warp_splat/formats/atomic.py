@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -41,6 +43,24 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             f"{path}: could not be written ({error.strerror or error}); an older file of this name is untouched. "
             "Free some space or choose another folder."
         ) from error
+
+
+def write_json(path: str | Path, value) -> None:
+    """Write ``value`` as JSON, whole or not at all; numbers that are not finite, which JSON lacks, become ``null``.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(_without_infinities(value), indent=1, allow_nan=False), encoding="utf-8")
+
+
+def _without_infinities(value):
+    if isinstance(value, Mapping):
+        return {key: _without_infinities(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_infinities(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _remove(path: Path) -> None:

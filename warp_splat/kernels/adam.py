@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from warp_splat.kernels.lanes import MODULE_OPTIONS
+from warp_splat.kernels.build import FORWARD_ONLY
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(FORWARD_ONLY)
 
 
 @wp.kernel

@@ -26,9 +26,10 @@ from typing import Any
 import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN
-from warp_splat.kernels.lanes import MODULE_OPTIONS, fill, over, times, where_less
+from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.lanes import fill, over, times, where_less
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(FORWARD_ONLY)
 
 
 @wp.struct

@@ -23,7 +23,8 @@ from warp_splat.kernels.blend import (
     recover,
     weight,
 )
-from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, MODULE_OPTIONS, times, total, vec16, where_less
+from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
 
 BLOCKS = TILE * TILE // LANES  # per tile
 STRIDE = 32  # instances between two looks at whether the whole tile has stopped
@@ -60,7 +61,7 @@ def make_blend(depth: bool) -> BlendKernels:
     CHANNELS = 4 if depth else 3
     GRADS = 6 + CHANNELS  # mean, conic, opacity, channels
     STATE = BLOCKS * CHANNELS
-    module_options = dict(MODULE_OPTIONS)
+    module_options = dict(FORWARD_ONLY)
 
     @wp.kernel(module="unique", module_options=module_options)
     def blend(

@@ -2,10 +2,9 @@
 
 import warp as wp
 
-#: Of the modules whose adjoint is Warp's. No reassociation: (mean - center) - center_low must stay in this order.
-MODULE_OPTIONS = {"optimization_level": 3, "cpu_compiler_flags": "-march=native -ffp-contract=fast -fno-signed-zeros"}
+from warp_splat.kernels.build import DIFFERENTIABLE
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(DIFFERENTIABLE)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199

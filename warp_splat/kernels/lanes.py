@@ -7,13 +7,9 @@ pieces of :mod:`warp_splat.kernels.blend`, generic in their argument types, comp
 
 import warp as wp
 
-#: Options of every module whose time matters on the CPU. The flags name what the compiler may do, not a processor:
-#: ``-march=native`` is Warp's way to say "this machine", and the width is an upper bound that AVX2 or NEON cut down.
-#: No flag lets the compiler assume that NaN or infinity never occur.
-CPU_FLAGS = "-march=native -ffp-contract=fast -fno-signed-zeros -mreassociate -mprefer-vector-width=512"
-MODULE_OPTIONS = {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": CPU_FLAGS}
+from warp_splat.kernels.build import FORWARD_ONLY
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(FORWARD_ONLY)
 
 LANES = 16
 vec16 = wp.types.vector(length=LANES, dtype=float)

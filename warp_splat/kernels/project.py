@@ -12,13 +12,14 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MIN, BLUR, NEAR
 from warp_splat.kernels.blend import reach_of
-from warp_splat.kernels.harmonics import MODULE_OPTIONS, evaluate_sh
+from warp_splat.kernels.build import DIFFERENTIABLE
+from warp_splat.kernels.harmonics import evaluate_sh
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(DIFFERENTIABLE)
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
-INVALID = wp.constant(-1)  # an input of the Gaussian is not finite, or its quaternion is zero
+INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
 COMPENSATION_MIN = wp.constant(2.5e-5)  # floor of det / det with blur, as in the reference
 
 
@@ -129,9 +130,12 @@ def project(
     yy = wp.dot(a2, a2)
     sharp = wp.dot(area, area)
     det = sharp + BLUR * (xx + yy) + BLUR * BLUR
-    if camera.antialiasing != 0:
+    if camera.antialiasing != 0:  # before any test of the opacity
         opacity = opacity * wp.sqrt(wp.max(sharp / det, COMPENSATION_MIN))
-    if not (opacity >= ALPHA_MIN and wp.isfinite(det)):
+    if not wp.isfinite(det):  # too large for float32 numbers, about 4e9 px
+        radii_out[i] = INVALID
+        return
+    if not opacity >= ALPHA_MIN:
         return
     mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
     xy = wp.dot(a1, a2)

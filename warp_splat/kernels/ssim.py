@@ -17,9 +17,10 @@ import math
 
 import warp as wp
 
-from warp_splat.kernels.lanes import LANES, MODULE_OPTIONS, fill, over, times, total, vec16, where_less
+from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.lanes import LANES, fill, over, times, total, vec16, where_less
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(FORWARD_ONLY)
 
 WINDOW = 11
 RADIUS = WINDOW // 2
@@ -105,7 +106,7 @@ def compare(
         a = mxy * 2.0 + fill(C1, mxy)
         b = (xy - mxy) * 2.0 + fill(C2, mxy)
         c = over(one, squares + fill(C1, mxy))
-        d = over(one, xx + yy - squares + fill(C2, mxy))
+        d = over(one, wp.max(xx + yy - squares, vec16(0.0)) + fill(C2, mxy))  # rounding must not make it negative
         scale = times(c, d)
         ssim = times(times(a, b), scale)
         start = LANES * group

@@ -10,9 +10,9 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.blend import Splat2D, reach_of
-from warp_splat.kernels.lanes import MODULE_OPTIONS
+from warp_splat.kernels.build import FORWARD_ONLY
 
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options(FORWARD_ONLY)
 
 MARGIN = wp.constant(1.0e-3)  # px, far more than the rounding of a span's ends; a spare instance costs time only
 

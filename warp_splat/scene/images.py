@@ -78,6 +78,8 @@ def read_rgb(path: Path, background: float) -> np.ndarray:
     error = file.geterror()  # a JPEG that is cut short still gives pixels: gray ones
     if pixels is None or error:
         raise _unreadable(path, error)
+    if not np.isfinite(pixels).all():
+        raise _unreadable(path, "pixels that are NaN or infinite")
     spec = file.spec()
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
     if spec.alpha_channel < 0:
@@ -152,4 +154,4 @@ def _roi(width: int, height: int) -> oiio.ROI:
 def _pixels(buffer: oiio.ImageBuf) -> np.ndarray:
     if buffer.has_error:
         raise RuntimeError(f"OpenImageIO: {buffer.geterror()}")
-    return buffer.get_pixels(oiio.FLOAT)
+    return np.asarray(buffer.get_pixels(oiio.FLOAT))

@@ -27,6 +27,11 @@ class Scene:
     colors: np.ndarray  # [P, 3] uint8
 
     @property
+    def evaluated(self) -> tuple[str, list[View]]:
+        """The views to judge by, with their name: those held out, or those for training if none are."""
+        return ("test", self.test) if self.test else ("train", self.train)
+
+    @property
     def extent(self) -> float:
         """1.1 x the largest distance of a training camera's centre from their mean (the reference's getNerfppNorm).
 

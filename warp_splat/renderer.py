@@ -83,7 +83,7 @@ def rasterize(
     background = _background(background)
     out = render(gaussians, camera, background, options)
     if out.invalid:
-        explain_invalid(*gaussians)
+        explain_invalid(out.invalid, gaussians[1])
     return out
 
 
@@ -133,6 +133,8 @@ def _background(background) -> torch.Tensor:
             background = torch.tensor([float(value) for value in background])
         except (TypeError, ValueError):
             raise InputError(f"background: expected three numbers or a tensor [3], got {background!r}.") from None
+    if background.device.type != "cpu":
+        raise InputError(f"background: expected a tensor on the CPU, got one on {background.device}.")
     if background.shape != (3,) or background.dtype != torch.float32 or not bool(torch.isfinite(background).all()):
         raise InputError(
             f"background: expected three finite numbers (a tensor: float32 [3]), got {background.dtype} "

@@ -1,0 +1,90 @@
+"""The package as others import it: public names in any order, threads, forks."""
+
+import itertools
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import warp_splat
+from warp_splat import launch
+
+ROOT = Path(__file__).parents[1]
+NAMES = warp_splat.__all__
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
+
+
+def test_every_public_name_exists_after_any_other_import():
+    """One process for all: lazily loaded names must not be shadowed by modules of the same name."""
+    lines = ["import warp_splat.trainer", "from warp_splat import *"]
+    lines += [f"from warp_splat import {a}, {b}" for a, b in itertools.permutations(NAMES, 2)]
+    lines += ["import types", f"names = {NAMES!r}"]
+    lines += ["assert not any(isinstance(getattr(warp_splat, name), types.ModuleType) for name in names)"]
+    python("\n".join(lines))
+
+
+def test_unknown_name():
+    with pytest.raises(AttributeError, match="nothing_like_it"):
+        _ = warp_splat.nothing_like_it
+
+
+def test_import_is_light():
+    assert python("import sys, warp_splat; print({'torch', 'warp', 'numpy'} & set(sys.modules))").strip() == "set()"
+
+
+def test_version_on_the_command_line():
+    out = subprocess.run([sys.executable, "-m", "warp_splat", "--version"], check=True, capture_output=True, text=True)
+    assert warp_splat.__version__ in out.stdout
+
+
+def image(count=3000):
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0.0, 5.0])
+    camera = warp_splat.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, torch.eye(3).numpy(), [0, 0, 0])
+    quats, scales = torch.randn(count, 4, generator=generator), torch.full((count, 3), 0.05)
+    sh = torch.randn(count, 1, 3, generator=generator)
+    return warp_splat.rasterize(means, quats, scales, torch.full((count,), 0.5), sh, camera).image
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_child_renders_too():
+    code = (
+        "import os, sys; sys.path.insert(0, 'tests'); import warp_splat; warp_splat.set_threads(2)\n"
+        "from test_package import image\n"
+        "expected = image()\n"
+        "child = os.fork()\n"
+        "if child == 0: os._exit(0 if (image() == expected).all() else 1)\n"
+        "sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT, timeout=120)
+
+
+def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
+    """An error in one slice reaches the caller, after the other slices have ended."""
+    threads = launch.get_threads()
+    warp_splat.set_threads(2)
+    image()
+    running = []
+
+    def failing(*arguments, **options):
+        running.append(options)
+        raise RuntimeError("planted")
+
+    monkeypatch.setattr(launch.wp, "launch", failing)
+    try:
+        with pytest.raises(RuntimeError, match="planted"):
+            image()
+    finally:
+        warp_splat.set_threads(threads)
+    assert running
+
+
+def test_threads_must_be_positive():
+    with pytest.raises(warp_splat.InputError, match="threads"):
+        warp_splat.set_threads(0)

@@ -1,0 +1,17 @@
+"""How Warp builds the kernels for the CPU.
+
+The flags name what the compiler may do, not a processor: ``-march=native`` is Warp's way to say "this machine", and the
+width is an upper bound that AVX2 or NEON cut down. No flag lets the compiler assume that NaN or infinity never occur.
+"""
+
+_FLAGS = "-march=native -ffp-contract=fast -fno-signed-zeros"
+
+#: Of the modules whose adjoint is Warp's. Sums keep their order: (mean - center) - center_low needs it.
+DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS}
+
+#: Of the modules that never need a generated adjoint. Sums over lanes may be regrouped, or they would not vectorize.
+FORWARD_ONLY = {
+    "enable_backward": False,
+    "optimization_level": 3,
+    "cpu_compiler_flags": f"{_FLAGS} -mreassociate -mprefer-vector-width=512",
+}
