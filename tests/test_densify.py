@@ -92,6 +92,15 @@ def test_pruning_never_empties_the_scene():
     assert change.refused and change.pruned == 0 and len(model) == 5
 
 
+def test_a_gaussian_that_is_not_finite_is_pruned():
+    model, _, densifier = setup(4)
+    set_rows(model, opacities=[0.0] * 4)
+    with torch.no_grad():
+        model.parameters["scales"][2, 1] = float("nan")
+    densifier.update(600)
+    assert len(model) == 3 and all(torch.isfinite(tensor).all() for tensor in model.parameters.values())
+
+
 @pytest.mark.parametrize(("limit", "pruned"), [(0, 0), (6, 2), (7, 0)])
 def test_screen_size_prunes_only_on_request(limit, pruned):
     model, _, densifier = setup(3, prune_screen_size=limit)

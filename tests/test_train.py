@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from warp_splat.cli import main
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
@@ -85,6 +86,7 @@ def test_render_repeats_the_pictures_of_training(trained, capsys):
     assert after == before
     assert len(list((trained / "train" / "ours_60" / "gt").iterdir())) == 43
     assert main(["render", "-m", str(trained), "--iteration", "40", "--skip_train", "--quiet"]) == 0
+    assert json.loads((trained / "results.json").read_text())["ours_60"]["seconds"] > 0  # what training said stays
     assert set(json.loads((trained / "results.json").read_text())) == {"ours_40", "ours_60"}
 
 
@@ -218,6 +220,59 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
     assert train(tmp_path / "model", "--iterations", "5") == 0
     (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
     assert str(saved) in capsys.readouterr().err and len(load_ply(saved).means) == 4500
+
+
+def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, capsys):
+    from warp_splat import train as module  # noqa: PLC0415
+    from warp_splat.errors import InputError  # noqa: PLC0415
+
+    def full(path, image):
+        raise InputError(f"{path}: could not be written (no space left on device).")
+
+    monkeypatch.setattr(module, "save_png", full)
+    monkeypatch.setattr(module.Trainer, "warm_up", lambda self: (tmp_path / "point_cloud").write_text("in the way"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "spare"))
+    (tmp_path / "spare").mkdir()
+    assert train(tmp_path, "--save_iterations", "20") == 0
+    saved = sorted(path.name for path in (tmp_path / "spare").glob("*/*.ply"))
+    assert saved == ["iteration_20.ply", "iteration_60.ply"]
+    errors = capsys.readouterr().err
+    assert "preview.png" in errors and "point_cloud" in errors and "Traceback" not in errors
+
+
+def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
+    from warp_splat.trainer import Trainer  # noqa: PLC0415
+
+    differentiate = Trainer.differentiate
+
+    def failing(self, iteration):
+        if iteration == 10:
+            raise MemoryError("planted")
+        return differentiate(self, iteration)
+
+    monkeypatch.setattr(Trainer, "differentiate", failing)
+    with pytest.raises(MemoryError):
+        train(tmp_path)
+    assert len(load_ply(ply_path(tmp_path, 9)).means) == 4500
+
+
+def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkeypatch, capsys):
+    """NaN from the loss in one pixel of one step: the run goes on and says so at its end."""
+    from warp_splat import trainer  # noqa: PLC0415
+
+    loss, steps = trainer.image_loss, []
+
+    def poisoned(image, target, share):
+        steps.append(0)
+        if len(steps) == 20 and image.requires_grad:
+            image.register_hook(lambda grad: grad.index_fill(0, torch.tensor([3]), float("nan")))
+        return loss(image, target, share)
+
+    monkeypatch.setattr(trainer, "image_loss", poisoned)
+    assert train(tmp_path) == 0
+    assert "66 pixels" in capsys.readouterr().out
+    assert json.loads((tmp_path / "results.json").read_text())["ours_60"]["dropped"]["pixels"] == 66
+    assert np.isfinite(load_ply(ply_path(tmp_path, 60)).means).all()
 
 
 @pytest.mark.slow

@@ -1,0 +1,88 @@
+"""Tile lists against a loop over every pixel of every tile."""
+
+import numpy as np
+import pytest
+import torch
+
+from warp_splat import Camera, InputError, RasterOptions, binning, set_threads
+from warp_splat.launch import get_threads
+from warp_splat.renderer import Dropped, Project, camera_view
+
+SIZE = (70, 53)
+
+
+def project(count=300, seed=0):
+    """Random Gaussians, needles among them, as the renderer projects them."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.randn(count, 3, generator=generator) * 1.5 + torch.tensor([0.0, 0.0, 4.0])
+    scales = torch.exp(torch.randn(count, 3, generator=generator) - 3.0)
+    quats, opacities = torch.randn(count, 4, generator=generator), torch.rand(count, generator=generator)
+    camera = Camera(*SIZE, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
+    view = camera_view(camera, 0, RasterOptions())
+    tensors = (means, quats, scales, opacities, torch.zeros(count, 1, 3), torch.zeros(count, 0, 3))
+    return camera, Project.apply(*tensors, view, Dropped())
+
+
+def lists(bins):
+    """Gaussians of each tile, in order."""
+    order, ranges, instances = bins.order.numpy(), bins.ranges.numpy(), bins.instances.numpy()
+    return [order[instances[first:last, 0]].tolist() for first, last in ranges]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
+    camera, projected = project(seed=seed)
+    means2d, conics, opacities, _, depths, _, radii = (tensor.double().numpy() for tensor in projected)
+    found = lists(binning.bin_tiles(*projected, camera))
+    spare = 0
+    for tile, listed in enumerate(found):
+        left, top = tile % 5 * 16, tile // 5 * 16
+        x, y = np.meshgrid(np.arange(left, min(left + 16, 70)) + 0.5, np.arange(top, min(top + 16, 53)) + 0.5)
+        dx, dy = (means2d[:, axis, None, None] - pixel for axis, pixel in enumerate((x, y)))
+        q = 0.5 * (conics[:, 0, None, None] * dx**2 + conics[:, 2, None, None] * dy**2)
+        q += conics[:, 1, None, None] * dx * dy
+        seen = (opacities[:, None, None] * np.exp(-q) >= 1 / 255).any((1, 2)) & (radii > 0)
+        expected = [i for i in np.argsort(depths, kind="stable") if seen[i]]
+        assert [i for i in listed if seen[i]] == expected
+        assert sorted(listed, key=lambda i: (depths[i], i)) == listed
+        spare += len(listed) - len(expected)
+    assert spare < 0.12 * sum(map(len, found))  # ellipses that pass between the pixel centers of a tile
+
+
+def test_slots_number_the_instances_gaussian_by_gaussian():
+    camera, projected = project()
+    bins = binning.bin_tiles(*projected, camera)
+    rank, slot = bins.instances.numpy().T
+    assert sorted(slot) == list(range(len(slot)))
+    ends = np.concatenate([[0], bins.slot_ends.numpy()])
+    assert ((slot >= ends[rank]) & (slot < ends[rank + 1])).all()
+
+
+def test_the_number_of_threads_changes_nothing():
+    threads = get_threads()
+    camera, projected = project(5000)
+    try:
+        results = []
+        for count in (1, 2, 3):
+            set_threads(count)
+            results.append(binning.bin_tiles(*projected, camera))
+    finally:
+        set_threads(threads)
+    for other in results[1:]:
+        assert torch.equal(other.instances, results[0].instances) and torch.equal(other.ranges, results[0].ranges)
+
+
+def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
+    camera, projected = project()
+    monkeypatch.setattr(binning, "MAX_INSTANCES", 100)
+    with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
+        binning.bin_tiles(*projected, camera)
+    counts = binning.wp.array(np.full(3, 2**30, np.int64), dtype=binning.wp.int64, device="cpu")
+    assert binning._scan(counts) == 3 * 2**30  # a 32-bit scan would have wrapped
+
+
+def test_one_tile_with_too_many_is_refused(monkeypatch):
+    camera, projected = project()
+    monkeypatch.setattr(binning, "MAX_TILE", 3)
+    with pytest.raises(InputError, match="one tile"):
+        binning.bin_tiles(*projected, camera)
