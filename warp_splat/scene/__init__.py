@@ -47,7 +47,9 @@ def load_scene(
         InputError: if an argument is out of range, or a file is missing, unreadable, or disagrees with another.
     """
     if not isinstance(resolution, int) or (resolution < 1 and resolution != -1):
-        raise InputError(f"resolution: expected a positive whole number or -1, got {resolution}; see -r in warp-splat train --help.")
+        raise InputError(
+            f"resolution: expected a positive whole number or -1, got {resolution}; see -r in warp-splat train --help."
+        )
     train, test, points, colors = _read(Path(source), images, report)
     if not eval:
         train, test = train + test, []
