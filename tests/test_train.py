@@ -198,6 +198,12 @@ def test_output_folder_that_cannot_be_written(tmp_path, capsys):
     assert str(tmp_path / "file") in message
 
 
+def test_a_folder_that_holds_a_model_is_left_alone(trained, capsys):
+    before = (trained / "cfg_args").read_bytes()
+    message = fails(capsys, "train", "-s", str(SCENE), "-m", str(trained), "--iterations", "5")
+    assert "already holds" in message and (trained / "cfg_args").read_bytes() == before
+
+
 def test_render_without_a_model(tmp_path, capsys):
     assert "-m" in fails(capsys, "render")
     assert str(tmp_path) in fails(capsys, "render", "-m", str(tmp_path))

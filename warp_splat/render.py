@@ -61,11 +61,13 @@ def render(config: RenderConfig) -> int:
 
 
 def _load(config: RenderConfig, trained: dict, say) -> Scene:
-    source = config.source_path or str(trained.get("source_path", ""))
+    source, resolution = config.source_path or str(trained.get("source_path", "")), trained.get("resolution", -1)
+    if not isinstance(resolution, int):
+        raise InputError(f"{config.model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
     return load_scene(
         source,
         images=str(trained.get("images", "images")),
-        resolution=int(trained.get("resolution", -1)),
+        resolution=resolution,
         white_background=bool(trained.get("white_background")),
         eval=bool(trained.get("eval")),
         report=say,

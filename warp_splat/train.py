@@ -59,6 +59,10 @@ def train(config: TrainConfig) -> int:
     launch.prepare(config.device, config.threads)
     config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
     say = (lambda *_: None) if config.quiet else tqdm.write
+    if config.model_path and any(Path(config.model_path).glob("point_cloud/*/*.ply")):
+        raise InputError(
+            f"-m {config.model_path}: this folder already holds a trained model; choose another, or move it."
+        )
     started = time.perf_counter()
     say(f"Scene {config.source_path}")
     scene = load_scene(
