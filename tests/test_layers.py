@@ -14,6 +14,7 @@ LAYERS = [
     {"gaussians", "optimizer", "densify"},
     {"trainer", "report", "evaluate"},
     {"train", "render"},
+    {"compare"},
     {"cli", "__init__", "__main__"},
 ]
 

@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
-import oracle
 import pytest
 import scenes
 import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
+
+from warp_splat.compare import oracle
 
 CENTRED = scenes.make_camera(9, 7, fx=20, seed=None)  # the middle pixel's centre is the principal point
 SMALL = scenes.make_camera(13, 11, fx=15, fy=12, cx=7.3, cy=4.1)

@@ -7,7 +7,6 @@ Gaussian's share. Their upstream gradients are zero, so that the gradients do no
 import functools
 from dataclasses import dataclass
 
-import oracle
 import pytest
 import scenes
 import torch
@@ -15,6 +14,7 @@ from scenes import PARAMETERS, SCENES
 
 import warp_splat
 from warp_splat import RasterOptions
+from warp_splat.compare import oracle
 
 IMAGE_MAX, IMAGE_MEAN = 1e-4, 1e-5  # allowed error of image and alpha
 SHARE = 0.02  # at a fragile pixel: the largest weight that one decision moves is about 1e-2

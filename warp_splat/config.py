@@ -14,7 +14,7 @@ BLUR = 0.3  # px^2, added to both variances of the projected Gaussian (low-pass)
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
 
-ADJOINTS = ("manual",)  # how the pixel loop is differentiated; see warp_splat.rasterize
+ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,25 @@ class RasterOptions:
         sh_degree: highest spherical-harmonics degree to evaluate (0 to 3); None evaluates all that ``sh`` holds.
         antialiasing: scale each opacity by the share of its area that the low-pass filter added (Mip-Splatting, Yu
             et al. 2024), so that small Gaussians do not grow brighter; by no less than 0.005, as in the reference.
+        projection: "affine" (EWA splatting, Zwicker et al. 2001: linearized at the mean) or "ellipsoid" (the exact
+            outline of the one-sigma ellipsoid; Qi, Cai and Han 2024).
+        alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips nothing.
+        t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 never stops.
+        max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.
+        extent: which tiles list a Gaussian: "ellipse" (exactly those where its opacity reaches ``alpha_min``) or
+            "square" (of the reference: 3 standard deviations of the long axis).
+        exp_degree: degree of the polynomial in the exponential, 3 to 6; None calls the C library's, without lanes.
     """
 
     depth: bool = False
     sh_degree: int | None = None
     antialiasing: bool = False
+    projection: str = "affine"
+    alpha_min: float = ALPHA_MIN
+    t_min: float = T_MIN
+    max_steps: int | None = None
+    extent: str = "ellipse"
+    exp_degree: int | None = 5
 
 
 def flag(default: Any, help: str, *names: str, choices: tuple | None = None, many: type | None = None) -> Any:

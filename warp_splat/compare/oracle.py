@@ -107,7 +107,22 @@ def jacobians(points, camera):
     return torch.stack(entries, 1)
 
 
-def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False):
+def outlines(points, sigma, live, camera):
+    """Centres [N, 2] and covariances [N, 2, 2] of the ellipses that ellipsoids of one sigma show, by the dual conic.
+
+    The dual quadric of an ellipsoid projects linearly: its outline's dual conic is K (Sigma - p p^T) K^T (Hartley and
+    Zisserman 2004, 8.3), and that of an ellipse of centre c and covariance S is a multiple of [S - c c^T, -c; -c^T, -1].
+    """
+    calibration = points.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    dual = sigma - points[:, :, None] * points[:, None, :]
+    dual = torch.where(live[:, None, None], dual, -torch.eye(3, dtype=dual.dtype))
+    dual = calibration @ dual @ calibration.T
+    dual = dual / -dual[:, 2:, 2:]
+    centre = -dual[:, :2, 2]
+    return centre, dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]
+
+
+def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
     """Gaussians as the camera sees them."""
     world_to_camera = torch.as_tensor(camera.rotation.copy(), dtype=torch.float64)
     translation = torch.as_tensor(camera.translation.copy(), dtype=torch.float64)
@@ -117,8 +132,13 @@ def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antiali
     x, y, z = points.unbind(1)
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
 
-    to_pixels = jacobians(points, camera) @ world_to_camera
-    sharp = to_pixels @ covariances(quats, scales) @ to_pixels.transpose(1, 2)
+    sigma = world_to_camera @ covariances(quats, scales) @ world_to_camera.T
+    if projection == "ellipsoid":
+        live = live & (z**2 > sigma[:, 2, 2])
+        means2d, sharp = outlines(points, sigma, live, camera)
+    else:
+        to_pixels = jacobians(points, camera)
+        sharp = to_pixels @ sigma @ to_pixels.transpose(1, 2)
     cov2d = sharp + BLUR * torch.eye(2, dtype=torch.float64)
     opacity = opacities
     if antialiasing:
@@ -150,44 +170,61 @@ def _alphas(splats, order, camera):
     return alpha, error
 
 
-def _decide(alpha, error):
+def _decide(alpha, error, alpha_min, t_min):
     """Which pairs are blended [P, M], and which pixels hang on rounding [P]. No gradient flows through a decision."""
-    solid = torch.where(alpha >= ALPHA_MIN, alpha.clamp_max(ALPHA_MAX), torch.zeros_like(alpha))
+    solid = torch.where(alpha >= alpha_min, alpha.clamp_max(ALPHA_MAX), torch.zeros_like(alpha))
     after = torch.cumprod(1 - solid, 1)  # transmittance if nothing stopped it: it can only fall
     before = after / (1 - solid)
-    blended = (solid > 0) & (after >= STOP)
+    blended = (solid > 0) & (after >= t_min)
 
     drift = torch.cumsum(error * solid / (1 - solid), 1) + 1e-5  # relative error of the transmittance
-    reached = before >= STOP * (1 - drift)
-    at_threshold = (alpha / ALPHA_MIN).log().abs().minimum((alpha / ALPHA_MAX).log().abs()) < error
-    at_stop = (solid > 0) & ((after / STOP).log().abs() < drift)
+    reached = before >= t_min * (1 - drift)
+    at_threshold = (alpha / alpha_min).log().abs().minimum((alpha / ALPHA_MAX).log().abs()) < error
+    at_stop = (solid > 0) & ((after / t_min).log().abs() < drift)
     seen = before * alpha.clamp_max(ALPHA_MAX) > UNSEEN
     return blended, ((at_threshold | at_stop) & reached & seen).any(1)
 
 
-def _culling(splats, alpha, order, camera):
+def _culling(splats, alpha, order, camera, alpha_min):
     """Which splats a renderer must keep, which it may keep, and how far they reach."""
     touches = torch.zeros_like(splats.live)
-    touches[order] = (alpha >= ALPHA_MIN * (1 + BAND)).any(0)
-    level = 2 * torch.log((splats.opacity / ALPHA_MIN).clamp_min(1))  # d' conic d on the edge of the ellipse
+    touches[order] = (alpha >= alpha_min * (1 + BAND)).any(0)
+    level = 2 * torch.log((splats.opacity / alpha_min).clamp_min(1))  # d' conic d on the edge of the ellipse
     half = (level[:, None] * torch.diagonal(splats.cov2d, dim1=1, dim2=2)).sqrt() + 0.01
     low, high = splats.means2d - half, splats.means2d + half
     size = splats.means2d.new_tensor([camera.width, camera.height])
-    inside = ((high > 0) & (low < size)).all(1) & splats.live & (splats.opacity > ALPHA_MIN * (1 - BAND))
+    inside = ((high > 0) & (low < size)).all(1) & splats.live & (splats.opacity > alpha_min * (1 - BAND))
     reach = (level * torch.linalg.eigvalsh(splats.cov2d)[:, 1]).sqrt() * splats.live
     return touches, inside, reach
 
 
-def render(means, quats, scales, opacities, sh, camera, background=(0.0, 0.0, 0.0), sh_degree=None, antialiasing=False):
-    """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background."""
-    splats = project(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing)
+def render(
+    means,
+    quats,
+    scales,
+    opacities,
+    sh,
+    camera,
+    background=(0.0, 0.0, 0.0),
+    *,
+    sh_degree=None,
+    antialiasing=False,
+    projection="affine",
+    alpha_min=ALPHA_MIN,
+    t_min=STOP,
+):
+    """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background.
+
+    Keywords are those of :class:`warp_splat.RasterOptions`; thresholds of 0 blend everything.
+    """
+    splats = project(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing, projection)
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]
     raw, error = _alphas(splats, order, camera)
     with torch.no_grad():
-        blended, fragile = _decide(raw, error)
-        touches, near_image, reach = _culling(splats, raw, order, camera)
+        blended, fragile = _decide(raw, error, alpha_min, t_min)
+        touches, near_image, reach = _culling(splats, raw, order, camera, alpha_min)
 
     alpha = torch.where(blended, raw.clamp_max(ALPHA_MAX), torch.zeros_like(raw))
     through = torch.cat([torch.ones_like(raw[:, :1].sum(1, keepdim=True)), torch.cumprod(1 - alpha, 1)], 1)
