@@ -43,7 +43,7 @@ class Lanes:
         arrays = (self.order, self.splats, self.slot_ends, self.instances, self.ranges)
         bins = Bins(*arrays, slices, self.scene.tiles_x, invalid=0)
         black = torch.zeros(3)
-        self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), Dropped())
+        self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), "manual", Dropped())
 
     def adjoint(self) -> None:
         self.grads = torch.autograd.grad(self.image, self.tensors[:4], self.upstream, retain_graph=True)

@@ -7,7 +7,7 @@ wp.exp and a sum into each Gaussian's gradient. On the CPU a launch is one threa
 import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE
-from warp_splat.kernels.blend import Splat2D
+from warp_splat.kernels.blend import LN_2, Splat2D
 from warp_splat.kernels.build import FORWARD_ONLY
 
 wp.set_module_options(FORWARD_ONLY)
@@ -18,7 +18,7 @@ vec9 = wp.types.vector(length=9, dtype=float)
 def exponential(splat: Splat2D, dx: float, dy: float):
     u = splat.root[0] * dx + splat.root[1] * dy
     v = splat.root[2] * dy
-    return wp.exp(-u * u - v * v)
+    return wp.exp(-LN_2 * (u * u + v * v))
 
 
 @wp.kernel
@@ -89,9 +89,9 @@ def adj_blend(
         grad = vec9(0.0)
         if raw < ALPHA_MAX:
             adj_q = -raw * adj_alpha
-            u = 2.0 * adj_q * (splat.root[0] * dx + splat.root[1] * dy)
+            u = 2.0 * LN_2 * adj_q * (splat.root[0] * dx + splat.root[1] * dy)
             grad[0] = splat.root[0] * u
-            grad[1] = splat.root[1] * u + 2.0 * adj_q * splat.root[2] * splat.root[2] * dy
+            grad[1] = splat.root[1] * u + 2.0 * LN_2 * adj_q * splat.root[2] * splat.root[2] * dy
             grad[2] = 0.5 * adj_q * dx * dx
             grad[3] = adj_q * dx * dy
             grad[4] = 0.5 * adj_q * dy * dy

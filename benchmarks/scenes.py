@@ -7,6 +7,8 @@ import numpy as np
 from warp_splat.config import ALPHA_MIN, TILE
 from warp_splat.kernels.blend import Splat2D
 
+LN_2 = np.log(2.0)
+
 
 class BlendScene(NamedTuple):
     """V Gaussians, M tile instances, T tiles."""
@@ -37,7 +39,7 @@ def blend_scene(count: int = 100_000, width: int = 980, height: int = 545, seed:
     splats = np.zeros(count, dtype=Splat2D.numpy_dtype())
     splats["mean"], splats["opacity"], splats["color"], splats["depth"] = mean, opacity, color, 1.0
     splats["extent"] = np.sqrt(reach[:, None] * np.stack([xx, yy], 1))
-    splats["root"] = np.stack([yy, -xy, np.sqrt(det)], 1) / np.sqrt(2 * det * yy)[:, None]
+    splats["root"] = np.stack([yy, -xy, np.sqrt(det)], 1) / np.sqrt(2 * LN_2 * det * yy)[:, None]
     return _bin(splats[order], np.ceil(3 * np.maximum(*sigma))[order], width, height)
 
 

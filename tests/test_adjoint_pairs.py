@@ -1,6 +1,6 @@
 """Every piece `f` of the mathematics that has an `adj_f` beside it, against central differences.
 
-Pieces run in Python: no kernel, no compiler.
+Pieces run in Python, without a compiler, where they can.
 """
 
 import inspect
@@ -8,8 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
+from warp_splat.config import ALPHA_MIN, T_MIN
 from warp_splat.kernels import blend
+from warp_splat.kernels.lanes import vec16
 
 PAIRS = {
     name: (getattr(blend, name), getattr(blend, f"adj_{name}")) for name in dir(blend) if hasattr(blend, f"adj_{name}")
@@ -25,8 +28,8 @@ def test_against_central_differences(name):
     forward, adjoint = PAIRS[name]
     step = 1e-3
     for value in (0.001, 0.1, 0.5, 0.97, 1.5):  # below the cut, between, above the clamp
-        slope = (forward(value + step) - forward(value - step)) / (2 * step)
-        assert adjoint(value, 2.5) == pytest.approx(2.5 * slope, abs=1e-3)
+        slope = (forward(value + step, ALPHA_MIN) - forward(value - step, ALPHA_MIN)) / (2 * step)
+        assert adjoint(value, ALPHA_MIN, 2.5) == pytest.approx(2.5 * slope, abs=1e-3)
 
 
 def test_a_blended_pixel_against_float64():
@@ -41,8 +44,8 @@ def test_a_blended_pixel_against_float64():
     t = 1.0
     total = 0.0
     for alpha, color in zip(alphas, colors, strict=True):
-        total += blend.weight(t, float(alpha)) * color
-        t = blend.advance(t, float(alpha))
+        total += blend.weight(t, float(alpha), T_MIN) * color
+        t = blend.advance(t, float(alpha), T_MIN)
     assert (total, t) == pytest.approx(pixel(alphas), rel=1e-5)
     behind = 0.0
     for k in reversed(range(12)):
@@ -57,16 +60,30 @@ def test_a_blended_pixel_against_float64():
 
 
 def test_a_pixel_stops_before_the_gaussian_that_would_darken_it():
-    t = blend.advance(2e-4, 0.6)
-    assert t == pytest.approx(-2e-4) and blend.weight(2e-4, 0.6) == 0.0
-    assert blend.advance(t, 0.5) == pytest.approx(-2e-4) and blend.weight(t, 0.5) == 0.0
+    t = blend.advance(2e-4, 0.6, T_MIN)
+    assert t == pytest.approx(-2e-4) and blend.weight(2e-4, 0.6, T_MIN) == 0.0
+    assert blend.advance(t, 0.5, T_MIN) == pytest.approx(-2e-4) and blend.weight(t, 0.5, T_MIN) == 0.0
 
 
-def test_exp_minus():
-    q = np.linspace(0, 6, 2001)
-    error = [blend.exp_minus(float(value)) / np.exp(-value) - 1 for value in q]
-    assert np.abs(error).max() < 2e-6
-    assert blend.exp_minus(50.0) == blend.exp_minus(6.0)
+@pytest.mark.parametrize(("degree", "allowed"), [(3, 8e-5), (4, 4e-6), (5, 1e-6), (6, 1e-6), (None, 1e-6)])
+def test_exp(degree, allowed):
+    exp2_minus = blend.make_exp(degree)
+
+    @wp.kernel(module="unique")
+    def evaluate(z: wp.array[float], scalar_out: wp.array[float], lanes_out: wp.array[vec16]):
+        i = wp.tid()
+        scalar_out[i] = exp2_minus(z[i])
+        lanes_out[i] = exp2_minus(vec16(z[i]))
+
+    z = np.concatenate([np.linspace(0, 12, 4001), np.linspace(12, 125, 500), [1e3, 1e38, np.inf]]).astype(np.float32)
+    scalar, lanes = wp.empty(len(z), dtype=float, device="cpu"), wp.empty(len(z), dtype=vec16, device="cpu")
+    wp.launch(evaluate, len(z), [wp.array(z, dtype=float, device="cpu")], [scalar, lanes], device="cpu")
+    truth = np.exp2(-z.astype(np.float64))
+    error = np.abs(scalar.numpy() - truth) / truth.clip(2.0**-125)
+    assert error[z <= 12].max() < allowed and error[z <= 125].max() < max(allowed, 1e-5)
+    assert scalar.numpy()[z > 125].max() < 1.001 * 2.0**-125
+    # the compiler may fuse multiplications and additions here and not there
+    assert np.abs(lanes.numpy() - scalar.numpy()[:, None]).max() < 1e-7
 
 
 def test_adjoint_stands_behind_its_forward():

@@ -33,7 +33,7 @@ def lists(bins):
 def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
     camera, projected = project(seed=seed)
     means2d, conics, opacities, _, depths, _, radii = (tensor.double().numpy() for tensor in projected)
-    found = lists(binning.bin_tiles(*projected, camera))
+    found = lists(binning.bin_tiles(*projected, camera, RasterOptions()))
     spare = 0
     for tile, listed in enumerate(found):
         left, top = tile % 5 * 16, tile // 5 * 16
@@ -51,7 +51,7 @@ def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
 
 def test_slots_number_the_instances_gaussian_by_gaussian():
     camera, projected = project()
-    bins = binning.bin_tiles(*projected, camera)
+    bins = binning.bin_tiles(*projected, camera, RasterOptions())
     rank, slot = bins.instances.numpy().T
     assert sorted(slot) == list(range(len(slot)))
     ends = np.concatenate([[0], bins.slot_ends.numpy()])
@@ -65,7 +65,7 @@ def test_the_number_of_threads_changes_nothing():
         results = []
         for count in (1, 2, 3):
             set_threads(count)
-            results.append(binning.bin_tiles(*projected, camera))
+            results.append(binning.bin_tiles(*projected, camera, RasterOptions()))
     finally:
         set_threads(threads)
     for other in results[1:]:
@@ -76,7 +76,7 @@ def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
     camera, projected = project()
     monkeypatch.setattr(binning, "MAX_INSTANCES", 100)
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        binning.bin_tiles(*projected, camera)
+        binning.bin_tiles(*projected, camera, RasterOptions())
     counts = binning.wp.array(np.full(3, 2**30, np.int64), dtype=binning.wp.int64, device="cpu")
     assert binning._scan(counts) == 3 * 2**30  # a 32-bit scan would have wrapped
 
@@ -85,4 +85,4 @@ def test_one_tile_with_too_many_is_refused(monkeypatch):
     camera, projected = project()
     monkeypatch.setattr(binning, "MAX_TILE", 3)
     with pytest.raises(InputError, match="one tile"):
-        binning.bin_tiles(*projected, camera)
+        binning.bin_tiles(*projected, camera, RasterOptions())

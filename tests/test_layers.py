@@ -10,7 +10,7 @@ LAYERS = [
     {"errors", "config"},
     {"kernels"},
     {"camera", "launch", "formats", "scene.types"},
-    {"checks", "binning", "renderer", "losses", "metrics", "scene"},
+    {"checks", "binning", "adjoints", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
     {"trainer", "report", "evaluate"},
     {"train", "render"},

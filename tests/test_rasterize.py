@@ -13,8 +13,9 @@ import torch
 from scenes import PARAMETERS, SCENES
 
 import warp_splat
-from warp_splat import RasterOptions
+from warp_splat import InputError, RasterOptions, adjoints
 from warp_splat.compare import oracle
+from warp_splat.config import ADJOINTS
 
 IMAGE_MAX, IMAGE_MEAN = 1e-4, 1e-5  # allowed error of image and alpha
 SHARE = 0.02  # at a fragile pixel: the largest weight that one decision moves is about 1e-2
@@ -51,7 +52,7 @@ def truth(name, options):
     """Computed once per scene and options, in float64."""
     scene = SCENES[name]()
     leaves = leaves_of(scene.to("cpu", torch.float64))
-    chosen = {"sh_degree": options.sh_degree, "antialiasing": options.antialiasing}
+    chosen = {key: getattr(options, key) for key in ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")}
     out = oracle.render(*[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **chosen)
     generator = torch.Generator().manual_seed(1)
     upstream = {}
@@ -72,11 +73,11 @@ def rasterize(scene, leaves=None, options=None, **more):
     return warp_splat.rasterize(**source, camera=scene.camera, background=background, options=options, **more)
 
 
-def run(name, device, options=PLAIN):
+def run(name, device, options=PLAIN, adjoint="manual"):
     """Render and differentiate a scene with the upstream gradients of its truth."""
     expected = truth(name, options)
     leaves = leaves_of(expected.scene.to(device))
-    out = rasterize(expected.scene, leaves, options)
+    out = rasterize(expected.scene, leaves, options, adjoint=adjoint)
     upstream = {key: weight.to(device) for key, weight in expected.upstream.items()}
     return out, backward(out, upstream, leaves)
 
@@ -125,9 +126,10 @@ def check_gradients(gradients, expected):
     assert all(error < GRADIENT for error in errors.values()), errors
 
 
+@pytest.mark.parametrize("adjoint", ADJOINTS)
 @pytest.mark.parametrize("name", SCENES)
-def test_scene(name, device, record_property):
-    out, gradients = run(name, device)
+def test_scene(name, adjoint, device, record_property):
+    out, gradients = run(name, device, adjoint=adjoint)
     expected = truth(name, PLAIN)
     record_property("fragile_pixels", int(expected.out.fragile.sum()))
     check_image(out, expected.out)
@@ -149,18 +151,79 @@ VARIANTS = [
     ("degree3", RasterOptions(sh_degree=1)),
     ("degree3", RasterOptions(sh_degree=2)),
     ("degree2", RasterOptions(sh_degree=3)),
+    ("degree2", RasterOptions(projection="ellipsoid")),
+    ("inside", RasterOptions(projection="ellipsoid", depth=True)),
+    ("needles", RasterOptions(projection="ellipsoid")),
+    ("offcentre", RasterOptions(projection="ellipsoid", antialiasing=True)),
+    ("near_and_behind", RasterOptions(projection="ellipsoid")),
+    ("degree1", RasterOptions(alpha_min=0.0)),
+    ("saturated", RasterOptions(t_min=0.0)),
+    ("saturated", RasterOptions(alpha_min=1e-4, t_min=1e-2)),
+    ("layers_4000", RasterOptions(alpha_min=0.0, t_min=0.0)),
+    ("degree2", RasterOptions(exp_degree=None)),
+    ("degree2", RasterOptions(exp_degree=6)),
 ]
 
 
 @pytest.mark.parametrize(("name", "options"), VARIANTS, ids=str)
 def test_options(name, options, device):
-    out, gradients = run(name, device, options)
+    check_options(name, options, device, "manual")
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS[1:])
+@pytest.mark.parametrize(("name", "options"), [VARIANTS[0], VARIANTS[-3]], ids=str)
+def test_options_in_other_modes(name, options, adjoint, device):
+    check_options(name, options, device, adjoint)
+
+
+def check_options(name, options, device, adjoint):
+    out, gradients = run(name, device, options, adjoint)
     expected = truth(name, options)
     check_image(out, expected.out)
     check_culling(out, expected.out)
     check_gradients(gradients, expected.gradients)
     if options.depth:
         check_depth(out, expected.out)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS[1:])
+@pytest.mark.parametrize("name", ["dense_tile", "saturated", "degree3"])
+def test_modes_share_the_image_and_agree_on_the_gradients(name, adjoint, device):
+    (first, expected), (second, found) = run(name, device), run(name, device, adjoint=adjoint)
+    assert torch.equal(first.image, second.image) and torch.equal(first.alpha, second.alpha)
+    for key, gradient in found.items():
+        assert relative_error(gradient, expected[key]) < 2e-5, key
+
+
+def test_stored_refuses_what_does_not_fit(device, monkeypatch):
+    monkeypatch.setattr(adjoints, "available_memory", lambda: 2**20)
+    scene = SCENES["dense_tile"]().to(device)
+    with pytest.raises(InputError, match=r"'stored': the transmittances of \d+ tile instances take .* GiB"):
+        rasterize(scene, leaves_of(scene), adjoint="stored")
+    assert rasterize(scene, adjoint="stored").image.isfinite().all()  # without gradients nothing is stored
+
+
+def test_extent_of_the_reference(device):
+    """Its square reaches 3 standard deviations, the ellipse 3.33 at opacity 1: nothing else may differ."""
+    scene = SCENES["degree2"]().to(device)
+    exact, square = (rasterize(scene, options=RasterOptions(extent=extent)) for extent in ("ellipse", "square"))
+    assert (exact.image - square.image).abs().max() < 0.05
+    faint = {"opacities": scene.opacities * 0.3}  # 2 log(255 * 0.3) < 9: the square holds the ellipse
+    exact, square = (rasterize(scene, faint, RasterOptions(extent=extent)) for extent in ("ellipse", "square"))
+    assert torch.equal(exact.image, square.image)
+
+
+def test_loop_cap(device):
+    """Entries of the tile's list beyond ``max_steps`` are as if they were not there."""
+    scene = SCENES["layers_4000"]().to(device)
+    depths = torch.tensor(scene.camera.rotation[2], dtype=torch.float32) @ scene.means.T
+    nearest = depths.argsort()[:100]
+    few = {name: getattr(scene, name)[nearest] for name in PARAMETERS}
+    leaves = leaves_of(scene)
+    capped = rasterize(scene, leaves, RasterOptions(max_steps=100))
+    assert (capped.image - rasterize(scene, few).image).abs().max() < 1e-6
+    capped.image.sum().backward()
+    assert leaves["opacities"].grad.nonzero().shape[0] == 100
 
 
 def test_means2d_carries_gradients_of_its_own(device):

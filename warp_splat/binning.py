@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from warp_splat.camera import Camera
-from warp_splat.config import TILE
+from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.blend import Splat2D
@@ -34,7 +34,9 @@ class Bins:
     invalid: int
 
 
-def bin_tiles(means2d, conics, opacities, colors, depths, extents, radii, camera: Camera) -> Bins:
+def bin_tiles(
+    means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
+) -> Bins:
     """Sort the drawn Gaussians by depth (ties by index) and list those of each tile."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     invalid = int(np.count_nonzero(radii.numpy() < 0))
@@ -44,11 +46,13 @@ def bin_tiles(means2d, conics, opacities, colors, depths, extents, radii, camera
     row_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
     slot_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
-    launch(tiles.pack, drawn, [order, *tensors, camera.height], [splats, row_ends])
+    support = [options.alpha_min, int(options.extent == "square")]
+    launch(tiles.pack, drawn, [order, *tensors, camera.height, *support], [splats, row_ends])
     rows = _scan(row_ends)
     _check_count(rows, camera, drawn)
     spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
-    launch(tiles.find_spans, drawn, [splats, row_ends, camera.width, camera.height, tiles_x], [spans, slot_ends])
+    size = [camera.width, camera.height, tiles_x]
+    launch(tiles.find_spans, drawn, [splats, row_ends, *size, *support], [spans, slot_ends])
     count = _scan(slot_ends)
     _check_count(count, camera, drawn)
     instances, ends = _sort_by_tile(spans, row_ends, slot_ends, count, tiles_x * tiles_y)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import ADJOINTS, RasterOptions
+from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
 
 
@@ -20,6 +20,16 @@ def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
     if options.sh_degree not in (None, 0, 1, 2, 3):
         raise InputError(f"options.sh_degree: expected 0, 1, 2, 3 or None, got {options.sh_degree!r}.")
+    for name, choices in (("projection", PROJECTIONS), ("extent", EXTENTS), ("exp_degree", EXP_DEGREES)):
+        if getattr(options, name) not in choices:
+            wanted = ", ".join(str(choice) for choice in choices)
+            raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
+    for name in ("alpha_min", "t_min"):
+        value = getattr(options, name)
+        if not (isinstance(value, (int, float)) and 0 <= value < 1):
+            raise InputError(f"options.{name}: expected a number from 0 to below 1, got {value!r}.")
+    if options.max_steps is not None and not (isinstance(options.max_steps, int) and options.max_steps >= 0):
+        raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {options.max_steps!r}.")
     return options
 
 

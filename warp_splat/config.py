@@ -15,6 +15,9 @@ FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half fi
 TILE = 16  # px, side of a tile
 
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
+PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that follow
+EXTENTS = ("ellipse", "square")
+EXP_DEGREES = (3, 4, 5, 6, None)
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ class TrainConfig:
         "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
     )
     adjoint: str = flag("manual", "how the pixel loop is differentiated", choices=ADJOINTS)
+    projection: str = flag("affine", "from 3D to 2D Gaussians", choices=PROJECTIONS)
     antialiasing: bool = flag(False, "keep small Gaussians from growing brighter (Mip-Splatting)")
     random_background: bool = flag(False, "a random background color in every step")
     lambda_dssim: float = flag(0.2, "share of 1 - SSIM in the loss")

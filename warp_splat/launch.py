@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 
+import psutil
 import torch
 import warp as wp
 
@@ -88,6 +89,11 @@ def _keep_freed_memory() -> None:
     m_trim_threshold, m_mmap_max = -1, -4  # of malloc.h
     mallopt(m_mmap_max, 0)
     mallopt(m_trim_threshold, 2**31 - 1)
+
+
+def available_memory() -> int:
+    """Bytes that can be had without swapping."""
+    return psutil.virtual_memory().available
 
 
 def even_slices(dim: int) -> list[int]:

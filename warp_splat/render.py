@@ -42,7 +42,11 @@ def render(config: RenderConfig) -> int:
     iteration = model_folder.find_iteration(folder, config.iteration)
     model = GaussianModel.load(model_folder.ply_path(folder, iteration))
     trained = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() or not config.orbit else {}
-    picture = make_picture(model, bool(trained.get("white_background")), bool(trained.get("antialiasing")))
+    options = RasterOptions(
+        antialiasing=bool(trained.get("antialiasing")),
+        projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
+    )
+    picture = make_picture(model, bool(trained.get("white_background")), options)
     say(f"{len(model)} Gaussians from iteration {iteration} of {folder}")
     if config.orbit:
         scene = _load(config, trained, say) if config.orbit_center == "focus" else None
@@ -74,10 +78,11 @@ def _load(config: RenderConfig, trained: dict, say) -> Scene:
     )
 
 
-def make_picture(model: GaussianModel, white_background: bool, antialiasing: bool) -> Callable[[Camera], np.ndarray]:
+def make_picture(
+    model: GaussianModel, white_background: bool, options: RasterOptions
+) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to the model's image, [H, W, 3] uint8."""
     background = torch.full((3,), float(white_background))
-    options = RasterOptions(antialiasing=antialiasing)
     with torch.no_grad():
         gaussians = model.activated()
 

@@ -12,14 +12,15 @@ import numpy as np
 import torch
 import warp as wp
 
-from warp_splat.binning import Bins, bin_tiles, views2d
+from warp_splat.adjoints import adjoint_of_blend, list_inputs, memory_for_states
+from warp_splat.binning import MAX_INSTANCES, Bins, bin_tiles, views2d
 from warp_splat.camera import Camera
 from warp_splat.checks import check_gaussians, check_options, explain_invalid
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
-from warp_splat.kernels.blend_lanes import BLOCKS, make_blend
-from warp_splat.kernels.lanes import vec16
+from warp_splat.kernels.blend_lanes import BLOCKS, make_blend, make_upstream
+from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.kernels.project import UNSEEN, CameraView, project, quarantine
 from warp_splat.launch import launch, stage, view
 
@@ -41,6 +42,10 @@ class RenderOutput:
     depth: torch.Tensor | None  # [H, W] world units, expected z (0 where alpha is 0), if asked for
     means2d: torch.Tensor  # [N, 2] px; 0 if culled
     radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= 1/255; 0 if culled
+    conics: torch.Tensor  # [N, 3] 1/px^2, (xx, xy, yy) of the inverse 2D covariance; 0 if culled, as all that follow
+    colors: torch.Tensor  # [N, 3]
+    depths: torch.Tensor  # [N] world units, z in the camera
+    opacities2d: torch.Tensor  # [N] after antialiasing
     invalid: int  # Gaussians left out because an input was not finite or a quaternion was zero
     dropped: Dropped = field(default_factory=Dropped)
 
@@ -67,28 +72,36 @@ def rasterize(
             as trainers keep them, which saves a copy. Color = max(0, 0.5 + sum of coefficients times basis).
         camera: pinhole camera, world to camera in COLMAP's axes.
         background: RGB behind everything; a tensor [3] receives a gradient.
-        adjoint: how the pixel loop is differentiated; "manual" (by hand, transmittance recovered by division).
+        adjoint: how the pixel loop is differentiated; one image, one gradient up to rounding. "manual": by hand.
+            "stepwise": reverse loop by hand, its body by Warp. "reversible": the whole loop by Warp, transmittance
+            recovered by division, as in the two before. "stored": likewise, every transmittance kept in memory.
         options: what to compute; see :class:`RasterOptions`.
 
     Returns:
-        A :class:`RenderOutput`. ``image``, ``alpha``, ``depth`` and ``means2d`` carry gradients. A pixel whose
+        A :class:`RenderOutput`. ``image``, ``alpha``, ``depth`` and all that lies on the way to them (``means2d``,
+        ``conics``, ``colors``, ``depths``, ``opacities2d``) carry gradients. A pixel whose
         upstream gradient is not finite is dropped, as is a Gaussian's gradient that is not finite; both are counted
         in ``dropped``.
 
     Raises:
-        InputError: if a shape, dtype, device or value is not as stated; the message names the argument.
+        InputError: if a shape, dtype, device or value is not as stated (the message names the argument), or if the
+            memory does not suffice for "stored".
     """
     options = check_options(adjoint, options, camera)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = _background(background)
-    out = render(gaussians, camera, background, options)
+    out = render(gaussians, camera, background, options, adjoint)
     if out.invalid:
         explain_invalid(out.invalid, gaussians[1])
     return out
 
 
 def render(
-    gaussians: tuple[torch.Tensor, ...], camera: Camera, background: torch.Tensor, options: RasterOptions
+    gaussians: tuple[torch.Tensor, ...],
+    camera: Camera,
+    background: torch.Tensor,
+    options: RasterOptions,
+    adjoint: str = "manual",
 ) -> RenderOutput:
     """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted."""
     dropped = Dropped()
@@ -97,15 +110,25 @@ def render(
             *gaussians, camera_view(camera, gaussians[5].shape[1], options), dropped
         )
     with stage("bin"):
-        bins = bin_tiles(means2d, conics, opacities2d, colors, depths, extents, radii, camera)
+        bins = bin_tiles(means2d, conics, opacities2d, colors, depths, extents, radii, camera, options)
     with stage("blend"):
         image, alpha, depth = Blend.apply(
-            means2d, conics, opacities2d, colors, depths, background, bins, camera, options, dropped
+            means2d, conics, opacities2d, colors, depths, background, bins, camera, options, adjoint, dropped
         )
     if options.depth:
         depth = depth / alpha.clamp_min(1e-10)
     return RenderOutput(
-        image, alpha, depth if options.depth else None, means2d, radii.clamp_min(0), bins.invalid, dropped
+        image=image,
+        alpha=alpha,
+        depth=depth if options.depth else None,
+        means2d=means2d,
+        radii=radii.clamp_min(0),
+        conics=conics,
+        colors=colors,
+        depths=depths,
+        opacities2d=opacities2d,
+        invalid=bins.invalid,
+        dropped=dropped,
     )
 
 
@@ -124,6 +147,8 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView
     cam.slope_max = wp.vec2(*((size - principal) / focal + margin))
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
     cam.antialiasing = int(options.antialiasing)
+    cam.ellipsoid = int(options.projection == "ellipsoid")
+    cam.alpha_min = options.alpha_min
     return cam
 
 
@@ -190,56 +215,66 @@ class Blend(torch.autograd.Function):
     """2D Gaussians to pixels; the adjoint walks each tile's list back to front."""
 
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, colors, depths, background, bins, camera, options, dropped):
+    def forward(ctx, means2d, conics, opacities, colors, depths, background, bins, camera, options, adjoint, dropped):
         height, width = camera.height, camera.width
         image, alpha = torch.empty(height, width, 3), torch.empty(height, width)
         depth = torch.empty(height, width) if options.depth else torch.empty(0, 0)
         tile_count = len(bins.ranges)
-        final, count = torch.empty(tile_count, BLOCKS, 16), torch.empty(tile_count, BLOCKS, 16)
+        final, count = torch.empty(tile_count, BLOCKS, LANES), torch.empty(tile_count, BLOCKS, LANES)
+        keep = adjoint == "stored" and any(ctx.needs_input_grad)
+        kept = memory_for_states(bins) if keep else torch.empty(0, 0, LANES)
         background = background.contiguous()
+        steps = [options.t_min, MAX_INSTANCES if options.max_steps is None else options.max_steps]
         launch(
-            make_blend(options.depth).forward,
+            make_blend(options.depth, options.exp_degree, keep),
             tile_count,
-            _blend_inputs(bins, background),
-            [*_pixel_views(image, alpha, depth), view(final, vec16), view(count, vec16)],
+            [*list_inputs(bins, options), *steps, view(background, wp.float32)],
+            [*_pixel_views(image, alpha, depth), *(view(lanes, vec16) for lanes in (final, count, kept))],
             bounds=bins.slices,
         )
-        ctx.save_for_backward(background, final, count)
-        ctx.bins, ctx.options, ctx.dropped, ctx.gaussian_count = bins, options, dropped, len(means2d)
+        ctx.save_for_backward(background, final, count, kept)
+        ctx.bins, ctx.options, ctx.adjoint, ctx.dropped = bins, options, adjoint, dropped
+        ctx.gaussian_count = len(means2d)
         return image, alpha, depth
 
     @staticmethod
     def backward(ctx, adj_image, adj_alpha, adj_depth):
         with stage("adjoint of blend"):
-            background, final, count = ctx.saved_tensors
+            background, final, count, kept = ctx.saved_tensors
             bins, options = ctx.bins, ctx.options
-            adj_image, adj_alpha, adj_depth = (adj.contiguous() for adj in (adj_image, adj_alpha, adj_depth))
+            adj_pixels = [adj.contiguous() for adj in (adj_image, adj_alpha, adj_depth)]
             slots = torch.empty(len(bins.instances), 10 if options.depth else 9)
-            adj_background = torch.empty(len(bins.ranges), 3)
-            bad = torch.empty(len(bins.ranges), dtype=torch.int32)
-            launch(
-                make_blend(options.depth).adjoint,
-                len(bins.ranges),
-                [
-                    *_blend_inputs(bins, background),
-                    *(view(final, vec16), view(count, vec16)),
-                    *_pixel_views(adj_image, adj_alpha, adj_depth),
-                ],
-                [view(slots, wp.float32), view(adj_background, wp.float32), view(bad, wp.int32)],
-                bounds=bins.slices,
+            up, adj_final, adj_background, bad, steps = _spread_upstream(
+                bins, options, background, final, count, adj_pixels, slots
             )
             ctx.dropped.pixels += int(bad.numpy().sum())
+            adjoint_of_blend(ctx.adjoint, bins, options, [final, count, kept, up, adj_final], steps, slots)
             rows, new = ctx.gaussian_count, slots.new_zeros
             grads = (new(rows, 2), new(rows, 3), new(rows), new(rows, 3), new(rows))
             launch(tiles.gather, len(bins.order), [bins.order, bins.slot_ends, view(slots, wp.float32)], views2d(grads))
             adj_background = torch.from_numpy(adj_background.numpy().sum(0))
-        return *grads, adj_background, None, None, None, None
-
-
-def _blend_inputs(bins: Bins, background: torch.Tensor) -> list:
-    ranges, instances = view(bins.ranges, wp.vec2i), view(bins.instances, wp.vec2i)
-    return [bins.tiles_x, ranges, instances, bins.splats, view(background, wp.float32)]
+        return *grads, adj_background, None, None, None, None, None
 
 
 def _pixel_views(image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> list:
     return [view(tensor, wp.float32) for tensor in (image, alpha, depth)]
+
+
+def _spread_upstream(
+    bins: Bins, options: RasterOptions, background, final, count, adj_pixels, slots
+) -> tuple[torch.Tensor, ...]:
+    tile_count = len(bins.ranges)
+    up = torch.empty(tile_count, BLOCKS * (4 if options.depth else 3), LANES)
+    adj_final, adj_background = torch.empty_like(final), torch.empty(tile_count, 3)
+    bad, steps = torch.empty(tile_count, dtype=torch.int32), torch.empty(tile_count, dtype=torch.int32)
+    lists = [bins.tiles_x, view(bins.ranges, wp.vec2i), view(bins.instances, wp.vec2i)]
+    launch(
+        make_upstream(options.depth),
+        tile_count,
+        [*lists, view(background, wp.float32), view(final, vec16), view(count, vec16), *_pixel_views(*adj_pixels)],
+        [
+            *(view(up, vec16), view(adj_final, vec16), view(adj_background, wp.float32)),
+            *(view(bad, wp.int32), view(steps, wp.int32), view(slots, wp.float32)),
+        ],
+    )
+    return up, adj_final, adj_background, bad, steps

@@ -102,8 +102,9 @@ class Trainer:
         return self._deck.pop(self._views_random.randrange(len(self._deck)))
 
     def _render(self, camera: Camera, background: torch.Tensor):
-        options = RasterOptions(sh_degree=self.degree, antialiasing=self.config.antialiasing)
-        return render(self.model.activated(), camera, background, options)
+        config = self.config
+        options = RasterOptions(sh_degree=self.degree, antialiasing=config.antialiasing, projection=config.projection)
+        return render(self.model.activated(), camera, background, options, config.adjoint)
 
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""

@@ -18,6 +18,7 @@ ALPHA_MIN = 1 / 255
 STOP = 1e-4  # a Gaussian that would take the transmittance below is not blended, nor is any behind it
 SIDE = 0.3  # the Jacobian sees x/z at most this share of the half width beyond the image
 
+FAINTEST = 1e-37  # about the least normal number of float32, the cut where there is none
 ROUNDING = 2.0**-24  # float32, half a unit in the last place
 UNSEEN = 1e-5  # a blending weight (and its gradient) too small to tell, a tenth of the error allowed
 BAND = 1e-3  # a Gaussian whose largest alpha is this close (relative) to 1/255 may be culled or not
@@ -119,7 +120,7 @@ def outlines(points, sigma, live, camera):
     dual = calibration @ dual @ calibration.T
     dual = dual / -dual[:, 2:, 2:]
     centre = -dual[:, :2, 2]
-    return centre, dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]
+    return centre.clone(), dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]
 
 
 def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
@@ -189,6 +190,7 @@ def _culling(splats, alpha, order, camera, alpha_min):
     """Which splats a renderer must keep, which it may keep, and how far they reach."""
     touches = torch.zeros_like(splats.live)
     touches[order] = (alpha >= alpha_min * (1 + BAND)).any(0)
+    alpha_min = max(alpha_min, FAINTEST)
     level = 2 * torch.log((splats.opacity / alpha_min).clamp_min(1))  # d' conic d on the edge of the ellipse
     half = (level[:, None] * torch.diagonal(splats.cov2d, dim1=1, dim2=2)).sqrt() + 0.01
     low, high = splats.means2d - half, splats.means2d + half

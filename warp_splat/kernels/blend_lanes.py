@@ -8,23 +8,13 @@ no lane sees the Gaussian, 5 % slower in both directions, because the test costs
 """
 
 import functools
-from typing import NamedTuple
 
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.blend import (
-    Splat2D,
-    adj_alpha_blend,
-    adj_alpha_of,
-    advance,
-    alpha_of,
-    falloff,
-    recover,
-    weight,
-)
+from warp_splat.kernels.blend import Splat2D, advance, alpha_of, exponent, make_exp, weight
 from warp_splat.kernels.build import FORWARD_ONLY
-from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
+from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, vec16, where_less
 
 BLOCKS = TILE * TILE // LANES  # per tile
 STRIDE = 32  # instances between two looks at whether the whole tile has stopped
@@ -48,28 +38,34 @@ def reach(mean: wp.vec2, extent: wp.vec2, x0: float, y0: float):
     )
 
 
-class BlendKernels(NamedTuple):
-    """A forward kernel and the adjoint that belongs to it."""
+@wp.func
+def offset_x(mean: wp.vec2, x0: float, bx: int):
+    """From the pixel centres of block column ``bx`` to the mean [px]."""
+    return vec16(mean[0] - x0 - float(4 * bx)) - LANE_X
 
-    forward: wp.Kernel
-    adjoint: wp.Kernel
+
+@wp.func
+def offset_y(mean: wp.vec2, y0: float, by: int):
+    return vec16(mean[1] - y0 - float(4 * by)) - LANE_Y
 
 
 @functools.cache
-def make_blend(depth: bool) -> BlendKernels:
-    """The blend and its hand-written adjoint (``manual``); with ``depth``, a fourth channel carries z."""
+def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
+    """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     CHANNELS = 4 if depth else 3
-    GRADS = 6 + CHANNELS  # mean, conic, opacity, channels
     STATE = BLOCKS * CHANNELS
-    module_options = dict(FORWARD_ONLY)
+    exp2_minus = make_exp(exp_degree)
 
-    @wp.kernel(module="unique", module_options=module_options)
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def blend(
         first: int,  # tile of this slice
         tiles_x: int,
         ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
         instances: wp.array[wp.vec2i],  # [M] (splat, slot), by tile, front to back
         splats: wp.array[Splat2D],  # [V]
+        alpha_min: float,
+        t_min: float,
+        max_steps: int,
         background: wp.array[float],  # [3]
         # out
         image_out: wp.array3d[float],  # [H, W, 3]
@@ -77,6 +73,7 @@ def make_blend(depth: bool) -> BlendKernels:
         depth_out: wp.array2d[float],  # [H, W] sum of w z
         final_out: wp.array2d[vec16],  # [T, BLOCKS] transmittance behind the last Gaussian
         count_out: wp.array2d[vec16],  # [T, BLOCKS] where the adjoint starts: instances walked before the pixel stopped
+        kept_out: wp.array2d[vec16],  # [M, BLOCKS] transmittance in front of each Gaussian
     ):
         tile = first + wp.tid()
         span = ranges[tile]
@@ -89,22 +86,25 @@ def make_blend(depth: bool) -> BlendKernels:
         c = wp.zeros(shape=(STATE,), dtype=vec16)
         for block in range(BLOCKS):
             t[block] = vec16(1.0)
-        for k in range(span[0], span[1]):
+        for k in range(span[0], span[0] + wp.min(span[1] - span[0], max_steps)):
             splat = splats[instances[k][0]]
             box = reach(splat.mean, splat.extent, x0, y0)
             walked = vec16(float(k - span[0] + 1))
             for by in range(box[2], box[3] + 1):
-                dy = vec16(splat.mean[1] - y0 - float(4 * by)) - LANE_Y
+                dy = offset_y(splat.mean, y0, by)
                 for bx in range(box[0], box[1] + 1):
                     block = 4 * by + bx
-                    dx = vec16(splat.mean[0] - x0 - float(4 * bx)) - LANE_X
-                    alpha = alpha_of(falloff(dx, dy, splat.root) * splat.opacity)
-                    w = weight(t[block], alpha)
+                    dx = offset_x(splat.mean, x0, bx)
+                    fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+                    alpha = alpha_of(fall * splat.opacity, alpha_min)
+                    w = weight(t[block], alpha, t_min)
+                    if wp.static(keep):
+                        kept_out[k, block] = t[block]
                     for channel in range(3):
                         c[block * CHANNELS + channel] = c[block * CHANNELS + channel] + w * splat.color[channel]
                     if wp.static(depth):
                         c[block * CHANNELS + 3] = c[block * CHANNELS + 3] + w * splat.depth
-                    behind = advance(t[block], alpha)
+                    behind = advance(t[block], alpha, t_min)
                     t[block] = behind
                     count[block] = where_less(behind, vec16(0.0), count[block], walked)
             if (k & (STRIDE - 1)) == STRIDE - 1:
@@ -130,42 +130,42 @@ def make_blend(depth: bool) -> BlendKernels:
                 if wp.static(depth):
                     depth_out[y, x] = c[block * CHANNELS + 3][lane]
 
-    @wp.kernel(module="unique", module_options=module_options)
-    def adj_blend(
+    return blend
+
+
+@functools.cache
+def make_upstream(depth: bool) -> wp.Kernel:
+    """The start of every adjoint: upstream gradients from rows of pixels to blocks, those that are not finite dropped."""
+    CHANNELS = 4 if depth else 3
+    STATE = BLOCKS * CHANNELS
+
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
+    def upstream(
         first: int,
         tiles_x: int,
-        ranges: wp.array[wp.vec2i],
-        instances: wp.array[wp.vec2i],
-        splats: wp.array[Splat2D],
-        background: wp.array[float],
-        final: wp.array2d[vec16],
-        count: wp.array2d[vec16],
+        ranges: wp.array[wp.vec2i],  # [T]
+        instances: wp.array[wp.vec2i],  # [M]
+        background: wp.array[float],  # [3]
+        final: wp.array2d[vec16],  # [T, BLOCKS]
+        count: wp.array2d[vec16],  # [T, BLOCKS]
         adj_image: wp.array3d[float],  # [H, W, 3]
         adj_alpha: wp.array2d[float],  # [H, W]
         adj_depth: wp.array2d[float],  # [H, W]
         # out
-        slots_out: wp.array2d[float],  # [M, GRADS] mean 2, conic 3, opacity 1, channels: one row per tile instance
+        up_out: wp.array2d[vec16],  # [T, STATE] dL/d(sum of w color, and of w z)
+        adj_final_out: wp.array2d[vec16],  # [T, BLOCKS] dL/d(final), through alpha and background
         adj_background_out: wp.array2d[float],  # [T, 3]
         dropped_out: wp.array[int],  # [T] pixels whose upstream gradient is not finite
+        steps_out: wp.array[int],  # [T] instances that the adjoint walks
+        slots_out: wp.array2d[float],  # [M, GRADS] zeros for those that it does not
     ):
         tile = first + wp.tid()
-        span = ranges[tile]
         column = (tile % tiles_x) * TILE
         line = (tile // tiles_x) * TILE
-        x0 = float(column) + 0.5
-        y0 = float(line) + 0.5
-        t = wp.zeros(shape=(BLOCKS,), dtype=vec16)
-        walked = wp.zeros(shape=(BLOCKS,), dtype=vec16)
-        behind = wp.zeros(shape=(BLOCKS,), dtype=vec16)
         up = wp.zeros(shape=(STATE,), dtype=vec16)
-        m = wp.zeros(shape=(GRADS,), dtype=vec16)
-        dropped = int(0)
+        adj_final = wp.zeros(shape=(BLOCKS,), dtype=vec16)
         adj_background = wp.vec3(0.0)
-        longest = float(0.0)
-        for block in range(BLOCKS):
-            t[block] = final[tile, block]
-            walked[block] = count[tile, block]
-            longest = wp.max(longest, wp.max(walked[block]))
+        dropped = int(0)
         for pixel in range(TILE * TILE):
             block = pixel // LANES
             lane = pixel % LANES
@@ -179,68 +179,25 @@ def make_blend(depth: bool) -> BlendKernels:
                 if wp.isfinite(u) and wp.isfinite(adj_t):
                     for channel in range(CHANNELS):
                         up[block * CHANNELS + channel][lane] = u[channel]
+                    t = final[tile, block][lane]
                     for channel in range(3):
                         adj_t += u[channel] * background[channel]
-                        adj_background[channel] += u[channel] * t[block][lane]
-                    behind[block][lane] = adj_t * t[block][lane]
+                        adj_background[channel] += u[channel] * t
+                    adj_final[block][lane] = adj_t
                 else:
                     dropped += 1
+        for i in range(STATE):
+            up_out[tile, i] = up[i]
+        longest = float(0.0)
+        for block in range(BLOCKS):
+            adj_final_out[tile, block] = adj_final[block]
+            longest = wp.max(longest, wp.max(count[tile, block]))
         for channel in range(3):
             adj_background_out[tile, channel] = adj_background[channel]
         dropped_out[tile] = dropped
-        end = span[0] + int(longest)
-        for k in range(end, span[1]):
-            for grad in range(GRADS):
+        steps_out[tile] = int(longest)
+        for k in range(ranges[tile][0] + int(longest), ranges[tile][1]):
+            for grad in range(slots_out.shape[1]):
                 slots_out[instances[k][1], grad] = 0.0
-        for back in range(end - span[0]):
-            k = end - 1 - back
-            splat = splats[instances[k][0]]
-            box = reach(splat.mean, splat.extent, x0, y0)
-            here = vec16(float(k - span[0]))
-            for grad in range(GRADS):
-                m[grad] = vec16(0.0)
-            for by in range(box[2], box[3] + 1):
-                dy = vec16(splat.mean[1] - y0 - float(4 * by)) - LANE_Y
-                for bx in range(box[0], box[1] + 1):
-                    block = 4 * by + bx
-                    dx = vec16(splat.mean[0] - x0 - float(4 * bx)) - LANE_X
-                    fall = falloff(dx, dy, splat.root)
-                    raw = where_less(here, walked[block], fall * splat.opacity, vec16(0.0))
-                    alpha = alpha_of(raw)
-                    inverse = recover(alpha)
-                    front = times(t[block], inverse)
-                    w = times(alpha, front)
-                    lit = vec16(0.0)
-                    for channel in range(3):
-                        lit = lit + up[block * CHANNELS + channel] * splat.color[channel]
-                        m[6 + channel] = m[6 + channel] + times(w, up[block * CHANNELS + channel])
-                    if wp.static(depth):
-                        lit = lit + up[block * CHANNELS + 3] * splat.depth
-                        m[9] = m[9] + times(w, up[block * CHANNELS + 3])
-                    adj_raw = adj_alpha_of(raw, adj_alpha_blend(front, inverse, behind[block], lit))
-                    behind[block] = behind[block] + times(w, lit)
-                    t[block] = front
-                    adj_fall = times(adj_raw, fall)  # dL/dopacity; times opacity: -dL/dq
-                    adj_x = times(adj_fall, dx)
-                    adj_y = times(adj_fall, dy)
-                    m[0] = m[0] + adj_x
-                    m[1] = m[1] + adj_y
-                    m[2] = m[2] + times(adj_x, dx)
-                    m[3] = m[3] + times(adj_x, dy)
-                    m[4] = m[4] + times(adj_y, dy)
-                    m[5] = m[5] + adj_fall
-            slot = instances[k][1]
-            sx = total(m[0])
-            sy = total(m[1])
-            adj_u = -2.0 * splat.opacity * (splat.root[0] * sx + splat.root[1] * sy)
-            adj_v = -2.0 * splat.opacity * splat.root[2] * sy
-            slots_out[slot, 0] = splat.root[0] * adj_u
-            slots_out[slot, 1] = splat.root[1] * adj_u + splat.root[2] * adj_v
-            slots_out[slot, 2] = -0.5 * splat.opacity * total(m[2])
-            slots_out[slot, 3] = -splat.opacity * total(m[3])
-            slots_out[slot, 4] = -0.5 * splat.opacity * total(m[4])
-            slots_out[slot, 5] = total(m[5])
-            for channel in range(CHANNELS):
-                slots_out[slot, 6 + channel] = total(m[6 + channel])
 
-    return BlendKernels(blend, adj_blend)
+    return upstream

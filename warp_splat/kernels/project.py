@@ -6,11 +6,16 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLU
     |a1 x a2|^2 + e (|a1|^2 + |a2|^2) + e^2,
 
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
+
+The exact outline of the ellipsoid x' Sigma^-1 x = 1 instead (Qi, Cai and Han 2024) follows from its dual conic,
+K (Sigma - p p') K' for a centre p. With a3 = (third row of W R S) / z and r = 1 - |a3|^2 that is, without a difference
+of large numbers, the mean moved by -(a1 a3, a2 a3) / r and A (I - a3 a3')^-1 A' / r as covariance; rows a_i become
+(a_i + (a_i a3) / (r + sqrt(r)) a3) / sqrt(r).
 """
 
 import warp as wp
 
-from warp_splat.config import ALPHA_MIN, BLUR, NEAR
+from warp_splat.config import BLUR, NEAR
 from warp_splat.kernels.blend import reach_of
 from warp_splat.kernels.build import DIFFERENTIABLE
 from warp_splat.kernels.harmonics import evaluate_sh
@@ -37,6 +42,8 @@ class CameraView:
     slope_max: wp.vec2
     sh_degree: int
     antialiasing: int
+    ellipsoid: int  # 1: outline of the ellipsoid instead of the affine projection
+    alpha_min: float
 
 
 @wp.func
@@ -55,15 +62,15 @@ def rotation_matrix(quat: wp.vec4):
 
 
 @wp.func
-def support(opacity: float, xx: float, xy: float, yy: float):
-    """Half sides of the box where alpha >= ALPHA_MIN, and the distance of its farthest point [px]; no gradient."""
-    reach = reach_of(opacity)
+def support(opacity: float, alpha_min: float, xx: float, xy: float, yy: float):
+    """Half sides of the box where alpha >= alpha_min, and the distance of its farthest point [px]; no gradient."""
+    reach = reach_of(opacity, alpha_min)
     widest = 0.5 * (xx + yy + wp.length(wp.vec2(xx - yy, 2.0 * xy)))  # variance of the long axis
     return wp.vec3(wp.sqrt(reach * xx), wp.sqrt(reach * yy), wp.sqrt(reach * widest))
 
 
 @wp.func_grad(support)
-def adj_support(opacity: float, xx: float, xy: float, yy: float, adj_ret: wp.vec3):
+def adj_support(opacity: float, alpha_min: float, xx: float, xy: float, yy: float, adj_ret: wp.vec3):
     pass
 
 
@@ -90,10 +97,10 @@ def project(
     opacities_out: wp.array[float],  # [N] after antialiasing
     colors_out: wp.array[wp.vec3],  # [N]
     depths_out: wp.array[float],  # [N] z in the camera
-    extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= ALPHA_MIN
+    extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= alpha_min
     radii_out: wp.array[
         int
-    ],  # [N] px, farthest point where alpha >= ALPHA_MIN, rounded up; CULLED or INVALID if not drawn; read first
+    ],  # [N] px, farthest point where alpha >= alpha_min, rounded up; CULLED or INVALID if not drawn; read first
 ):
     i = first + wp.tid()
     if radii_out[i] <= 0:  # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
@@ -113,8 +120,11 @@ def project(
     if not z > NEAR:
         return
     slope = wp.vec2(p[0] / z, p[1] / z)
-    u = wp.clamp(slope[0], camera.slope_min[0], camera.slope_max[0])
-    v = wp.clamp(slope[1], camera.slope_min[1], camera.slope_max[1])
+    u = slope[0]
+    v = slope[1]
+    if camera.ellipsoid == 0:  # the linearization is worthless far outside the image; the outline is not
+        u = wp.clamp(u, camera.slope_min[0], camera.slope_max[0])
+        v = wp.clamp(v, camera.slope_min[1], camera.slope_max[1])
     toward = wp.vec3(camera.rotation[2, 0], camera.rotation[2, 1], camera.rotation[2, 2])
     j1 = (camera.focal[0] / z) * (
         wp.vec3(camera.rotation[0, 0], camera.rotation[0, 1], camera.rotation[0, 2]) - u * toward
@@ -125,6 +135,17 @@ def project(
     axes = rotation_matrix(quat)
     a1 = wp.cw_mul(scale, j1 * axes)
     a2 = wp.cw_mul(scale, j2 * axes)
+    mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
+    if camera.ellipsoid != 0:
+        a3 = wp.cw_mul(scale, toward * axes) / z
+        rest = 1.0 - wp.dot(a3, a3)
+        if not rest > 0.0:  # reaches the plane of the camera: its outline is no ellipse
+            return
+        shift = wp.vec2(wp.dot(a1, a3), wp.dot(a2, a3))
+        mean2d = mean2d - shift / rest
+        stretch = 1.0 / (rest + wp.sqrt(rest))
+        a1 = (a1 + stretch * shift[0] * a3) / wp.sqrt(rest)
+        a2 = (a2 + stretch * shift[1] * a3) / wp.sqrt(rest)
     area = wp.cross(a1, a2)
     xx = wp.dot(a1, a1)
     yy = wp.dot(a2, a2)
@@ -135,11 +156,10 @@ def project(
     if not wp.isfinite(det):  # too large for float32 numbers, about 4e9 px
         radii_out[i] = INVALID
         return
-    if not opacity >= ALPHA_MIN:
+    if not opacity >= camera.alpha_min:
         return
-    mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
     xy = wp.dot(a1, a2)
-    extent = support(opacity, xx + BLUR, xy, yy + BLUR)
+    extent = support(opacity, camera.alpha_min, xx + BLUR, xy, yy + BLUR)
     if not (covers_pixel(mean2d[0], extent[0], camera.size[0]) and covers_pixel(mean2d[1], extent[1], camera.size[1])):
         return
     color = evaluate_sh(camera.sh_degree, wp.normalize(offset), sh_dc, sh_rest, i) + wp.vec3(0.5)

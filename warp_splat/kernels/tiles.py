@@ -9,7 +9,7 @@ two kernels can round differently. Slots, where the adjoint writes, number the i
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.blend import Splat2D, reach_of
+from warp_splat.kernels.blend import LOG2_E, Splat2D, reach_of
 from warp_splat.kernels.build import FORWARD_ONLY
 
 wp.set_module_options(FORWARD_ONLY)
@@ -26,6 +26,16 @@ def pixels(low: float, high: float, size: int):
     return wp.vec2i(int(first), int(last))
 
 
+@wp.func
+def square_of(extent: wp.vec2, conic: wp.vec3, reach: float):
+    """Half sides of the reference's square, 3 standard deviations of the long axis, rounded up."""
+    xx = extent[0] * extent[0] / reach
+    yy = extent[1] * extent[1] / reach
+    xy = -conic[1] * yy / conic[0]
+    side = wp.ceil(3.0 * wp.sqrt(0.5 * (xx + yy + wp.length(wp.vec2(xx - yy, 2.0 * xy)))))
+    return wp.vec2(side, side)
+
+
 @wp.kernel
 def pack(
     first: int,  # rank of this slice
@@ -37,6 +47,8 @@ def pack(
     depths: wp.array[float],  # [N]
     extents: wp.array[wp.vec2],  # [N]
     height: int,
+    alpha_min: float,
+    square: int,  # 1: look at the square of the reference instead of the ellipse
     # out
     splats_out: wp.array[Splat2D],  # [V]
     rows_out: wp.array[wp.int64],  # [V] rows of tiles that the box touches
@@ -46,10 +58,13 @@ def pack(
     splat = Splat2D()
     splat.mean = means2d[i]
     splat.extent = extents[i]
-    # root' root = conic / 2; the last term is sqrt((yy - xy^2 / xx) / 2) without the difference, by the box's height
-    root = wp.sqrt(0.5 * conics[i][0])
+    # root' root = conic log2(e) / 2; the last term is the root of yy - xy^2 / xx without the difference, by the box's height
+    root = wp.sqrt(0.5 * LOG2_E * conics[i][0])
     splat.opacity = opacities[i]
-    splat.root = wp.vec3(root, 0.5 * conics[i][1] / root, wp.sqrt(0.5 * reach_of(splat.opacity)) / splat.extent[1])
+    reach = reach_of(splat.opacity, alpha_min)
+    splat.root = wp.vec3(root, 0.5 * LOG2_E * conics[i][1] / root, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
+    if square != 0:
+        splat.extent = square_of(splat.extent, conics[i], reach)
     splat.color = colors[i]
     splat.depth = depths[i]
     splats_out[rank] = splat
@@ -65,6 +80,8 @@ def find_spans(
     width: int,
     height: int,
     tiles_x: int,
+    alpha_min: float,
+    square: int,
     # out
     spans_out: wp.array[wp.vec2i],  # [R] per row of tiles: first tile, number of tiles
     instances_out: wp.array[wp.int64],  # [V] tiles in all
@@ -76,9 +93,9 @@ def find_spans(
     begin = int(0)
     if rank > 0:
         begin = int(row_ends[rank - 1])
-    # at height dy the ellipse 2 q <= reach spans dx = slope dy +- half sqrt(1 - (dy / extent y)^2)
+    # at height dy the ellipse q <= reach / 2 spans dx = slope dy +- half sqrt(1 - (dy / extent y)^2)
     slope = -splat.root[1] / splat.root[0]
-    half = wp.sqrt(0.5 * reach_of(splat.opacity)) / splat.root[0]
+    half = wp.sqrt(0.5 * LOG2_E * reach_of(splat.opacity, alpha_min)) / splat.root[0]
     turn = slope * splat.extent[1] * splat.extent[1] / splat.extent[0]  # dy at its right end
     found = int(0)
     for row in range(end - begin):
@@ -92,6 +109,9 @@ def find_spans(
         f_left = dy_left / splat.extent[1]
         right = slope * dy_right + half * wp.sqrt(wp.max(1.0 - f_right * f_right, 0.0))
         left = slope * dy_left - half * wp.sqrt(wp.max(1.0 - f_left * f_left, 0.0))
+        if square != 0:
+            right = splat.extent[0]
+            left = -splat.extent[0]
         span = pixels(splat.mean[0] + left, splat.mean[0] + right, width)
         count = wp.max(span[1] // TILE - span[0] // TILE + 1, 0)
         spans_out[begin + row] = wp.vec2i((top + row) * tiles_x + span[0] // TILE, count)

@@ -1,0 +1,235 @@
+"""The physics under the splats, against closed forms, quadrature and stiff solvers of SciPy; and the files of `run`."""
+
+import json
+
+import numpy as np
+import pytest
+from scenes import make_camera
+from scipy.integrate import quad, solve_ivp
+from scipy.spatial.transform import Rotation
+
+from warp_splat.compare import volume as physics
+from warp_splat.compare import volume_report
+from warp_splat.compare.volume import Volume
+from warp_splat.errors import InputError
+
+BACKGROUND = np.array([0.2, 0.8, 0.4])
+COLOR = np.array([0.9, 0.3, 0.1])
+INTEGRATORS = (physics.integrate_exponential, physics.integrate_euler, physics.integrate_rk4)
+
+
+def slab(tau):
+    """A medium of constant extinction and color."""
+    return lambda s: (np.full((len(s), 1), tau), np.tile(tau * COLOR, (len(s), 1, 1)))
+
+
+def wavy(s):
+    """Smooth, but neither constant nor nothing at the ends, where rules for periodic functions would be too good."""
+    tau = (1 + 0.5 * np.sin(2 * s) + 0.2 * s)[:, None]
+    color = np.stack([0.5 + 0.4 * np.cos(s), 0.3 + 0.1 * s, 0.9 - 0.2 * s], -1)[:, None]
+    return tau, tau[..., None] * color
+
+
+def cloud(count, seed=3, density=2.0):
+    """Rotated Gaussians of aspect ratios up to 10, in front of the origin."""
+    rng = np.random.default_rng(seed)
+    return Volume(
+        means=rng.normal(size=(count, 3)) * 0.5 + [0, 0, 6],
+        quats=rng.normal(size=(count, 4)),
+        scales=np.exp(rng.uniform(np.log(0.1), 0, (count, 3))),
+        densities=rng.uniform(0.1, 1, count) * density,
+        colors=rng.uniform(0, 1, (count, 3)),
+        background=BACKGROUND,
+    )
+
+
+def directions(count, seed=4):
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(count, 3)) * [0.1, 0.1, 0] + [0, 0, 1]
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def extinction(volume, point):
+    """tau_i at one point by its definition, with the covariance inverted."""
+    rotation = Rotation.from_quat(volume.quats, scalar_first=True).as_matrix()
+    covariance = rotation @ (volume.scales[:, :, None] ** 2 * rotation.transpose(0, 2, 1))
+    offset = point - volume.means
+    return volume.densities * np.exp(-0.5 * np.einsum("ni,nij,nj->n", offset, np.linalg.inv(covariance), offset))
+
+
+def test_profile_is_the_gaussian_along_the_ray():
+    volume, rays, origin = cloud(5), directions(3), np.array([0.2, -0.1, 0.3])
+    profile = physics.ray_profile(volume, origin, rays)
+    for s in (0.0, 4.0, 5.5, 7.0):
+        expected = [extinction(volume, origin + s * ray) for ray in rays]
+        assert profile.extinction(np.array([s])) == pytest.approx(np.array(expected), rel=1e-11, abs=1e-300)
+
+
+@pytest.mark.parametrize("end", [3.0, 6.1, np.inf])
+def test_depth_is_the_integral(end):
+    volume, rays = cloud(3), directions(2)
+    depths = physics.ray_profile(volume, np.zeros(3), rays).depths(end)
+    for ray, row in zip(rays, np.broadcast_to(depths, (2, 3)), strict=True):
+        for index, depth in enumerate(row):
+            whole = quad(lambda s, r=ray, i=index: extinction(volume, s * r)[i], 0, min(end, 16), points=[6], limit=200)
+            assert depth == pytest.approx(whole[0], rel=1e-8, abs=1e-12)
+
+
+def test_needle_keeps_its_digits():
+    # axes 1 : 1e-6, seen along its length and 1e-6 beside it: q = 1/2, whatever the rotation
+    turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
+    quat = turn.as_quat(scalar_first=True)
+    needle = Volume([turn.apply([0, 0, 5])], [quat], [[1e-6, 1e-6, 1]], [1], [COLOR], BACKGROUND)
+    profile = physics.ray_profile(needle, turn.apply([1e-6, 0, 0]), turn.apply([[0, 0, 1]]))
+    assert profile.peak[0, 0] == pytest.approx(np.exp(-0.5), rel=1e-7)
+    assert profile.width[0, 0] == pytest.approx(1, rel=1e-12)
+    assert profile.center[0, 0] == pytest.approx(5, rel=1e-12)
+
+
+@pytest.mark.parametrize("integrate", INTEGRATORS)
+def test_constant_medium(integrate):
+    expected = COLOR * (1 - np.exp(-0.7 * 3)) + BACKGROUND * np.exp(-0.7 * 3)
+    steps, tolerance = {"integrate_exponential": (3, 1e-14), "integrate_euler": (20000, 1e-4)}.get(
+        integrate.__name__, (200, 1e-10)
+    )
+    assert integrate(slab(0.7), 1.0, 4.0, steps, BACKGROUND)[0] == pytest.approx(expected, abs=tolerance)
+
+
+def test_empty_medium_shows_the_background():
+    for integrate in INTEGRATORS:
+        assert np.array_equal(integrate(slab(0.0), 0.0, 1.0, 4, BACKGROUND)[0], BACKGROUND)
+
+
+def test_single_gaussian_is_its_color_at_its_depth():
+    volume = Volume([[0.1, 0, 4]], [[1, 0, 0, 0]], [[0.5, 0.3, 0.4]], [3.0], [COLOR], BACKGROUND)
+    profile = physics.ray_profile(volume, np.zeros(3), directions(4))
+    seen = np.exp(-profile.depths().sum(-1))[:, None]
+    expected = COLOR * (1 - seen) + BACKGROUND * seen
+    assert physics.integrate_exact(profile, volume.colors, BACKGROUND) == pytest.approx(expected, abs=1e-14)
+
+
+@pytest.mark.parametrize(("integrate", "order"), zip(INTEGRATORS, (2, 1, 4), strict=True))
+def test_orders(integrate, order):
+    truth = solve_ivp(
+        lambda q, c: wavy(np.array([3 - q]))[1][0, 0] - wavy(np.array([3 - q]))[0][0] * c,
+        (0, 3),
+        BACKGROUND,
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-14,
+    ).y[:, -1]
+    errors = [np.abs(integrate(wavy, 0.0, 3.0, n, BACKGROUND)[0] - truth).max() for n in (32, 64, 128)]
+    slopes = np.log2(errors[:-1]) - np.log2(errors[1:])
+    assert slopes == pytest.approx([order, order], abs=0.15)
+
+
+@pytest.mark.parametrize(("optical_depth", "method"), [(3.0, "LSODA"), (3.0, "Radau"), (1e4, "Radau"), (1e6, "Radau")])
+def test_truth_against_a_stiff_solver(optical_depth, method):
+    profile, volume = volume_report.stiff_medium(optical_depth, rays=1)
+    medium = profile.medium(volume.colors)
+
+    def toward_camera(q, radiance):
+        tau, source = medium(np.array([volume_report.FAR - q]))
+        return source[0, 0] - tau[0, 0] * radiance
+
+    solution = solve_ivp(
+        toward_camera, (0, volume_report.FAR), BACKGROUND, method=method, rtol=1e-9, atol=1e-11, max_step=0.5
+    )
+    truth = physics.integrate_exact(profile, volume.colors, BACKGROUND)[0]
+    assert solution.y[:, -1] == pytest.approx(truth, abs=1e-6)
+
+
+def test_dense_media_leave_only_the_exponential_alive():
+    profile, volume = volume_report.stiff_medium(1e6, rays=4)
+    truth = physics.integrate_exact(profile, volume.colors, BACKGROUND, 128)
+    medium = profile.medium(volume.colors)
+    highest = max(volume.colors.max(), BACKGROUND.max())
+    for samples in (8, 64, 512):
+        radiance = physics.integrate_exponential(medium, 0.0, volume_report.FAR, samples, BACKGROUND)
+        assert radiance.min() >= 0 and radiance.max() <= highest * (1 + 1e-14)
+        for explicit in INTEGRATORS[1:]:  # no warning either: it would fail this test
+            with np.errstate(divide="raise"):
+                error = explicit(medium, 0.0, volume_report.FAR, samples, BACKGROUND) - truth
+            assert not np.abs(error).max() < 1e6
+    assert np.abs(radiance - truth).max() < 1e-4
+
+
+@pytest.mark.parametrize(("name", "limit"), [("Euler", 2.0), ("RK4", 2.785293563), ("exponential", np.inf)])
+def test_stability_limits(name, limit):
+    assert volume_report._slab_limit(volume_report.METHODS[name][0]) == pytest.approx(limit, rel=1e-5)
+
+
+def test_thin_far_separate_gaussians_are_splats():
+    camera = make_camera(24, 18, fx=60, seed=5)
+    columns, rows = np.meshgrid([4.3, 11.9, 19.6], [4.7, 12.4])
+    pixels = np.stack([columns.ravel(), rows.ravel()], 1)
+    points = np.concatenate([(pixels - [camera.cx, camera.cy]) / camera.fx, np.ones((6, 1))], 1) * 1000
+    points *= np.linspace(1, 1.5, 6)[:, None]
+    rng = np.random.default_rng(6)
+    volume = Volume(
+        means=(points - camera.translation) @ camera.rotation,
+        quats=rng.normal(size=(6, 4)),
+        scales=rng.uniform(0.7, 1, (6, 3)) * points[:, 2:] / camera.fx,  # a pixel
+        densities=np.ones(6),
+        colors=rng.uniform(0, 1, (6, 3)),
+        background=BACKGROUND,
+    )
+    volume = Volume(
+        **{**vars(volume), "densities": 1e-3 / physics.peak_depths(volume, camera)}  # optical depth 1e-3 each
+    )
+    truth = physics.render_volume(volume, camera)
+    assert np.abs(truth - BACKGROUND).max() > 2e-4
+    images = physics.splat_ladder(volume, camera)
+    assert np.abs(images.pop("no overlap") - truth).max() < 1e-12
+    for name in ("linear depth", "linear peak", "affine", "ellipsoid"):
+        assert np.abs(images[name] - truth).max() < 2e-5, name  # 1e-3^2 / 2, and the perspective in a pixel's width
+
+
+def test_overlap_is_what_the_first_rung_ignores():
+    camera = make_camera(5, 5, fx=10, seed=None)
+    apart, close = (
+        Volume([[0, 0, 4], [0, 0, z]], [[1, 0, 0, 0]] * 2, [[0.4] * 3] * 2, [3, 3], np.eye(3)[:2], [0] * 3)
+        for z in (12.0, 4.1)
+    )
+    errors = [
+        np.abs(physics.splat_ladder(volume, camera)["no overlap"] - physics.render_volume(volume, camera)).max()
+        for volume in (apart, close)
+    ]
+    assert errors[0] < 1e-12 and errors[1] > 0.1
+
+
+def test_renderer_rung_is_linear_and_clamped():
+    # a Gaussian that fills the image, od 20 in the middle: the renderer stops at 0.99, light goes through
+    camera = make_camera(3, 3, fx=10, seed=None)
+    volume = Volume([[0, 0, 5]], [[1, 0, 0, 0]], [[1] * 3], [20 / np.sqrt(2 * np.pi)], [[1, 1, 1]], [0] * 3)
+    assert physics.peak_depths(volume, camera) == pytest.approx([20], rel=1e-5)
+    assert physics.splat_ladder(volume, camera)["3DGS"][1, 1] == pytest.approx([0.99] * 3)
+    assert physics.render_volume(volume, camera)[1, 1] == pytest.approx([1 - np.exp(-20)] * 3, abs=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("scales", [[1, 0, 1]]), ("densities", [-1]), ("quats", [[0] * 4]), ("colors", [[np.nan] * 3])]
+)
+def test_bad_volumes_are_refused(name, value):
+    good = {"means": [[0, 0, 1]], "quats": [[1, 0, 0, 0]], "scales": [[1, 1, 1]], "densities": [1]}
+    good |= {"colors": [[0, 0, 0]], "background": [0, 0, 0]}
+    with pytest.raises(InputError, match="Volume"):
+        Volume(**{**good, name: value})
+
+
+def test_run_writes_its_files(tmp_path, monkeypatch):
+    for name, value in {"OPTICAL_DEPTHS": (1.0, 1e6), "SAMPLES": [8, 64, 512, 4096], "REPEATS": 1, "RAYS": 2}.items():
+        monkeypatch.setattr(volume_report, name, value)
+    monkeypatch.setattr(volume_report, "LIMIT_DEPTHS", (1e2,))
+    scenes = {name: volume_report.SCENES[name] for name in ("one", "needle at the edge")}
+    monkeypatch.setattr(volume_report, "SCENES", scenes)
+    monkeypatch.setattr(volume_report, "PICTURED", tuple(scenes))
+    said = []
+    results = volume_report.run(tmp_path / "new", said.append)
+    assert {record["rung"] for record in results["ladder"]} == set(volume_report.PARENT)
+    assert "unstable" in "\n".join(said)
+    assert set(json.loads((tmp_path / "new/volume.json").read_text())) == set(results)
+    lines = (tmp_path / "new/volume.csv").read_text().splitlines()
+    assert len(lines) == 1 + sum(map(len, results.values()))
+    for name in ("volume_stiff.png", "volume_maps.png"):
+        assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
