@@ -21,6 +21,8 @@ from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.kernels.taped_lanes import make_walk
 from warp_splat.launch import available_memory, launch, view
 
+SPLATS = 3  # place of the Gaussians in the list
+
 
 def list_inputs(bins: Bins, options: RasterOptions) -> list:
     """What every blend kernel reads first."""
@@ -38,8 +40,8 @@ def memory_for_states(bins: Bins) -> torch.Tensor:
     needed, available = 4 * BLOCKS * LANES * count, available_memory()
     if needed > 0.8 * available:
         raise InputError(
-            f"adjoint 'stored': the transmittances of {count} tile instances take {needed / 2**30:.1f} GiB, of which "
-            f"{available / 2**30:.1f} GiB are free; use 'reversible', which needs none, a smaller image or fewer Gaussians."
+            f"adjoint 'stored': the transmittances of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
+            f"{available / 2**30:.1f} GiB are free; use 'reversible', which needs none, or a smaller image."
         )
     return torch.empty(count, BLOCKS, LANES)
 
@@ -54,26 +56,24 @@ def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list
         inputs = [*lists, final, count, steps, up, adj_final]
         launch(make_reverse(mode, *variant), tile_count, inputs, [rows], bounds=bins.slices)
         return
-    inputs = [*lists, final, count, kept, steps, rows]
-    adj_inputs = [None] * len(inputs)
+    adj_lists = [None] * len(lists)
     if mode == "generated":
         copies = wp.array(bins.splats.numpy()[bins.instances.numpy()[:, 0]], dtype=Splat2D, device="cpu")
-        adj_inputs[3] = wp.zeros(len(copies), dtype=Splat2D, device="cpu")
-        inputs[3] = copies
-    outputs = [up, adj_final]  # the kernel's own outputs are never computed; its adjoint reads these in their place
+        adj_copies = wp.zeros(len(copies), dtype=Splat2D, device="cpu")
+        lists[SPLATS], adj_lists[SPLATS] = copies, adj_copies
+    outputs = [up, adj_final]  # what the kernel would write; its adjoint reads their gradients and writes ``rows``
+    inputs = [final, count, kept, steps, rows]
     launch(
         make_walk(mode, *variant),
         tile_count,
-        inputs,
+        [*lists, *inputs],
         outputs,
         bounds=bins.slices,
-        adj_inputs=adj_inputs,
+        adj_inputs=[*adj_lists, *(None for _ in inputs)],
         adj_outputs=outputs,
     )
     if mode == "generated":
-        slots[bins.instances[:, 1].long()] = torch.from_numpy(
-            _rows(adj_inputs[3].numpy(), copies.numpy(), slots.shape[1])
-        )
+        slots[bins.instances[:, 1].long()] = torch.from_numpy(_rows(adj_copies.numpy(), copies.numpy(), slots.shape[1]))
 
 
 def _rows(adj: np.ndarray, splats: np.ndarray, width: int) -> np.ndarray:

@@ -142,6 +142,20 @@ class RenderConfig:
     quiet: bool = flag(False, "print only the summary")
 
 
+@dataclass
+class CompareConfig:
+    """Options of the comparison; without ``--stability`` or ``--volume``: adjoints, knobs and training."""
+
+    scene: str = flag("", "a COLMAP or nerf-synthetic scene to measure on, besides those that come with it", "-s")
+    out: str = flag("output/compare", "folder for tables (CSV, JSON) and plots", "-o")
+    modes: list[str] = flag(list(ADJOINTS), "adjoints to compare", many=str)
+    stability: bool = flag(False, "the catalogue of stiff and extreme cases instead")
+    volume: bool = flag(False, "the physics underneath instead: quadratures, and what splatting approximates")
+    full: bool = flag(False, "train by the whole schedule instead of 300 steps")
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores")
+
+
 #: Flags of the reference that this program does not have, and what to say when somebody uses one.
 FOREIGN_FLAGS = {
     "--checkpoint_iterations": "checkpoints are not supported yet; --save_iterations saves the model",

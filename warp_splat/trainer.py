@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,6 +45,7 @@ class Trainer:
         self.optimizer = Optimizer(self.model, config, extent)
         self.densifier = Densifier(self.model, self.optimizer, config, extent)
         self.quarantine = Quarantine()
+        self.options = RasterOptions(antialiasing=config.antialiasing, projection=config.projection)
         self.background = torch.full((3,), float(config.white_background))
         self.degree = 0
         self._views_random = random.Random(config.seed)
@@ -102,9 +103,8 @@ class Trainer:
         return self._deck.pop(self._views_random.randrange(len(self._deck)))
 
     def _render(self, camera: Camera, background: torch.Tensor):
-        config = self.config
-        options = RasterOptions(sh_degree=self.degree, antialiasing=config.antialiasing, projection=config.projection)
-        return render(self.model.activated(), camera, background, options, config.adjoint)
+        options = replace(self.options, sh_degree=self.degree)
+        return render(self.model.activated(), camera, background, options, self.config.adjoint)
 
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""

@@ -112,7 +112,8 @@ def outlines(points, sigma, live, camera):
     """Centres [N, 2] and covariances [N, 2, 2] of the ellipses that ellipsoids of one sigma show, by the dual conic.
 
     The dual quadric of an ellipsoid projects linearly: its outline's dual conic is K (Sigma - p p^T) K^T (Hartley and
-    Zisserman 2004, 8.3), and that of an ellipse of centre c and covariance S is a multiple of [S - c c^T, -c; -c^T, -1].
+    Zisserman 2004, 8.3), and that of an ellipse with centre c and covariance S is
+    a multiple of [S - c c^T, -c; -c^T, -1].
     """
     calibration = points.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     dual = sigma - points[:, :, None] * points[:, None, :]

@@ -1,11 +1,12 @@
 """The adjoint of the blend, its reverse loop by hand: ``manual`` and ``stepwise`` differ in the body of the loop.
 
-``manual`` is derived on paper (top of :mod:`warp_splat.kernels.blend`). ``stepwise`` lets Warp differentiate the step of
-one Gaussian over one block of pixels, as the rasterizer written in Slang does (Bangaru et al. 2023). Both recover T by
-division, both sum over the pixels of a tile in lanes and write one row per tile instance.
+``manual`` is derived on paper (top of :mod:`warp_splat.kernels.blend`). ``stepwise`` lets Warp differentiate the step
+of one Gaussian over one block of pixels, as the rasterizer written in Slang does (Bangaru et al. 2023). Both recover T
+by division, both sum over the pixels of a tile in lanes and write one row per tile instance.
 
-The exponential is called at one place of a kernel: LLVM inlines a function of this size only then, and a call costs more
-than the step (Tried: three calls, 2.9 times slower). Hence ``exp2_known``, whose gradient uses a value already there.
+The exponential is called at one place of a kernel: LLVM inlines a function of this size only then, and a call costs
+more than the step (Tried: three calls, 2.9 times slower). Hence ``exp2_known``, whose gradient uses a value that is
+there already.
 """
 
 import functools

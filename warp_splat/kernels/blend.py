@@ -86,7 +86,7 @@ def make_exp(degree: int | None) -> wp.Function:
 
 @wp.func
 def exponent(dx: Any, dy: Any, xx: Any, xy: Any, yy: Any):
-    """z at offset (dx, dy) [px] from pixel centre to mean, from the entries of the root."""
+    """The exponent z at offset (dx, dy) [px] from pixel centre to mean, from the entries of the root."""
     u = times(dx, xx) + times(dy, xy)
     v = times(dy, yy)
     return times(u, u) + times(v, v)

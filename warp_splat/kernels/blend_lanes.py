@@ -135,7 +135,7 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
 
 @functools.cache
 def make_upstream(depth: bool) -> wp.Kernel:
-    """The start of every adjoint: upstream gradients from rows of pixels to blocks, those that are not finite dropped."""
+    """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
     CHANNELS = 4 if depth else 3
     STATE = BLOCKS * CHANNELS
 

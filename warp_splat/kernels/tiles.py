@@ -58,7 +58,7 @@ def pack(
     splat = Splat2D()
     splat.mean = means2d[i]
     splat.extent = extents[i]
-    # root' root = conic log2(e) / 2; the last term is the root of yy - xy^2 / xx without the difference, by the box's height
+    # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
     root = wp.sqrt(0.5 * LOG2_E * conics[i][0])
     splat.opacity = opacities[i]
     reach = reach_of(splat.opacity, alpha_min)
