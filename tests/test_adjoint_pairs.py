@@ -44,15 +44,16 @@ def test_a_blended_pixel_against_float64():
     t = 1.0
     total = 0.0
     for alpha, color in zip(alphas, colors, strict=True):
-        total += blend.weight(t, float(alpha), T_MIN) * color
-        t = blend.advance(t, float(alpha), T_MIN)
+        after = blend.advance(t, float(alpha), T_MIN)
+        total += blend.weight(t, float(alpha), after) * color
+        t = after
     assert (total, t) == pytest.approx(pixel(alphas), rel=1e-5)
     behind = 0.0
     for k in reversed(range(12)):
-        inverse = blend.recover(float(alphas[k]))
-        t = t * inverse
+        odds = blend.odds_of(float(alphas[k]))
+        t = t + t * odds
         lit = float(colors[k] * up)
-        found = blend.adj_alpha_blend(t, inverse, behind, lit)
+        found = blend.adj_alpha_blend(t, odds, behind, lit)
         behind += float(alphas[k]) * t * lit
         nudge = np.where(np.arange(12) == k, 1e-6, 0.0)
         expected = up * (pixel(alphas + nudge)[0] - pixel(alphas - nudge)[0]) / 2e-6
@@ -61,8 +62,8 @@ def test_a_blended_pixel_against_float64():
 
 def test_a_pixel_stops_before_the_gaussian_that_would_darken_it():
     t = blend.advance(2e-4, 0.6, T_MIN)
-    assert t == pytest.approx(-2e-4) and blend.weight(2e-4, 0.6, T_MIN) == 0.0
-    assert blend.advance(t, 0.5, T_MIN) == pytest.approx(-2e-4) and blend.weight(t, 0.5, T_MIN) == 0.0
+    assert t == pytest.approx(-2e-4) and blend.weight(2e-4, 0.6, t) == 0.0
+    assert blend.advance(t, 0.5, T_MIN) == pytest.approx(-2e-4) and blend.weight(t, 0.5, t) == 0.0
 
 
 @pytest.mark.parametrize(("degree", "allowed"), [(3, 8e-5), (4, 4e-6), (5, 1e-6), (6, 1e-6), (None, 1e-6)])

@@ -56,24 +56,18 @@ def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list
         inputs = [*lists, final, count, steps, up, adj_final]
         launch(make_reverse(mode, *variant), tile_count, inputs, [rows], bounds=bins.slices)
         return
-    adj_lists = [None] * len(lists)
-    if mode == "generated":
-        copies = wp.array(bins.splats.numpy()[bins.instances.numpy()[:, 0]], dtype=Splat2D, device="cpu")
-        adj_copies = wp.zeros(len(copies), dtype=Splat2D, device="cpu")
-        lists[SPLATS], adj_lists[SPLATS] = copies, adj_copies
+    walk, inputs = make_walk(mode, *variant), [final, count, kept, steps, rows]
     outputs = [up, adj_final]  # what the kernel would write; its adjoint reads their gradients and writes ``rows``
-    inputs = [final, count, kept, steps, rows]
-    launch(
-        make_walk(mode, *variant),
-        tile_count,
-        [*lists, *inputs],
-        outputs,
-        bounds=bins.slices,
-        adj_inputs=[*adj_lists, *(None for _ in inputs)],
-        adj_outputs=outputs,
-    )
-    if mode == "generated":
-        slots[bins.instances[:, 1].long()] = torch.from_numpy(_rows(adj_copies.numpy(), copies.numpy(), slots.shape[1]))
+    adjoint = {"adj_inputs": [None] * (len(lists) + len(inputs)), "adj_outputs": outputs}
+    if mode != "generated":
+        launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
+        return
+    lists[SPLATS] = wp.array(bins.splats.numpy()[bins.instances.numpy()[:, 0]], dtype=Splat2D, device="cpu")
+    adj_splats = wp.zeros(len(bins.instances), dtype=Splat2D, device="cpu")
+    adjoint["adj_inputs"][SPLATS] = adj_splats
+    launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
+    found = _rows(adj_splats.numpy(), lists[SPLATS].numpy(), slots.shape[1])
+    slots[bins.instances[:, 1].long()] = torch.from_numpy(found)
 
 
 def _rows(adj: np.ndarray, splats: np.ndarray, width: int) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is skipped there
 ALPHA_MAX = 0.99  # alpha is clamped so that 1 / (1 - alpha) stays bounded
 T_MIN = 1.0e-4  # a pixel stops before the Gaussian that would take its transmittance below this
+T_LEAST = 1.0e-30  # no threshold is lower: a transmittance that underflows could not be recovered by division
 NEAR = 0.2  # world units along the optical axis; Gaussians whose centre is nearer are culled
 BLUR = 0.3  # px^2, added to both variances of the projected Gaussian (low-pass)
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
@@ -32,7 +33,7 @@ class RasterOptions:
         projection: "affine" (EWA splatting, Zwicker et al. 2001: linearized at the mean) or "ellipsoid" (the exact
             outline of the one-sigma ellipsoid; Qi, Cai and Han 2024).
         alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips nothing.
-        t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 never stops.
+        t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 means 1e-30.
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.
         extent: which tiles list a Gaussian: "ellipse" (exactly those where its opacity reaches ``alpha_min``) or
             "square" (of the reference: 3 standard deviations of the long axis).

@@ -61,7 +61,7 @@ class GaussianModel:
         return (
             raw["means"],
             raw["quats"],
-            torch.exp(raw["scales"]),
+            torch.exp(raw["scales"].clamp_max(88.0)),  # finite; the renderer leaves out what is too large
             torch.sigmoid(raw["opacities"]),
             raw["sh_dc"],
             raw["sh_rest"],

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import math
+
+import numpy as np
 import torch
 import warp as wp
 
@@ -11,6 +15,7 @@ from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.launch import launch, stage, view
 
 ROWS_PER_SLICE = 16
+FAR_APART = 10.0  # in units of an image's usual range
 
 
 def image_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 0.2) -> torch.Tensor:
@@ -39,9 +44,8 @@ class ImageLoss(torch.autograd.Function):
         with stage("loss"):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
             groups = -(-length // LANES)
-            x, y = _pad(image, groups), _pad(target, groups)
-            if target.dtype == torch.uint8:
-                y /= 255.0
+            centers = _centers(image, target)
+            x, y = _pad(image, centers[0], groups), _pad(target, centers[1], groups)
             moments, slopes = torch.empty(height, 5, groups, LANES), torch.empty(height, 3, groups, LANES)
             sums = torch.empty(height, 2)
             bounds = _row_slices(height)
@@ -49,13 +53,20 @@ class ImageLoss(torch.autograd.Function):
             launch(
                 ssim.compare,
                 height,
-                [_taps(x), _taps(y), view(moments, vec16), length],
+                [
+                    _taps(x),
+                    _taps(y),
+                    view(moments, vec16),
+                    view(_missing(groups, length), vec16),
+                    wp.vec2(*centers),
+                    length,
+                ],
                 [view(sums, wp.float32), view(slopes, vec16)],
                 bounds=bounds,
             )
             l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
             ctx.save_for_backward(x, y, slopes)
-            ctx.shape, ctx.lambda_dssim = image.shape, lambda_dssim
+            ctx.shape, ctx.lambda_dssim, ctx.gap = image.shape, lambda_dssim, centers[0] - centers[1]
             return torch.tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), dtype=torch.float32)
 
     @staticmethod
@@ -72,7 +83,7 @@ class ImageLoss(torch.autograd.Function):
             launch(
                 ssim.adj_compare,
                 height,
-                [_taps(x), _taps(y), _taps(blurred.view(height, 3, -1)), *weights],
+                [_taps(x), _taps(y), _taps(blurred.view(height, 3, -1)), ctx.gap, *weights],
                 [view(adj, vec16)],
                 bounds=bounds,
             )
@@ -80,12 +91,45 @@ class ImageLoss(torch.autograd.Function):
             return adj.view(height, -1)[:, :length].reshape(ctx.shape), None, None
 
 
-def _pad(image: torch.Tensor, groups: int) -> torch.Tensor:
-    """Rows of the image as float32 in [H, P], a group of zeros at either end."""
+def _centers(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
+    """What to subtract from the two images: any numbers are right, the middles of their ranges keep most digits.
+
+    One number for both unless they lie far apart, so that equal pixels stay equal.
+    """
+    if target.dtype == torch.uint8 or not target.numel():
+        return 0.5, 0.5
+    center = _middle(target)
+    own = _middle(image.detach())
+    return (own, center) if abs(own - center) > FAR_APART else (center, center)
+
+
+def _middle(image: torch.Tensor) -> float:
+    low, high = image.aminmax()
+    middle = 0.5 * low.item() + 0.5 * high.item()
+    return float(np.float32(middle)) if math.isfinite(middle) else 0.5
+
+
+def _pad(image: torch.Tensor, center: float, groups: int) -> torch.Tensor:
+    """Rows of the image minus ``center`` as float32 in [H, P], a group of zeros at either end."""
     height, length = image.shape[0], image.shape[1] * image.shape[2]
     padded = torch.zeros(height, (groups + 2) * LANES)
-    padded[:, LANES : LANES + length] = image.detach().reshape(height, length)
+    rows = padded[:, LANES : LANES + length]
+    rows.copy_(image.detach().reshape(height, length))
+    if image.dtype == torch.uint8:
+        rows /= 255.0
+    rows -= center
     return padded
+
+
+@functools.cache
+def _missing(groups: int, length: int) -> torch.Tensor:
+    """The share of the window beyond the ends of a row, by place in the row, [G, LANES]."""
+    columns = length // ssim.CHANNELS
+    tap = np.arange(columns)[:, None] + np.arange(ssim.WINDOW) - ssim.RADIUS
+    share = ((tap < 0) | (tap >= columns)) @ np.array(list(ssim.WEIGHTS))
+    missing = torch.zeros(groups * LANES)
+    missing[:length] = torch.from_numpy(np.repeat(share, ssim.CHANNELS))
+    return missing.view(groups, LANES)
 
 
 def _taps(rows: torch.Tensor) -> wp.array:

@@ -16,7 +16,7 @@ from warp_splat.adjoints import adjoint_of_blend, list_inputs, memory_for_states
 from warp_splat.binning import MAX_INSTANCES, Bins, bin_tiles, views2d
 from warp_splat.camera import Camera
 from warp_splat.checks import check_gaussians, check_options, explain_invalid
-from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
+from warp_splat.config import FRUSTUM_MARGIN, T_LEAST, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.blend_lanes import BLOCKS, make_blend, make_upstream
@@ -224,7 +224,7 @@ class Blend(torch.autograd.Function):
         keep = adjoint == "stored" and any(ctx.needs_input_grad)
         kept = memory_for_states(bins) if keep else torch.empty(0, 0, LANES)
         background = background.contiguous()
-        steps = [options.t_min, MAX_INSTANCES if options.max_steps is None else options.max_steps]
+        steps = [max(options.t_min, T_LEAST), MAX_INSTANCES if options.max_steps is None else options.max_steps]
         launch(
             make_blend(options.depth, options.exp_degree, keep),
             tile_count,

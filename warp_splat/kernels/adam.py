@@ -2,9 +2,10 @@
 
 import warp as wp
 
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.build import DIFFERENTIABLE
 
-wp.set_module_options(FORWARD_ONLY)
+# sums keep their order: regrouped, v would overflow for gradients above 1e19
+wp.set_module_options({**DIFFERENTIABLE, "enable_backward": False})
 
 
 @wp.kernel

@@ -23,7 +23,7 @@ from warp_splat.kernels.blend import (
     alpha_of,
     exponent,
     make_exp,
-    recover,
+    odds_of,
 )
 from warp_splat.kernels.blend_lanes import BLOCKS, offset_x, offset_y, reach
 from warp_splat.kernels.build import FORWARD_ONLY
@@ -62,9 +62,9 @@ def make_manual(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.Fu
         fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
         raw = where_less(here, walked, fall * splat.opacity, vec16(-1.0))
         alpha = alpha_of(raw, alpha_min)
-        inverse = recover(alpha)
-        front = times(t[block], inverse)
-        w = times(alpha, front)
+        odds = odds_of(alpha)
+        w = times(t[block], odds)
+        front = t[block] + w
         lit = vec16(0.0)
         for channel in range(3):
             u = up[block * CHANNELS + channel]
@@ -74,7 +74,7 @@ def make_manual(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.Fu
             u = up[block * CHANNELS + 3]
             lit = lit + u * splat.depth
             m[9] = m[9] + times(w, u)
-        adj_raw = adj_alpha_of(raw, alpha_min, adj_alpha_blend(front, inverse, behind[block], lit))
+        adj_raw = adj_alpha_of(raw, alpha_min, adj_alpha_blend(front, odds, behind[block], lit))
         behind[block] = behind[block] + times(w, lit)
         t[block] = front
         adj_fall = times(adj_raw, fall)  # dL/dopacity; times opacity: -dL/dq
@@ -196,7 +196,8 @@ def make_stepwise(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.
         parcel.blue = vec16(splat.color[2])
         parcel.depth = vec16(splat.depth)
         fall = exp2_minus(exponent(dx, dy, parcel.xx, parcel.xy, parcel.yy))
-        front = times(t[block], recover(opaque(times(fall, parcel.opacity), alpha_min, here, walked)))
+        odds = odds_of(opaque(times(fall, parcel.opacity), alpha_min, here, walked))
+        front = t[block] + times(t[block], odds)
         first = block * CHANNELS
         depth_up = vec16(0.0)
         if wp.static(depth):

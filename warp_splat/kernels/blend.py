@@ -114,30 +114,31 @@ def adj_alpha_of(raw: Any, alpha_min: float, adj_ret: Any):
 
 
 @wp.func
-def weight(t: Any, alpha: Any, t_min: float):
-    """Share of the Gaussian in the pixel; 0 from the Gaussian on that would take T below ``t_min``.
-
-    ``t`` is the transmittance in front, negative once the pixel has stopped.
-    """
-    w = times(alpha, t)
-    return where_less(t - w, fill(t_min, t), fill(0.0, t), w)
-
-
-@wp.func
 def advance(t: Any, alpha: Any, t_min: float):
-    """Transmittance behind the Gaussian. A pixel that stops keeps its T with the sign flipped, from then on."""
+    """Transmittance behind the Gaussian; ``t`` is that in front.
+
+    A pixel stops at the Gaussian that would take T below ``t_min``: it keeps its T with the sign flipped, from then on.
+    """
     after = t - times(alpha, t)
     return where_less(after, fill(t_min, t), wp.min(t, -t), after)
 
 
 @wp.func
-def adj_alpha_blend(t: Any, inverse: Any, behind: Any, here: Any):
-    """dL/dalpha_k from T_k, 1 / (1 - alpha_k), behind_k and color_k . u (module docstring)."""
-    return times(t, here) - times(behind, inverse)
+def weight(t: Any, alpha: Any, behind: Any):
+    """Share of the Gaussian in the pixel, from T in front and :func:`advance`'s answer: one decision, one rounding."""
+    return where_less(behind, fill(0.0, t), fill(0.0, t), times(alpha, t))
 
 
 @wp.func
-def recover(alpha: Any):
-    """1 / (1 - alpha): what turns the transmittance behind a Gaussian into that in front of it."""
-    one = fill(1.0, alpha)
-    return over(one, one - alpha)
+def adj_alpha_blend(t: Any, odds: Any, behind: Any, here: Any):
+    """dL/dalpha_k from T_k, alpha_k / (1 - alpha_k), behind_k and color_k . u (module docstring)."""
+    return times(t, here) - (behind + times(behind, odds))
+
+
+@wp.func
+def odds_of(alpha: Any):
+    """w_k / T_{k+1}: the transmittance in front of a Gaussian is that behind it times 1 + odds.
+
+    For faint Gaussians 1 / (1 - alpha) would round to one side: over 100,000 layers an error of 3e-3 instead of 5e-6.
+    """
+    return over(alpha, fill(1.0, alpha) - alpha)

@@ -97,14 +97,14 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
                     dx = offset_x(splat.mean, x0, bx)
                     fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
                     alpha = alpha_of(fall * splat.opacity, alpha_min)
-                    w = weight(t[block], alpha, t_min)
+                    behind = advance(t[block], alpha, t_min)
+                    w = weight(t[block], alpha, behind)
                     if wp.static(keep):
                         kept_out[k, block] = t[block]
                     for channel in range(3):
                         c[block * CHANNELS + channel] = c[block * CHANNELS + channel] + w * splat.color[channel]
                     if wp.static(depth):
                         c[block * CHANNELS + 3] = c[block * CHANNELS + 3] + w * splat.depth
-                    behind = advance(t[block], alpha, t_min)
                     t[block] = behind
                     count[block] = where_less(behind, vec16(0.0), count[block], walked)
             if (k & (STRIDE - 1)) == STRIDE - 1:

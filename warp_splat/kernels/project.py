@@ -47,9 +47,20 @@ class CameraView:
 
 
 @wp.func
+def largest(quat: wp.vec4):
+    """Largest entry, without a gradient: what is divided by it is normalized afterwards."""
+    return wp.max(wp.max(wp.abs(quat)), 1.0e-37)
+
+
+@wp.func_grad(largest)
+def adj_largest(quat: wp.vec4, adj_ret: float):
+    pass
+
+
+@wp.func
 def rotation_matrix(quat: wp.vec4):
     """Rotation of a quaternion (w, x, y, z) of any norm but 0; scaled first, so that denormals keep their direction."""
-    q = wp.normalize(quat / wp.max(wp.max(wp.abs(quat)), 1.0e-37))
+    q = wp.normalize(quat * (1.0 / largest(quat)))
     w = q[0]
     x = q[1]
     y = q[2]

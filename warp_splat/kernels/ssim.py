@@ -9,8 +9,15 @@ blur(.) the window, mu1 = blur(x), mu2 = blur(y), E11 = blur(x x), E22 = blur(y 
     A = 2 mu1 mu2 + C1            B = 2 (E12 - mu1 mu2) + C2
     C = mu1^2 + mu2^2 + C1        D = E11 + E22 - mu1^2 - mu2^2 + C2        SSIM = A B / (C D)
 
-    dSSIM/dmu1 = 2 mu2 (B - A) / (C D) - 2 mu1 SSIM (1/C - 1/D),   dSSIM/dE11 = -SSIM / D,   dSSIM/dE12 = 2 A / (C D)
-    dL/dx = blur(dL/dmu1) + 2 x blur(dL/dE11) + y blur(dL/dE12)
+In float32 the differences lose their digits where x is large and flat. So the kernels see x - p and y - q inside the
+image, p and q near the middle of the values, and zeros outside. With m1 = blur(x - p), m2 = blur(y - q),
+e11 = blur((x - p)^2), e12 = blur((x - p) (y - q)) and s = blur(1) (below 1 near the border only),
+
+    mu1 = m1 + p s,     E12 - mu1 mu2 = e12 - m1 m2 + (1 - s) (p m2 + q m1 + p q s)     (E11, E22 likewise)
+
+    dSSIM/dm1 = 2 (mu2 B - (mu2 - q) A) / (C D) - 2 SSIM (mu1 / C - (mu1 - p) / D)
+    dSSIM/de11 = -SSIM / D,   dSSIM/de12 = 2 A / (C D)
+    dL/dx = blur(dL/dm1) + 2 (x - p) blur(dL/de11) + (y - q) blur(dL/de12)
 """
 
 import math
@@ -78,16 +85,24 @@ def compare(
     x: wp.array2d[vec16],  # [H, P - 15]
     y: wp.array2d[vec16],
     moments: wp.array3d[vec16],  # [H, 5, G]
+    missing: wp.array[vec16],  # [G] share of the window beyond the ends of a row
+    centers: wp.vec2,  # p, q
     length: int,  # floats in a row of the image
     # out
     sums_out: wp.array2d[float],  # [H, 2] sum of |x - y| and of SSIM over the row
-    slopes_out: wp.array3d[vec16],  # [H, 3, G] dSSIM / dmu1, dE11, dE12; 0 outside the image
+    slopes_out: wp.array3d[vec16],  # [H, 3, G] dSSIM / dm1, de11, de12; 0 outside the image
 ):
     row = first + wp.tid()
     height = moments.shape[0]
     difference = vec16(0.0)
     similarity = vec16(0.0)
     one = vec16(1.0)
+    p = centers[0]
+    q = centers[1]
+    above = float(0.0)  # share of the window above or below the image
+    for tap in range(WINDOW):
+        if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
+            above += WEIGHTS[tap]
     for group in range(moments.shape[2]):
         mx = vec16(0.0)
         my = vec16(0.0)
@@ -101,19 +116,26 @@ def compare(
             xx = xx + moments[other, 2, group] * w
             yy = yy + moments[other, 3, group] * w
             xy = xy + moments[other, 4, group] * w
-        mxy = times(mx, my)
-        squares = times(mx, mx) + times(my, my)
-        a = mxy * 2.0 + fill(C1, mxy)
-        b = (xy - mxy) * 2.0 + fill(C2, mxy)
-        c = over(one, squares + fill(C1, mxy))
-        d = over(one, wp.max(xx + yy - squares, vec16(0.0)) + fill(C2, mxy))  # rounding must not make it negative
+        outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
+        inner = one - outside
+        mu_x = mx + inner * p
+        mu_y = my + inner * q
+        covariance = xy - times(mx, my) + times(outside, my * p + mx * q + inner * (p * q))
+        variances = xx + yy - times(mx, mx) - times(my, my)
+        variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
+        a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
+        b = covariance * 2.0 + fill(C2, mu_x)
+        c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
+        d = over(one, wp.max(variances, vec16(0.0)) + fill(C2, mu_x))  # rounding must not make it negative
         scale = times(c, d)
         ssim = times(times(a, b), scale)
         start = LANES * group
         similarity = similarity + inside(ssim, start, length)
-        delta = x[row, start + LANES] - y[row, start + LANES]
+        delta = x[row, start + LANES] - y[row, start + LANES] + inside(vec16(p - q), start, length)
         difference = difference + wp.max(delta, -delta)
-        slope = times(times(my, b - a), scale) - times(times(mx, ssim), c - d)
+        far_x = mu_x - vec16(p)
+        far_y = mu_y - vec16(q)
+        slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
         slopes_out[row, 0, group] = inside(slope * 2.0, start, length)
         slopes_out[row, 1, group] = inside(-times(ssim, d), start, length)
         slopes_out[row, 2, group] = inside(times(a, scale) * 2.0, start, length)
@@ -147,6 +169,7 @@ def adj_compare(
     x: wp.array2d[vec16],  # [H, P - 15]
     y: wp.array2d[vec16],
     slopes: wp.array3d[vec16],  # [H, 3, P - 15] blurred along columns
+    gap: float,  # p - q
     adj_l1: float,  # dL / d(sum of |x - y|)
     adj_ssim: float,  # dL / d(sum of SSIM)
     # out
@@ -165,5 +188,6 @@ def adj_compare(
         a = x[row, LANES * (group + 1)]
         b = y[row, LANES * (group + 1)]
         zero = vec16(0.0)
-        sign = where_less(b, a, vec16(1.0), where_less(a, b, vec16(-1.0), zero))
+        delta = a - b + vec16(gap)
+        sign = where_less(zero, delta, vec16(1.0), where_less(delta, zero, vec16(-1.0), zero))
         adj_x_out[row, group] = sign * adj_l1 + (dmu + times(a, dxx) * 2.0 + times(b, dxy)) * adj_ssim

@@ -21,7 +21,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.adjoint_lanes import conic_from_root, exp2_known, opaque
-from warp_splat.kernels.blend import Splat2D, alpha_of, exponent, make_exp, recover
+from warp_splat.kernels.blend import Splat2D, alpha_of, exponent, make_exp, odds_of
 from warp_splat.kernels.blend_lanes import BLOCKS, reach
 from warp_splat.kernels.build import FORWARD_ONLY
 from warp_splat.kernels.lanes import LANE_X, LANE_Y, times, total, vec16, where_less
@@ -52,7 +52,7 @@ def front_of(t: wp.array[vec16], block: int, alpha: vec16):
 
 @wp.func_replay(front_of)
 def replay_front_of(t: wp.array[vec16], block: int, alpha: vec16):
-    t[block] = times(t[block], recover(alpha))
+    t[block] = t[block] + times(t[block], odds_of(alpha))
     return t[block]
 
 

@@ -1,0 +1,98 @@
+"""Cameras and Gaussians for the extreme cases: ordinary ones, of which a case changes what it is about."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+
+C0 = 0.28209479177387814  # color = C0 * sh_dc + 0.5
+
+
+def look(
+    width: int = 24, height: int = 20, fov: float = 50.0, seed: int | None = 0, center=(0.3, -0.2, 0.5), **lens: float
+) -> Camera:
+    """A camera at ``center``, turned at random (``seed=None``: along the world's axes).
+
+    Args:
+        width: px.
+        height: px.
+        fov: horizontal field of view [degrees].
+        seed: of the rotation.
+        center: world units.
+        lens: ``cx`` and ``cy`` where they are not the image's middle [px].
+    """
+    rotation = np.eye(3)
+    if seed is not None:
+        rotation, upper = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+        rotation *= np.sign(np.diag(upper))
+        rotation *= np.linalg.det(rotation)
+    focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
+    principal = {"cx": width / 2, "cy": height / 2} | lens
+    return Camera(width, height, focal, focal, **principal, rotation=rotation, translation=-rotation @ np.array(center))
+
+
+def spread(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
+    """``count`` numbers in random order, no two closer than half an even spacing: depths that cannot swap."""
+    step = (high - low) / max(count, 1)
+    return low + step * (rng.permutation(count) + rng.uniform(0.25, 0.75, count))
+
+
+def to_world(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Camera points [N, 3] in the world."""
+    return points @ camera.rotation + camera.center
+
+
+def at_pixels(pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """World points [N, 3] that show at ``pixels`` [N, 2] at ``depth`` [N]."""
+    slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return to_world(np.concatenate([slopes * depth[:, None], depth[:, None]], 1), camera)
+
+
+def cloud(
+    seed: int,
+    count: int,
+    camera: Camera,
+    depth: np.ndarray | tuple[float, float] = (2.0, 8.0),
+    sigma: tuple[float, float] = (1.0, 5.0),
+    opacity: tuple[float, float] = (0.05, 0.9),
+    aspect: float = 0.2,
+) -> dict[str, np.ndarray]:
+    """Random Gaussians over the image, of SH degree 1.
+
+    Args:
+        seed: of everything.
+        count: N.
+        camera: whose image they cover.
+        depth: of each [N], or their range, world units.
+        sigma: range of the largest standard deviation on the image [px].
+        opacity: range.
+        aspect: least ratio of the other standard deviations to the largest.
+    """
+    rng = np.random.default_rng(seed)
+    z = spread(rng, count, *depth) if isinstance(depth, tuple) else depth
+    pixels = rng.uniform(-0.1, 1.1, (count, 2)) * [camera.width, camera.height]
+    size = np.exp(rng.uniform(*np.log(sigma), count)) * np.abs(z) / camera.fx
+    ratios = np.exp(rng.uniform(np.log(aspect), 0, (count, 3)))
+    ratios[:, 0] = 1
+    return {
+        "means": at_pixels(pixels, z, camera),
+        "quats": rng.normal(size=(count, 4)),
+        "scales": size[:, None] * ratios,
+        "opacities": rng.uniform(*opacity, count),
+        "sh_dc": (rng.uniform(0, 1, (count, 1, 3)) - 0.5) / C0,
+        "sh_rest": 0.15 * rng.normal(size=(count, 3, 3)),
+    }
+
+
+def facing(camera: Camera, angles: np.ndarray, tilts: np.ndarray) -> np.ndarray:
+    """Quaternions [N, 4] that turn the x axis to ``angles`` in the image plane and ``tilts`` out of it [radians]."""
+    x = np.stack([np.cos(tilts) * np.cos(angles), np.cos(tilts) * np.sin(angles), np.sin(tilts)], 1) @ camera.rotation
+    half = np.concatenate([1 + x[:, :1], np.zeros((len(x), 1)), -x[:, 2:], x[:, 1:2]], 1)  # from (1, 0, 0) to x
+    return half / np.linalg.norm(half, axis=1, keepdims=True)
+
+
+def tensors(arrays: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    """The arrays in float32, on which float64 and float32 agree exactly."""
+    return {name: torch.tensor(np.ascontiguousarray(array), dtype=torch.float32) for name, array in arrays.items()}
