@@ -12,7 +12,7 @@ LAYERS = [
     {"camera", "launch", "formats", "scene.types"},
     {"checks", "binning", "adjoints", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
-    {"trainer", "report", "evaluate"},
+    {"trainer", "report", "evaluate", "gradcheck"},
     {"train", "render"},
     {"compare"},
     {"cli", "__init__", "__main__"},

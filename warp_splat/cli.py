@@ -9,12 +9,13 @@ import sys
 from dataclasses import fields
 
 from warp_splat import __version__
-from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, RenderConfig, TrainConfig
+from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, CompareConfig, RenderConfig, TrainConfig
 from warp_splat.errors import InputError
 
 COMMANDS = {
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
+    "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
 }
 
 
@@ -50,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parse(arguments: list[str]) -> TrainConfig | RenderConfig:
+def parse(arguments: list[str]) -> TrainConfig | RenderConfig | CompareConfig:
     """The configuration that the arguments ask for.
 
     Raises:
@@ -80,8 +81,11 @@ def main(arguments: list[str] | None = None) -> int:
         # idle OpenMP threads of torch must not spin beside busy kernels; read when torch is loaded
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         os.environ.setdefault("GOMP_SPINCOUNT", "0")
+        os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # torch's profiler, which the comparison uses, greets otherwise
         if isinstance(config, TrainConfig):
             from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
+        elif isinstance(config, CompareConfig):
+            from warp_splat.compare.run import compare as run  # noqa: PLC0415
         else:
             from warp_splat.render import render as run  # noqa: PLC0415
         return run(config)

@@ -155,14 +155,13 @@ def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antiali
     return Splats(means2d, z, cov2d, opacity, colour, live)
 
 
-def _alphas(splats, order, camera):
+def _alphas(splats, order, camera, pixels):
     """Alpha of each pixel and splat before any decision, [P, M], and a bound on its relative error in float32."""
-    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     cov = splats.cov2d[order]
     det = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
     xx, xy, yy = cov[:, 1, 1] / det, -cov[:, 0, 1] / det, cov[:, 0, 0] / det  # the inverse's diagonal is swapped
-    dx = splats.means2d[order, 0] - (columns.reshape(-1, 1) + 0.5)
-    dy = splats.means2d[order, 1] - (rows.reshape(-1, 1) + 0.5)
+    dx = splats.means2d[order, 0] - (pixels[:, 1:] + 0.5)
+    dy = splats.means2d[order, 1] - (pixels[:, :1] + 0.5)
     alpha = splats.opacity[order] * torch.exp(-0.5 * (xx * dx**2 + yy * dy**2) - xy * dx * dy)
     with torch.no_grad():
         terms = 0.5 * (xx * dx**2 + yy * dy**2) + (xy * dx * dy).abs()  # what rounds when the exponent is summed
@@ -215,24 +214,30 @@ def render(
     projection="affine",
     alpha_min=ALPHA_MIN,
     t_min=STOP,
+    pixels=None,
 ):
     """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background.
 
-    Keywords are those of :class:`warp_splat.RasterOptions`; thresholds of 0 blend everything.
+    Keywords are those of :class:`warp_splat.RasterOptions`; thresholds of 0 blend everything. With ``pixels`` [P, 2]
+    (row, column) only those are computed, and what is [H, W] otherwise is [P].
     """
+    shape = (camera.height, camera.width) if pixels is None else (len(pixels),)
+    if pixels is None:
+        pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width))
     splats = project(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing, projection)
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]
-    raw, error = _alphas(splats, order, camera)
     with torch.no_grad():
+        raw, error = _alphas(splats, order, camera, pixels)
         blended, fragile = _decide(raw, error, alpha_min, t_min)
         touches, near_image, reach = _culling(splats, raw, order, camera, alpha_min)
-
+        seen = blended.any(0)  # the others have no gradient, and need no memory for it
+    order, blended = order[seen], blended[:, seen]
+    raw, _ = _alphas(splats, order, camera, pixels)
     alpha = torch.where(blended, raw.clamp_max(ALPHA_MAX), torch.zeros_like(raw))
     through = torch.cat([torch.ones_like(raw[:, :1].sum(1, keepdim=True)), torch.cumprod(1 - alpha, 1)], 1)
     weight = alpha * through[:, :-1]
-    shape = (camera.height, camera.width)
     background = torch.as_tensor(background, dtype=torch.float64)
     image = weight @ splats.colour[order] + through[:, -1:] * background
     total = weight.sum(1)

@@ -8,44 +8,30 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warp_splat.camera import Camera
 from warp_splat.compare import volume as physics
-from warp_splat.compare.volume import Volume
+from warp_splat.compare.volume_plots import plot_integrators, plot_maps
+from warp_splat.compare.volume_scenes import (
+    FAR,
+    LIMIT_DEPTHS,
+    METHODS,
+    OPTICAL_DEPTHS,
+    PARENT,
+    PICTURED,
+    RAYS,
+    REPEATS,
+    SAMPLES,
+    SCENES,
+    UNSTABLE,
+    plain,
+    stiff_medium,
+)
 from warp_splat.formats.atomic import atomic_write, write_json
-from warp_splat.report import BLUE, DPI, FAINT, GREEN, INK, ORANGE, WIDTH, format_table
-
-#: name: (integrator, evaluations of the medium per step, largest stable tau ds in theory, color, marker)
-METHODS = {
-    "exponential": (physics.integrate_exponential, 1, np.inf, BLUE, "o"),
-    "Euler": (physics.integrate_euler, 1, 2.0, ORANGE, "s"),
-    "RK4": (physics.integrate_rk4, 2, 2.785293563405282, GREEN, "^"),
-}
-OPTICAL_DEPTHS = (1e-2, 1.0, 1e2, 1e4, 1e6)
-SAMPLES = [2**k for k in range(3, 13)]
-RAYS = 64
-FAR = 20.0  # world units; the media of the integrators lie between 0 and here
-REPEATS = 5
-UNSTABLE = 1.0  # an error as large as the whole range of color, or one that is no number
-LIMIT_DEPTHS = (1e2, 1e3, 1e4)  # media in which the largest stable step is sought
-
-#: Rung of the ladder: the image that it changes in one thing, so that the difference is that thing's own cost.
-PARENT = {
-    "no overlap": "truth",
-    "linear depth": "no overlap",
-    "linear peak": "no overlap",
-    "affine": "no overlap",
-    "ellipsoid": "no overlap",
-    "affine + blur": "affine",
-    "3DGS": "truth",
-}
-PICTURED = ("overlapping", "needle at the edge", "cluster")
-LEAST_ERROR = 1e-4  # black in the error maps, a fortieth of a step of 8-bit color
+from warp_splat.report import format_table
 
 
 def run(out: Path, say: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
@@ -78,67 +64,6 @@ def run(out: Path, say: Callable[[str], None] = print) -> dict[str, list[dict[st
     plot_integrators(out / "volume_stiff.png", integrators, limits)
     plot_maps(out / "volume_maps.png", {name: images[name] for name in PICTURED})
     return results
-
-
-# media and scenes -------------------------------------------------------------------------------------------------
-
-
-def stiff_medium(optical_depth: float, rays: int = RAYS) -> tuple[physics.Profile, Volume]:
-    """A fan of rays through two overlapping Gaussians of different color, ``optical_depth`` along the first ray."""
-    volume = Volume(
-        means=[[0, 0, 10], [0.4, 0.1, 10.5]],
-        quats=[[1, 0, 0, 0], [0.9, 0.2, 0.3, 0.1]],
-        scales=[[1, 1, 1], [1.2, 0.6, 1.1]],
-        densities=[1, 1],
-        colors=[[0.9, 0.3, 0.1], [0.1, 0.4, 0.9]],
-        background=[0.2, 0.8, 0.4],
-    )
-    directions = np.stack([np.linspace(0, 0.1, rays), np.zeros(rays), np.ones(rays)], 1)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    profile = physics.ray_profile(volume, np.zeros(3), directions)
-    return replace(profile, peak=profile.peak * optical_depth / profile.depths()[0].sum()), volume
-
-
-def _scene(camera: Camera, means, scales, optical_depths, colors, quats=None) -> tuple[Volume, Camera]:
-    """Gaussians with an optical depth through the center as the camera sees it; unrotated unless ``quats``."""
-    count = len(means)
-    quats = np.tile([1.0, 0, 0, 0], (count, 1)) if quats is None else quats
-    volume = Volume(means, quats, scales, np.ones(count), colors, [0.05, 0.05, 0.08])
-    return replace(volume, densities=optical_depths / physics.peak_depths(volume, camera)), camera
-
-
-def _camera(size: int = 48, focal: float = 48.0) -> Camera:
-    return Camera(size, size, focal, focal, size / 2, size / 2, np.eye(3), np.zeros(3))
-
-
-def _cluster() -> tuple[Volume, Camera]:
-    rng, count = np.random.default_rng(7), 32
-    means = rng.normal(size=(count, 3)) * [0.55, 0.55, 0.4] + [0, 0, 4]
-    scales = np.exp(rng.uniform(np.log(0.08), np.log(0.45), (count, 3)))
-    optical_depths = np.exp(rng.uniform(np.log(0.3), np.log(6), count))
-    return _scene(_camera(), means, scales, optical_depths, rng.uniform(0, 1, (count, 3)), rng.normal(size=(count, 4)))
-
-
-ORANGE_BLUE = np.array([[0.95, 0.55, 0.1], [0.1, 0.4, 0.9]])
-SCENES: dict[str, Callable[[], tuple[Volume, Camera]]] = {
-    "one": lambda: _scene(_camera(), [[0, 0, 4]], [[0.5, 0.35, 0.4]], np.array([2.0]), ORANGE_BLUE[:1]),
-    "separated": lambda: _scene(
-        _camera(), [[-0.2, 0, 3], [0.4, 0, 9]], [[0.3] * 3, [1.0] * 3], np.array([1.5, 3.0]), ORANGE_BLUE
-    ),
-    "overlapping": lambda: _scene(
-        _camera(), [[-0.25, 0, 4], [0.25, 0, 4.2]], [[0.5, 0.5, 0.6]] * 2, np.array([3.0, 3.0]), ORANGE_BLUE
-    ),
-    "needle along its axis": lambda: _scene(
-        _camera(), [[0, 0, 5]], [[0.08, 0.08, 0.8]], np.array([4.0]), ORANGE_BLUE[:1]
-    ),
-    "needle at the edge": lambda: _scene(
-        _camera(focal=17.0), [[2.6, 0.6, 3.0]], [[0.35, 0.35, 0.8]], np.array([3.0]), ORANGE_BLUE[:1]
-    ),
-    "cluster": _cluster,
-}
-
-
-# measuring --------------------------------------------------------------------------------------------------------
 
 
 def measure_integrators() -> list[dict[str, Any]]:
@@ -194,7 +119,7 @@ def measure_limits() -> list[dict[str, Any]]:
             measured = np.inf if not len(bad) else float(tau_ds[bad[-1] + 1])
             records.append(
                 {
-                    "medium": f"Gaussians, optical depth {_plain(optical_depth)}",
+                    "medium": f"Gaussians, optical depth {plain(optical_depth)}",
                     "method": name,
                     "theory": theory,
                     "measured": measured,
@@ -265,14 +190,6 @@ def measure_ladder() -> tuple[dict[str, dict[str, np.ndarray]], list[dict[str, A
     return images, records
 
 
-# tables -----------------------------------------------------------------------------------------------------------
-
-
-def _plain(number: float) -> str:
-    """0.01 and 1,000,000, not 1e+06."""
-    return f"{number:,.0f}" if number >= 1 else f"{number:g}"
-
-
 def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
     shown = (8, 64, 512, 4096)
     cells = {(r["optical_depth"], r["method"], r["samples"]): r for r in records}
@@ -282,7 +199,7 @@ def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
         return f"{error} ({1e3 * record['seconds']:.2g} ms)"
 
     rows = [
-        [_plain(depth), name, *(cell(cells[depth, name, count]) for count in shown)]
+        [plain(depth), name, *(cell(cells[depth, name, count]) for count in shown)]
         for depth in OPTICAL_DEPTHS
         for name in METHODS
     ]
@@ -330,87 +247,3 @@ def _write_csv(path: Path, results: Mapping[str, Sequence[Mapping[str, Any]]]) -
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
-
-
-# pictures ---------------------------------------------------------------------------------------------------------
-
-
-def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limits: Sequence[Mapping[str, Any]]) -> None:
-    """Draw error against run time, a panel for each optical depth, and error against tau ds around the limits."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
-
-    figure = Figure(figsize=(WIDTH, 5.4), dpi=DPI, layout="constrained", facecolor="white")
-    figure.supylabel("largest error of the radiance (colors 0 to 1)", fontsize=9, color=INK)
-    panels = figure.subplots(2, 3).ravel()
-    for axes, optical_depth in zip(panels, OPTICAL_DEPTHS, strict=False):
-        chosen = [r for r in integrators if r["optical_depth"] == optical_depth]
-        _style(axes, f"optical depth {_plain(optical_depth)}", f"run time for {RAYS} rays [ms]", "")
-        for name, (*_, color, marker) in METHODS.items():
-            stable = [(1e3 * r["seconds"], r["error"]) for r in chosen if r["method"] == name and r["stable"]]
-            unstable = [1e3 * r["seconds"] for r in chosen if r["method"] == name and not r["stable"]]
-            if stable:
-                axes.plot(*zip(*stable, strict=True), color=color, marker=marker, markersize=4, linewidth=1.4)
-            # crosses in a row of their own, above every error
-            axes.plot(unstable, [6.0 if name == "Euler" else 60.0] * len(unstable), "x", color=color, markersize=5)
-        axes.set_ylim(1e-16, 1e3)
-        axes.axhline(UNSTABLE, color=INK, linewidth=0.6, linestyle=":")
-    axes = panels[-1]
-    _style(axes, f"step limit at {_plain(LIMIT_DEPTHS[-1])}", "tau ds at the peak of tau", "")
-    for record in limits[-len(METHODS) :]:  # those of the densest medium
-        theory, color = METHODS[record["method"]][2:4]
-        axes.plot(record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, linewidth=1.4)  # some are inf
-        if np.isfinite(theory):
-            axes.axvline(theory, color=color, linewidth=1, linestyle="--")
-    axes.set_ylim(1e-16, 1e3)
-    axes.set_xticks([1, 2, 5, 10, 20], labels=["1", "2", "5", "10", "20"])
-    axes.minorticks_off()
-    lines = [axes.plot([], [], color=color, marker=marker, markersize=4)[0] for *_, color, marker in METHODS.values()]
-    cross = axes.plot([], [], "x", color=INK)[0]
-    dashed = axes.plot([], [], "--", color=INK, linewidth=1)[0]
-    labels = [*METHODS, "unstable: error above 1", "stability limit for constant tau"]
-    figure.legend([*lines, cross, dashed], labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary)
-
-
-def _style(axes: Any, title: str, x: str, y: str) -> None:
-    axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
-    axes.set_xlabel(x, fontsize=9, color=INK)
-    axes.set_ylabel(y, fontsize=9, color=INK)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["bottom", "left"]].set_color(FAINT)
-    axes.tick_params(labelsize=8, labelcolor=INK, color=FAINT)
-    axes.grid(color=FAINT, linewidth=0.5)
-    axes.set_axisbelow(True)
-
-
-def plot_maps(path: Path, scenes: Mapping[str, Mapping[str, np.ndarray]]) -> None:
-    """Draw for each scene the truth, the renderer's image, and where each rung of the ladder is wrong."""
-    from matplotlib.colors import LogNorm  # noqa: PLC0415 - half a second, only for pictures
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(WIDTH, 4.2), dpi=DPI, layout="compressed", facecolor="white")
-    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
-    grid = figure.subplots(len(scenes), 1 + len(PARENT))
-    shown = None
-    for row, (scene, images) in zip(grid, scenes.items(), strict=True):
-        row[0].imshow(images["truth"].clip(0, 1))
-        row[0].set_ylabel(scene.replace(" at", "\nat"), fontsize=8, color=INK)
-        for axes, rung in zip(row[1:], PARENT, strict=True):
-            error = np.abs(images[rung] - images["truth"]).mean(-1)
-            shown = axes.imshow(error.clip(LEAST_ERROR), cmap="inferno", norm=LogNorm(LEAST_ERROR, 0.3))
-            mean = f"{error.mean():.1e}" if error.mean() > 1e-12 else "exact"
-            axes.set_xlabel(mean, fontsize=8, color=INK, labelpad=2)
-        for axes in row:
-            axes.set_xticks([])
-            axes.set_yticks([])
-            axes.spines[:].set_visible(False)
-    for axes, title in zip(grid[0], ("truth", *PARENT), strict=True):
-        axes.set_title(title, fontsize=8, fontweight="bold", color=INK)
-    bar = figure.colorbar(shown, ax=grid, orientation="horizontal", fraction=0.05, aspect=70, extend="both")
-    bar.set_label("|error|, mean of the channels (colors 0 to 1); under each map its mean", fontsize=8)
-    bar.ax.tick_params(labelsize=8, labelcolor=INK)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -53,6 +54,18 @@ def write_json(path: str | Path, value) -> None:
     """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_without_infinities(value), indent=1, allow_nan=False), encoding="utf-8")
+
+
+def write_csv(path: str | Path, rows: Sequence[Mapping]) -> None:
+    """Write records as CSV, whole or not at all, with a column for each key that any of them has.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _without_infinities(value):

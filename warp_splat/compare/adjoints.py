@@ -1,0 +1,207 @@
+"""Adjoint against adjoint: error, time and memory, by scene and parameter.
+
+All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
+instance (:mod:`warp_splat.adjoints` says where they differ). Beside the modes of ``rasterize`` stand ``generated``
+(``reversible`` without any gradient by hand), ``plain`` (the loop recorded naively: wrong), the thesis's loop cap, and
+central differences.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from warp_splat import launch
+from warp_splat.compare.source import derivative_lines
+from warp_splat.compare.truth import Error, Truth, compute_truth, errors_of, gradients_of
+from warp_splat.compare.workloads import Workload
+from warp_splat.config import RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.renderer import render
+
+CAPS = (2048, 512, 128)  # the thesis's loop cap, and two that bite in smaller scenes
+REPEATS = 5
+BUDGET = 12.0  # s for the repeats of a workload; slow ones get fewer
+DIFFERENCES = 12  # parameters at which central differences are computed
+STEP = 3e-3  # of central differences, relative to the opacity or what is left to 1
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A way to an image and its gradient."""
+
+    name: str
+    adjoint: str
+    changes: Mapping[str, Any] = field(default_factory=dict)  # of RasterOptions
+
+    def options(self, workload: Workload) -> RasterOptions:
+        """The workload's options with this variant's changes."""
+        return replace(workload.options, **self.changes)
+
+
+@dataclass
+class Measurement:
+    """One variant on one workload; None where there is no number."""
+
+    scene: str
+    variant: str
+    gaussians: int
+    errors: dict[str, Error] = field(default_factory=dict)  # by parameter
+    image_error: float | None = None  # largest
+    forward: list[float] = field(default_factory=list)  # s, of the pixel loop
+    backward: list[float] = field(default_factory=list)  # s, of its adjoint
+    stages: dict[str, float] = field(default_factory=dict)  # s of all stages of rendering and differentiating
+    memory: int | None = None  # bytes at the peak of a forward and backward pass, by torch's allocator
+    rules: int | None = None  # lines that state a derivative or an inverse, see derivative_lines
+    plumbing: int | None = None  # lines that restate the loop or carry values
+    note: str = ""
+    extrapolated: bool = False  # the time
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The parameter with the largest relative error; not the background: behind much, its gradient is next to 0."""
+        known = {name: error.relative for name, error in self.errors.items() if error.relative == error.relative}
+        return max(((name, known[name]) for name in known if name != "background"), key=lambda item: item[1])
+
+
+def variants_of(modes: Sequence[str]) -> list[Variant]:
+    """The modes asked for and what only the comparison has."""
+    found = [Variant(mode, mode) for mode in dict.fromkeys(("manual", *modes))]
+    found += [Variant("generated", "generated"), Variant("plain", "plain")]
+    return found + [Variant(f"cap {cap}", "manual", {"max_steps": cap}) for cap in CAPS]
+
+
+def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[str], None]) -> list[Measurement]:
+    """Every variant on every workload, and central differences."""
+    results = []
+    for workload in workloads:
+        start = time.perf_counter()
+        truth = compute_truth(workload)
+        found = {variant: first_run(workload, truth, variant) for variant in variants_of(modes)}
+        time_all(workload, found)
+        results += [*found.values(), central_differences(workload, truth)]
+        say(f"{workload.name}: measured in {time.perf_counter() - start:.0f} s")
+    return results
+
+
+def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement:
+    """Error and memory; compiles and warms up the kernels."""
+    result = Measurement(workload.name, variant.name, len(workload.gaussians[0]))
+    result.rules, result.plumbing = derivative_lines(variant.adjoint)
+    options = variant.options(workload)
+    try:
+        image, gradients = gradients_of(workload, truth, variant.adjoint, options)
+    except InputError as error:  # stored refuses what does not fit
+        result.extrapolated = True
+        result.note = str(error)
+        return result
+    result.errors = errors_of(gradients, truth)
+    result.image_error = float((image - truth.image).abs()[truth.sure].max())
+    result.memory = _peak_memory(lambda: _differentiate(workload, variant))
+    return result
+
+
+def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
+    """Interleaved repeats over all variants that ran, fewer where one round takes long."""
+    runnable = {variant: result for variant, result in found.items() if result.errors}
+    start, rounds = time.perf_counter(), 0
+    while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
+        for variant, result in runnable.items():
+            with launch.profile() as stages:
+                _differentiate(workload, variant)
+            result.forward.append(stages["blend"])
+            result.backward.append(stages["adjoint of blend"])
+            result.stages = dict(stages)
+        rounds += 1
+
+
+def _differentiate(workload: Workload, variant: Variant) -> None:
+    """A forward and a backward pass over the whole image."""
+    leaves = tuple(tensor.clone().requires_grad_() for tensor in workload.gaussians)
+    out = render(leaves, workload.camera, workload.background, variant.options(workload), variant.adjoint)
+    out.image.backward(torch.ones_like(out.image))
+
+
+def _peak_memory(run: Callable[[], None]) -> int:
+    """Largest sum of bytes that torch allocated and had not yet freed during ``run``."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
+        run()
+    events = profile.profiler.kineto_results.events()
+    steps = [event.nbytes() for event in events if event.name() == "[memory]"]  # pyright: ignore[reportAttributeAccessIssue]
+    return int(np.cumsum([0, *steps]).max())
+
+
+def central_differences(workload: Workload, truth: Truth) -> Measurement:
+    """Time per parameter, measured; for all of them, extrapolated. Error at the largest gradients of the opacities."""
+    result = Measurement(workload.name, "central differences", len(workload.gaussians[0]))
+    opacities, exact = workload.gaussians[3], truth.gradients["opacities"]
+    chosen = exact.abs().argsort(descending=True)[:DIFFERENCES]
+    found, seconds = [], []
+    for index in chosen:
+        start, losses = time.perf_counter(), []
+        step = STEP * min(float(opacities[index]), 1.0 - float(opacities[index]))
+        for sign in (1, -1):
+            moved = opacities.clone()
+            moved[index] += sign * step
+            losses.append((_loss(workload, truth, moved), float(moved[index])))
+        (high, up), (low, down) = losses
+        found.append((high - low) / (up - down))
+        seconds.append(time.perf_counter() - start)
+    count = sum(tensor.numel() for tensor in workload.gaussians)
+    if found:
+        error = float((torch.tensor(found, dtype=torch.float64) - exact[chosen]).norm() / exact[chosen].norm())
+        result.backward = [float(np.median(seconds)) * count]
+        result.extrapolated = True
+        result.note = f"{1e3 * float(np.median(seconds)):.1f} ms per parameter, times {count}: extrapolated"
+        result.errors = {"opacities": Error(error, float("nan"), float("nan"), float("nan"))}
+    return result
+
+
+def _loss(workload: Workload, truth: Truth, opacities: torch.Tensor) -> float:
+    gaussians = (*workload.gaussians[:3], opacities, *workload.gaussians[4:])
+    with torch.no_grad():
+        image = render(gaussians, workload.camera, workload.background, workload.options).image
+    rows, columns = workload.pixels.T
+    return float((image[rows, columns].double() * truth.weights).sum())
+
+
+def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:
+    """A row per scene, variant and parameter, for CSV and JSON."""
+    return [
+        {
+            "scene": item.scene,
+            "variant": item.variant,
+            "gaussians": item.gaussians,
+            "parameter": parameter,
+            "relative_error": error.relative,
+            "largest_error": error.largest,
+            "cosine": error.cosine,
+            "bias": error.bias,
+            "image_error": item.image_error,
+            "forward_seconds": median(item.forward),
+            "forward_spread": spread(item.forward),
+            "backward_seconds": median(item.backward),
+            "backward_spread": spread(item.backward),
+            "peak_memory": item.memory,
+            "rules": item.rules,
+            "plumbing": item.plumbing,
+            "note": item.note,
+        }
+        for item in measurements
+        for parameter, error in (item.errors or {"": Error(*[float("nan")] * 4)}).items()
+    ]
+
+
+def median(seconds: Sequence[float]) -> float | None:
+    """Median, or None."""
+    return float(np.median(seconds)) if seconds else None
+
+
+def spread(seconds: Sequence[float]) -> float | None:
+    """Half of the range between the quartiles, or None."""
+    return float(np.subtract(*np.percentile(seconds, [75, 25])) / 2) if seconds else None

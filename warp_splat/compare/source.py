@@ -1,0 +1,77 @@
+"""How many lines a person had to write for the derivative of the pixel loop, counted in the source."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+KERNELS = Path(__file__).parents[1] / "kernels"
+
+_CLAMP = ("blend.adj_alpha_of",)
+_EXP = ("adjoint_lanes.adj_exp2_known", "adjoint_lanes.adj_opaque", *_CLAMP)
+_ROOT = ("adjoint_lanes.conic_from_root",)
+_READ = ("taped_lanes.adj_spread", "taped_lanes.adj_collect", "taped_lanes.adj_exp2_value", *_ROOT)
+_BEGIN = ("taped_lanes.replay_begin", "taped_lanes.adj_begin")
+_UNDO = ("taped_lanes.replay_front_of", "taped_lanes.adj_front_of", "blend.odds_of")
+_KEPT = ("taped_lanes.replay_front_of_kept", "taped_lanes.adj_front_of_kept")
+
+#: Rules: functions that state a derivative or an inverse. Ends in a factory's name where one name has several homes.
+RULES = {
+    "manual": ("adjoint_lanes.make_manual", "blend.adj_alpha_blend", "blend.odds_of", *_CLAMP),
+    "stepwise": ("blend.odds_of", *_EXP, *_ROOT),
+    "reversible": (*_BEGIN, *_UNDO, *_EXP, *_READ),
+    "stored": (*_BEGIN, *_KEPT, *_EXP, *_READ),
+    "generated": (*_BEGIN, *_UNDO, "lanes.adj_halved"),
+    "plain": (*_EXP, *_READ),
+}
+#: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
+_KNOWN = ("adjoint_lanes.exp2_known", "adjoint_lanes.opaque")
+_WALK = ("taped_lanes.walk", "taped_lanes.spread", "taped_lanes.collect", "taped_lanes.exp2_value", *_KNOWN)
+PLUMBING = {
+    "manual": ("adjoint_lanes.adj_blend",),
+    "stepwise": ("adjoint_lanes.adj_blend", "adjoint_lanes.make_stepwise", "adjoint_lanes.Parcel", *_KNOWN),
+    "reversible": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of"),
+    "stored": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of_kept"),
+    "generated": ("taped_lanes.walk", "taped_lanes.begin", "taped_lanes.front_of"),
+    "plain": _WALK,
+}
+
+
+def derivative_lines(mode: str) -> tuple[int, int]:
+    """Lines of rules and of plumbing that the derivative in ``mode`` needs, without depth.
+
+    A line is a line of ``ast.unparse``: no comments, docstrings, or line breaks inside a statement.
+    """
+    count = lambda names: sum(_lines(*name.split("."), mode) for name in names)  # noqa: E731
+    return count(RULES[mode]), count(PLUMBING[mode])
+
+
+def _lines(module: str, name: str, mode: str) -> int:
+    tree = ast.parse((KERNELS / f"{module}.py").read_text())
+    nodes = (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef))
+    found = next(node for node in nodes if node.name == name)
+    return len(ast.unparse(_Specialize(mode).visit(found)).splitlines())
+
+
+class _Specialize(ast.NodeTransformer):
+    """Removes docstrings, and the branches of ``if wp.static(...)`` that a mode does not take."""
+
+    def __init__(self, mode: str):
+        self.known = {"mode": mode, "depth": False}
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        super().generic_visit(node)
+        body = getattr(node, "body", None)
+        if isinstance(body, list):
+            if body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+                del body[0]
+            body.extend([] if body else [ast.Pass()])
+        return node
+
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+        self.generic_visit(node)
+        test = node.test
+        if not (isinstance(test, ast.Call) and ast.unparse(test.func) == "wp.static"):
+            return node
+        taken = eval(ast.unparse(test.args[0]), {}, self.known)
+        return node.body if taken else node.orelse

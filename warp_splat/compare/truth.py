@@ -1,0 +1,87 @@
+"""Images and gradients of a workload in float64, and how far others are from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from warp_splat.compare import oracle
+from warp_splat.compare.workloads import Workload
+from warp_splat.config import RasterOptions
+from warp_splat.renderer import render
+
+ZERO = 1e-12  # norm of a gradient that is rounding only, as that of the rotation of a ball
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "background", "means2d")
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What the oracle says at the workload's pixels."""
+
+    image: torch.Tensor  # [P, 3]
+    weights: torch.Tensor  # [P, 3] upstream gradient: random, 0 at pixels that hang on a rounding
+    sure: torch.Tensor  # [P] bool, the other pixels
+    gradients: dict[str, torch.Tensor]  # by parameter, float64
+
+
+@dataclass(frozen=True)
+class Error:
+    """Distance of a gradient from the truth."""
+
+    relative: float  # L2 of the difference over L2 of the truth
+    largest: float  # of the entries of the difference, over the largest of the truth
+    cosine: float
+    bias: float  # mean difference over mean magnitude of the truth, signed
+
+
+def compute_truth(workload: Workload) -> Truth:
+    """Float64 image and gradients at the workload's pixels."""
+    options = workload.options
+    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double() for tensor in workload.gaussians)
+    leaves = [means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), workload.background.double()]
+    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
+    keys = ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")
+    chosen = {key: getattr(options, key) for key in keys}
+    out = oracle.render(*leaves[:5], workload.camera, leaves[5], **chosen, pixels=workload.pixels)
+    weights = torch.randn(out.image.shape, generator=torch.Generator().manual_seed(1))
+    weights[out.fragile] = 0.0
+    out.means2d.retain_grad()
+    (out.image * weights).sum().backward()
+    gradients = [leaf.grad for leaf in leaves] + [out.means2d.grad]
+    return Truth(out.image.detach(), weights, ~out.fragile, dict(zip(PARAMETERS, gradients, strict=True)))
+
+
+def gradients_of(
+    workload: Workload, truth: Truth, adjoint: str, options: RasterOptions
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """The renderer's image [P, 3] at the workload's pixels, and its gradients for the truth's upstream gradient."""
+    leaves = [tensor.clone().requires_grad_() for tensor in workload.gaussians]
+    background = workload.background.clone().requires_grad_()
+    out = render(tuple(leaves), workload.camera, background, options, adjoint)
+    out.means2d.retain_grad()
+    rows, columns = workload.pixels.T
+    seen = out.image[rows, columns]
+    (seen * truth.weights).sum().backward()
+    sh = torch.cat([leaves[4].grad, leaves[5].grad], 1)
+    gradients = [*(leaf.grad for leaf in leaves[:4]), sh, background.grad, out.means2d.grad]
+    return seen.detach(), dict(zip(PARAMETERS, gradients, strict=True))
+
+
+def errors_of(found: dict[str, torch.Tensor], truth: Truth) -> dict[str, Error]:
+    """The error of each parameter's gradient."""
+    return {name: compare(found[name], exact) for name, exact in truth.gradients.items()}
+
+
+def compare(found: torch.Tensor, exact: torch.Tensor) -> Error:
+    """How far ``found`` is from ``exact``; NaN where the truth is zero but for rounding."""
+    found, exact = found.double().flatten(), exact.flatten()
+    if exact.norm() < ZERO:
+        return Error(*[float("nan")] * 4)
+    difference = found - exact
+    return Error(
+        relative=float(difference.norm() / exact.norm()),
+        largest=float(difference.abs().max() / exact.abs().max()),
+        cosine=float(found @ exact / (found.norm() * exact.norm()).clamp_min(ZERO)),
+        bias=float(difference.mean() / exact.abs().mean()),
+    )

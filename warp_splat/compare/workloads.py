@@ -1,0 +1,92 @@
+"""What adjoints and knobs are measured on: layered scenes of known depth complexity, and scenes in training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.compare.training import SHORT
+from warp_splat.config import RasterOptions, TrainConfig
+from warp_splat.scene import load_scene
+from warp_splat.scene.types import Scene
+from warp_splat.train import embedded_scene
+from warp_splat.trainer import Trainer
+
+CANDIDATES = (10, 100, 1000, 10_000)  # per pixel of the layered scenes
+LAYERED_SIZE = 96  # px
+STAGES = (0, 100, 300)  # steps of the short schedule after which a scene in training is measured
+SAMPLES = 192  # pixels at which float64 is computed
+
+
+@dataclass(frozen=True, eq=False)
+class Workload:
+    """Activated Gaussians, as :func:`warp_splat.renderer.render` takes them, a camera, and pixels to look at."""
+
+    name: str
+    gaussians: tuple[torch.Tensor, ...]  # means, quats, scales, opacities, sh_dc, sh_rest
+    camera: Camera
+    background: torch.Tensor  # [3]
+    options: RasterOptions
+    pixels: torch.Tensor  # [P, 2] (row, column), int64
+
+
+def layered(candidates: int) -> Workload:
+    """Gaussians that all cover the whole image, so that each is a candidate at every pixel.
+
+    Opacities fall with their number, but not below what the cut at 1/255 leaves: at 10,000 most pixels stop early.
+    """
+    rng = np.random.default_rng(candidates)
+    size = LAYERED_SIZE
+    camera = Camera(size, size, size, size, size / 2, size / 2, np.eye(3), np.zeros(3))
+    depth = 2.0 + 6.0 * (rng.permutation(candidates) + rng.uniform(0.25, 0.75, candidates)) / candidates
+    pixels = rng.uniform(0.3, 0.7, (candidates, 2)) * size
+    means = np.concatenate([(pixels - size / 2) / size * depth[:, None], depth[:, None]], 1)
+    scales = rng.uniform(0.4, 0.9, (candidates, 3)) * depth[:, None]
+    opacities = rng.uniform(0.0045, max(0.008, min(0.9, 15 / candidates)), candidates)
+    arrays = (means, rng.normal(size=(candidates, 4)), scales, opacities, rng.uniform(-1.5, 1.5, (candidates, 1, 3)))
+    tensors = [torch.tensor(array, dtype=torch.float32) for array in arrays]
+    rest = torch.zeros(candidates, 0, 3)
+    background = torch.tensor([0.2, 0.4, 0.7])
+    return Workload(
+        f"{candidates} layers", (*tensors, rest), camera, background, RasterOptions(), sample_pixels(camera)
+    )
+
+
+def in_training(name: str, scene: Scene, say: Callable[[str], None]) -> list[Workload]:
+    """The first held-out view of a scene after each of :data:`STAGES` of the short schedule."""
+    trainer = Trainer(scene, TrainConfig(**SHORT))
+    camera = scene.evaluated[1][0].camera
+    found = []
+    for iteration in range(max(STAGES) + 1):
+        if iteration:
+            trainer.differentiate(iteration)
+        if iteration in STAGES:
+            with torch.no_grad():
+                gaussians = tuple(tensor.detach().clone() for tensor in trainer.model.activated())
+            stage = f"{name}, step {iteration}"
+            say(f"{stage}: {len(trainer.model)} Gaussians, {camera.width} x {camera.height} px")
+            options = RasterOptions(sh_degree=trainer.degree)
+            found.append(Workload(stage, gaussians, camera, trainer.background, options, sample_pixels(camera)))
+        if iteration:
+            trainer.update(iteration)
+    return found
+
+
+def all_workloads(scene: str, say: Callable[[str], None]) -> list[Workload]:
+    """The layered scenes, the embedded scene in training, and ``scene`` in training if one is named."""
+    found = [layered(candidates) for candidates in CANDIDATES]
+    for name, path in {"embedded": embedded_scene(), **({Path(scene).name: Path(scene)} if scene else {})}.items():
+        found += in_training(name, load_scene(path, eval=True, report=say), say)
+    return found
+
+
+def sample_pixels(camera: Camera) -> torch.Tensor:
+    """:data:`SAMPLES` pixels of the image at random, or all if it has no more, [P, 2] (row, column)."""
+    count = camera.width * camera.height
+    chosen = np.random.default_rng(0).permutation(count)[:SAMPLES]
+    return torch.from_numpy(np.stack([chosen // camera.width, chosen % camera.width], 1))
