@@ -26,8 +26,9 @@ from warp_splat.renderer import Blend, Dropped
 class Lanes:
     """The package's driver on the scene."""
 
-    def __init__(self, scene: BlendScene, upstream: torch.Tensor):
+    def __init__(self, scene: BlendScene, upstream: torch.Tensor, mode: str = "manual"):
         splats = scene.splats
+        self.mode = mode
         # the blend takes their values from the splats; tensors are there to receive gradients (of conics for roots)
         fields = ("mean", "root", "opacity", "color", "depth")
         self.tensors = [torch.from_numpy(splats[name].copy()).requires_grad_() for name in fields]
@@ -43,7 +44,7 @@ class Lanes:
         arrays = (self.order, self.splats, self.slot_ends, self.instances, self.ranges)
         bins = Bins(*arrays, slices, self.scene.tiles_x, invalid=0)
         black = torch.zeros(3)
-        self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), "manual", Dropped())
+        self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), self.mode, Dropped())
 
     def adjoint(self) -> None:
         self.grads = torch.autograd.grad(self.image, self.tensors[:4], self.upstream, retain_graph=True)

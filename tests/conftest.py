@@ -1,6 +1,9 @@
 """Fixtures that several test modules share."""
 
 import pytest
+import torch
+
+torch.set_num_threads(1)  # idle threads of torch would spin beside the kernels'
 
 
 @pytest.fixture(params=["cpu"])

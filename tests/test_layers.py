@@ -12,7 +12,7 @@ LAYERS = [
     {"camera", "launch", "formats", "scene.types"},
     {"checks", "binning", "adjoints", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
-    {"trainer", "report", "evaluate", "gradcheck"},
+    {"trainer", "report", "evaluate", "gradcheck", "differences"},
     {"train", "render"},
     {"compare"},
     {"cli", "__init__", "__main__"},
@@ -21,6 +21,8 @@ LAYERS = [
 
 def module_of(path: Path) -> str:
     parts = path.relative_to(PACKAGE).with_suffix("").parts
+    if parts[-1] == "__main__":
+        return "__main__"
     return "scene.types" if parts == ("scene", "types") else parts[0]
 
 

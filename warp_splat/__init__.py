@@ -13,6 +13,7 @@ _HOMES = {
     "InputError": "errors",
     "RasterOptions": "config",
     "RenderOutput": "renderer",
+    "check_gradients": "gradcheck",
     "get_threads": "launch",
     "load_scene": "scene",
     "rasterize": "renderer",
@@ -23,6 +24,7 @@ __all__ = [
     "InputError",
     "RasterOptions",
     "RenderOutput",
+    "check_gradients",
     "get_threads",
     "load_scene",
     "rasterize",
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from warp_splat.camera import Camera
     from warp_splat.config import RasterOptions
     from warp_splat.errors import InputError
+    from warp_splat.gradcheck import check_gradients
     from warp_splat.launch import get_threads, set_threads
     from warp_splat.renderer import RenderOutput, rasterize
     from warp_splat.scene import load_scene

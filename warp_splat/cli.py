@@ -81,7 +81,9 @@ def main(arguments: list[str] | None = None) -> int:
         # idle OpenMP threads of torch must not spin beside busy kernels; read when torch is loaded
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         os.environ.setdefault("GOMP_SPINCOUNT", "0")
-        os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # torch's profiler, which the comparison uses, greets otherwise
+        # torch's profiler, by which the comparison measures memory, would tell what it does
+        os.environ.setdefault("KINETO_LOG_LEVEL", "99")
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         if isinstance(config, TrainConfig):
             from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
         elif isinstance(config, CompareConfig):

@@ -12,6 +12,8 @@ T_MIN = 1.0e-4  # a pixel stops before the Gaussian that would take its transmit
 T_LEAST = 1.0e-30  # no threshold is lower: a transmittance that underflows could not be recovered by division
 NEAR = 0.2  # world units along the optical axis; Gaussians whose centre is nearer are culled
 BLUR = 0.3  # px^2, added to both variances of the projected Gaussian (low-pass)
+OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline the projection "ellipsoid" takes
+OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard deviations reach the plane of the camera
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
 
@@ -31,7 +33,7 @@ class RasterOptions:
         antialiasing: scale each opacity by the share of its area that the low-pass filter added (Mip-Splatting, Yu
             et al. 2024), so that small Gaussians do not grow brighter; by no less than 0.005, as in the reference.
         projection: "affine" (EWA splatting, Zwicker et al. 2001: linearized at the mean) or "ellipsoid" (the exact
-            outline of the one-sigma ellipsoid; Qi, Cai and Han 2024).
+            outline of an ellipsoid instead of the Gaussian; Qi, Cai and Han 2024).
         alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips nothing.
         t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 means 1e-30.
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.

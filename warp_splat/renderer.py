@@ -89,7 +89,7 @@ def rasterize(
     """
     options = check_options(adjoint, options, camera)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
-    background = _background(background)
+    background = as_background(background)
     out = render(gaussians, camera, background, options, adjoint)
     if out.invalid:
         explain_invalid(out.invalid, gaussians[1])
@@ -152,7 +152,8 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView
     return cam
 
 
-def _background(background) -> torch.Tensor:
+def as_background(background) -> torch.Tensor:
+    """The background as a tensor [3]. Raises InputError if it is not three finite numbers."""
     if not isinstance(background, torch.Tensor):
         try:
             background = torch.tensor([float(value) for value in background])

@@ -102,7 +102,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
         return result
     result.errors = errors_of(gradients, truth)
     result.image_error = float((image - truth.image).abs()[truth.sure].max())
-    result.memory = _peak_memory(lambda: _differentiate(workload, variant))
+    result.memory = peak_memory(lambda: _differentiate(workload, variant))
     return result
 
 
@@ -127,7 +127,7 @@ def _differentiate(workload: Workload, variant: Variant) -> None:
     out.image.backward(torch.ones_like(out.image))
 
 
-def _peak_memory(run: Callable[[], None]) -> int:
+def peak_memory(run: Callable[[], None]) -> int:
     """Largest sum of bytes that torch allocated and had not yet freed during ``run``."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
         run()

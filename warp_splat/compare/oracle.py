@@ -16,6 +16,8 @@ BLUR = 0.3  # low-pass filter, px^2
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
 STOP = 1e-4  # a Gaussian that would take the transmittance below is not blended, nor is any behind it
+OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline is taken
+OUTLINE_REACH = 3.0  # of the one that must not reach the plane of the camera
 SIDE = 0.3  # the Jacobian sees x/z at most this share of the half width beyond the image
 
 FAINTEST = 1e-37  # about the least normal number of float32, the cut where there is none
@@ -109,19 +111,19 @@ def jacobians(points, camera):
 
 
 def outlines(points, sigma, live, camera):
-    """Centres [N, 2] and covariances [N, 2, 2] of the ellipses that ellipsoids of one sigma show, by the dual conic.
+    """Centres [N, 2] and covariances [N, 2, 2] of the ellipses that ellipsoids show, by the dual conic.
 
     The dual quadric of an ellipsoid projects linearly: its outline's dual conic is K (Sigma - p p^T) K^T (Hartley and
     Zisserman 2004, 8.3), and that of an ellipse with centre c and covariance S is
     a multiple of [S - c c^T, -c; -c^T, -1].
     """
     calibration = points.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    dual = sigma - points[:, :, None] * points[:, None, :]
+    dual = OUTLINE**2 * sigma - points[:, :, None] * points[:, None, :]
     dual = torch.where(live[:, None, None], dual, -torch.eye(3, dtype=dual.dtype))
     dual = calibration @ dual @ calibration.T
     dual = dual / -dual[:, 2:, 2:]
     centre = -dual[:, :2, 2]
-    return centre.clone(), dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]
+    return centre.clone(), (dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]) / OUTLINE**2
 
 
 def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
@@ -136,7 +138,7 @@ def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antiali
 
     sigma = world_to_camera @ covariances(quats, scales) @ world_to_camera.T
     if projection == "ellipsoid":
-        live = live & (z**2 > sigma[:, 2, 2])
+        live = live & (z**2 > OUTLINE_REACH**2 * sigma[:, 2, 2])
         means2d, sharp = outlines(points, sigma, live, camera)
     else:
         to_pixels = jacobians(points, camera)

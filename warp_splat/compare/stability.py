@@ -8,8 +8,6 @@ Algorithms, 2002: n eps for a product of n rounded factors, and the condition of
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +15,7 @@ from pathlib import Path
 from warp_splat import report
 from warp_splat.compare import stability_blend, stability_numbers, stability_shape
 from warp_splat.compare.stability_check import EPS, Case, Outcome
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.atomic import write_csv, write_json
 
 CASES = (*stability_blend.CASES, *stability_shape.CASES, *stability_numbers.CASES)
 MARKERS = ("o", "s", "^", "D")
@@ -97,19 +95,13 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
         for row in rows
         for mode, outcome in row.outcomes.items()
     ]
-    for line in flat:  # JSON has no infinity
-        line.update({key: "inf" for key, value in line.items() if value == float("inf")})
     measured = {
         "verdicts": flat,
         "determinant": {"ratios": stability_numbers.RATIOS, **stability_numbers.determinant_errors()},
         "eps": EPS,
     }
-    with atomic_write(out / "stability.json") as path:
-        path.write_text(json.dumps(measured, indent=1))
-    with atomic_write(out / "stability.csv") as path, path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(flat[0]))
-        writer.writeheader()
-        writer.writerows({**line, "failures": "; ".join(line["failures"])} for line in flat)
+    write_json(out / "stability.json", measured)
+    write_csv(out / "stability.csv", [{**line, "failures": "; ".join(line["failures"])} for line in flat])
 
 
 def plot(path: Path, rows: Sequence[Row]) -> None:

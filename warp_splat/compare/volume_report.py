@@ -5,7 +5,6 @@ The physics is :mod:`warp_splat.compare.volume`; here are the media and scenes, 
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -30,7 +29,7 @@ from warp_splat.compare.volume_scenes import (
     plain,
     stiff_medium,
 )
-from warp_splat.formats.atomic import atomic_write, write_json
+from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.report import format_table
 
 
@@ -243,7 +242,4 @@ def _write_csv(path: Path, results: Mapping[str, Sequence[Mapping[str, Any]]]) -
         for table, records in results.items()
         for record in records
     ]
-    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(path, rows)

@@ -7,15 +7,17 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLU
 
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
 
-The exact outline of the ellipsoid x' Sigma^-1 x = 1 instead (Qi, Cai and Han 2024) follows from its dual conic,
-K (Sigma - p p') K' for a centre p. With a3 = (third row of W R S) / z and r = 1 - |a3|^2 that is, without a difference
-of large numbers, the mean moved by -(a1 a3, a2 a3) / r and A (I - a3 a3')^-1 A' / r as covariance; rows a_i become
-(a_i + (a_i a3) / (r + sqrt(r)) a3) / sqrt(r).
+The exact outline of the ellipsoid x' Sigma^-1 x = k^2 instead (Qi, Cai and Han 2024, with k = 3) follows from its
+dual conic, K (k^2 Sigma - p p') K' for a centre p. With a3 = k / z (third row of W R S) and r = 1 - |a3|^2 that is,
+without a difference of large numbers, the mean moved by -(a1 a3, a2 a3) k / r and, divided by k^2, the covariance
+A (I - a3 a3')^-1 A' / r: rows a_i become (a_i + (a_i a3) / (r + sqrt(r)) a3) / sqrt(r). We take k = 2: against the
+volume (warp_splat.compare.volume) its footprint is better than the affine one by 4 to 9 dB, that of k = 3 worse by 1
+to 6.
 """
 
 import warp as wp
 
-from warp_splat.config import BLUR, NEAR
+from warp_splat.config import BLUR, NEAR, OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.blend import reach_of
 from warp_splat.kernels.build import DIFFERENTIABLE
 from warp_splat.kernels.harmonics import evaluate_sh
@@ -148,12 +150,12 @@ def project(
     a2 = wp.cw_mul(scale, j2 * axes)
     mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
     if camera.ellipsoid != 0:
-        a3 = wp.cw_mul(scale, toward * axes) / z
+        a3 = (OUTLINE / z) * wp.cw_mul(scale, toward * axes)
         rest = 1.0 - wp.dot(a3, a3)
-        if not rest > 0.0:  # reaches the plane of the camera: its outline is no ellipse
+        if not rest > 1.0 - (OUTLINE / OUTLINE_REACH) * (OUTLINE / OUTLINE_REACH):
             return
         shift = wp.vec2(wp.dot(a1, a3), wp.dot(a2, a3))
-        mean2d = mean2d - shift / rest
+        mean2d = mean2d - (OUTLINE / rest) * shift
         stretch = 1.0 / (rest + wp.sqrt(rest))
         a1 = (a1 + stretch * shift[0] * a3) / wp.sqrt(rest)
         a2 = (a2 + stretch * shift[1] * a3) / wp.sqrt(rest)

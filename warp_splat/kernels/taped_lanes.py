@@ -1,7 +1,8 @@
 """The adjoint of the blend by differentiating its whole loop with Warp: ``reversible`` and ``stored``.
 
 In the reverse pass Warp replays the body of a dynamic loop, last iteration first, from whatever the variables that the
-loop carries hold at that moment. Recorded plainly (``plain``) that is silently wrong for T. Two cures:
+loop carries hold at that moment. Recorded plainly (``plain``) that is silently wrong: stores are not replayed, so that
+T is 0 in every step, and with it every gradient. Two cures:
 
     reversible  the replay of ``front_of`` undoes the step, T = T / (1 - alpha): no memory
     stored      the replay of ``front_of_kept`` reads the T that the forward pass wrote

@@ -1,0 +1,172 @@
+"""The comparison: what it measures is right, and it measures what it says."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scenes import SCENES
+
+from warp_splat import RasterOptions, cli
+from warp_splat.adjoints import list_inputs
+from warp_splat.binning import bin_tiles
+from warp_splat.compare import adjoints, knobs, oracle, report, source, truth, workloads
+from warp_splat.config import ADJOINTS
+from warp_splat.kernels.blend_lanes import BLOCKS
+from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.kernels.taped_lanes import make_walk
+from warp_splat.launch import launch, view
+from warp_splat.renderer import Blend, Dropped, Project, camera_view
+
+PLAIN = RasterOptions()
+
+
+def workload(name="degree1"):
+    """A test scene as the comparison takes it; every pixel is looked at."""
+    scene = SCENES[name]()
+    tensors = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh[:, :1], scene.sh[:, 1:])
+    pixels = torch.cartesian_prod(torch.arange(scene.camera.height), torch.arange(scene.camera.width))
+    return workloads.Workload(name, tensors, scene.camera, scene.background, PLAIN, pixels)
+
+
+@pytest.mark.parametrize("mode", ["reversible", "stored", "generated"])
+def test_what_is_differentiated_is_the_blend(mode):
+    """The loop whose adjoint Warp generates computes the colors and transmittances of the forward kernel."""
+    given = workload("dense_tile")
+    cam = camera_view(given.camera, 3, PLAIN)
+    *projected, extents, radii = Project.apply(*given.gaussians, cam, Dropped())
+    bins = bin_tiles(*projected, extents, radii, given.camera, PLAIN)
+    black = torch.zeros(3, requires_grad=True)
+    image, _, _ = Blend.apply(*projected, black, bins, given.camera, PLAIN, "manual", Dropped())
+    final, count, kept = image.grad_fn.saved_tensors[1:]
+    lists, steps = list_inputs(bins, PLAIN), count.amax((1, 2)).int()
+    if mode == "generated":
+        lists[3] = wp.array(bins.splats.numpy()[bins.instances.numpy()[:, 0]], dtype=bins.splats.dtype, device="cpu")
+    color, behind = torch.zeros(len(final), 3 * BLOCKS, LANES), torch.zeros_like(final)
+    slots = torch.zeros(len(bins.instances), 9)
+    states = [view(state, vec16) for state in (final, count, kept)]
+    inputs = [*lists, *states, view(steps, wp.int32), view(slots, wp.float32)]
+    launch(make_walk(mode, False, 5), len(final), inputs, [view(color, vec16), view(behind, vec16)])
+    assert torch.allclose(behind, final, rtol=1e-6, atol=0)
+    height, width, _ = image.shape
+    for tile in range(len(final)):
+        row, column = 16 * (tile // bins.tiles_x), 16 * (tile % bins.tiles_x)
+        # [block y, block x, channel, y, x] to [y, x, channel]
+        pixels = color[tile].view(4, 4, 3, 4, 4).permute(0, 3, 1, 4, 2).reshape(16, 16, 3)
+        shown = image[row : row + 16, column : column + 16]
+        assert (pixels[: height - row, : width - column] - shown).abs().max() < 1e-6
+
+
+def test_generated_is_right_and_plain_is_not():
+    given = workload()
+    exact = truth.compute_truth(given)
+    for mode, low, high in (("generated", 0.0, 1e-5), ("plain", 0.5, 10.0)):
+        _, found = truth.gradients_of(given, exact, mode, PLAIN)
+        worst = max(error.relative for name, error in truth.errors_of(found, exact).items() if name != "background")
+        assert low <= worst < high, mode
+
+
+def test_truth_at_some_pixels_is_that_of_the_image():
+    given = workload()
+    scene = SCENES["degree1"]().to("cpu", torch.float64)
+    whole = oracle.render(*scene.parameters(), scene.camera, scene.background)
+    few = given.pixels[::7]
+    some = oracle.render(*scene.parameters(), scene.camera, scene.background, pixels=few)
+    rows, columns = few.T
+    assert torch.allclose(some.image, whole.image[rows, columns], rtol=0, atol=1e-14)
+    assert torch.equal(some.fragile, whole.fragile[rows, columns])
+
+
+def test_error_measures():
+    exact = torch.tensor([3.0, -4.0], dtype=torch.float64)
+    error = truth.compare(torch.tensor([3.3, -3.6]), exact)
+    assert error.relative == pytest.approx(0.1, rel=1e-5) and error.largest == pytest.approx(0.1, rel=1e-5)
+    assert error.cosine == pytest.approx((9.9 + 14.4) / (5 * np.hypot(3.3, 3.6)), rel=1e-5)
+    assert error.bias == pytest.approx(0.35 / 3.5, rel=1e-5)
+    assert np.isnan(truth.compare(torch.tensor([1e-7]), torch.zeros(1, dtype=torch.float64)).relative)
+
+
+def test_layered_scenes_are_as_deep_as_they_say():
+    given = workloads.layered(100)
+    *projected, extents, radii = Project.apply(*given.gaussians, camera_view(given.camera, 0, PLAIN), Dropped())
+    bins = bin_tiles(*projected, extents, radii, given.camera, PLAIN)
+    assert (bins.ranges[:, 1] - bins.ranges[:, 0] > 90).all()
+
+
+def test_derivative_lines_are_counted_for_every_mode():
+    counts = {mode: source.derivative_lines(mode) for mode in (*ADJOINTS, "generated", "plain")}
+    assert all(rules > 0 and plumbing > 0 for rules, plumbing in counts.values())
+    assert counts["stepwise"][0] < counts["manual"][0]
+
+
+def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
+    monkeypatch.setattr(adjoints, "REPEATS", 2)
+    monkeypatch.setattr(knobs, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
+    monkeypatch.setattr(report, "KNOB_STYLES", {"t_min": ("k", "o"), "alpha_min": ("b", "s")})
+    scenes = [workloads.layered(10), workload()]
+    measured, lines = adjoints.measure(scenes, ["stepwise"], lambda _: None), []
+    rows = adjoints.records(measured)
+    assert {row["variant"] for row in rows} >= {
+        "manual",
+        "stepwise",
+        "generated",
+        "plain",
+        "cap 128",
+        "central differences",
+    }
+    by_name = {(row["scene"], row["variant"], row["parameter"]): row for row in rows}
+    assert by_name["degree1", "stepwise", "means"]["relative_error"] < 2e-4
+    assert by_name["degree1", "stepwise", "means"]["cosine"] == pytest.approx(1, abs=1e-6)
+    assert by_name["degree1", "central differences", "opacities"]["relative_error"] < 0.05
+    assert by_name["degree1", "central differences", "opacities"]["note"].endswith("extrapolated")
+    lines += report.adjoint_table(measured).splitlines()
+    report.plot_errors(tmp_path / "errors.png", measured)
+    report.plot_memory(tmp_path / "memory.png", measured)
+    report.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
+    turned = knobs.measure(scenes, lambda _: None)
+    report.plot_knobs(tmp_path / "knobs.png", turned)
+    lines += report.knob_table(turned).splitlines()
+    assert len({len(line) for line in lines}) == 2  # two tables, every line as long as its header
+    exact = {item.variant: item.image_error for item in turned if item.scene == "degree1"}
+    assert exact["alpha_min 0"] < 1e-5 < exact["alpha_min 0.003922 *"] and exact["t_min 0.0001 *"] < 1e-3
+    assert len(list(tmp_path.glob("*.png"))) == 4
+
+
+def test_stored_that_does_not_fit_is_a_row(monkeypatch):
+    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda: 2**10)
+    monkeypatch.setattr(adjoints, "REPEATS", 2)
+    measured = adjoints.measure([workload()], ["stored"], lambda _: None)
+    row = next(item for item in measured if item.variant == "stored")
+    assert "transmittances" in row.note and not row.backward
+    assert "stored" in report.adjoint_table(measured)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--modes", "newton"], "--modes: expected some of manual, stepwise, reversible, stored, got newton."),
+        (["--modes"], "got none"),
+        (["--scene", "nowhere"], "nowhere"),
+        (["--device", "cuda"], "--device cuda"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
+    assert cli.main(["compare", *arguments, "--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_whole_commands(tmp_path, capsys):
+    """The three commands at their default size, but for the number of trainings, which has a test of its own."""
+    for arguments, files in (
+        (["--volume"], ("volume.csv", "volume.json", "volume_stiff.png", "volume_maps.png")),
+        (["--stability", "--modes", "manual"], ("stability.csv", "stability.json", "stability.png")),
+    ):
+        assert cli.main(["compare", *arguments, "--out", str(tmp_path)]) == 0
+        assert all((tmp_path / name).stat().st_size > 0 for name in files)
+    with open(tmp_path / "stability.csv") as file:
+        assert all(row["failures"] == "" for row in csv.DictReader(file))
+    assert json.loads((tmp_path / "volume.json").read_text())["ladder"]

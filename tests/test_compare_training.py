@@ -1,0 +1,97 @@
+"""The training comparison, on the embedded scene made tiny: every file, every mode, the cap, a mode refused."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from warp_splat.compare import training
+from warp_splat.config import ADJOINTS, EMBEDDED_DEFAULTS
+from warp_splat.scene import load_scene
+from warp_splat.train import embedded_scene
+
+STEPS = 24
+SCHEDULE = {**training.SHORT, "iterations": STEPS, "densify_from_iter": 10, "densification_interval": 12}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Half of the points; 33 x 31 pixels; two views held out."""
+    whole = load_scene(embedded_scene(), eval=True, resolution=8, report=str)
+    return replace(whole, test=whole.test[:2], points=whole.points[::2], colors=whole.colors[::2])
+
+
+@pytest.fixture
+def tiny(scene, monkeypatch):
+    monkeypatch.setattr(training, "load_scene", lambda *_, **__: scene)
+    monkeypatch.setattr(training, "SHORT", SCHEDULE)
+    monkeypatch.setattr(training, "SEEDS", (0, 1))
+    monkeypatch.setattr(training, "EVALUATIONS", 4)
+
+
+def test_short_schedule_is_whole_within_its_steps():
+    assert set(EMBEDDED_DEFAULTS) < set(training.SHORT)
+    assert training.SHORT["iterations"] == training.SHORT["position_lr_max_steps"] == 300
+    assert training.COMPARED[-1] < 2 * training.SHORT["densification_interval"] < training.SHORT["densify_until_iter"]
+
+
+def test_run_writes_its_files(tiny, tmp_path):
+    said = []
+    results = training.run(tmp_path / "new", ["manual", "stepwise"], say=said.append)
+    assert set(json.loads((tmp_path / "new/training.json").read_text())) == set(results)
+    assert results["schedule"]["iterations"] == STEPS
+    with open(tmp_path / "new/training.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    columns = "scene variant seed psnr ssim gaussians longest_list lists_cut iterations_per_second refused".split()
+    assert list(rows[0]) == columns
+    late = [f"cap {cap}, rendering only" for cap in training.CAPS]
+    further = [*(f"cap {cap}" for cap in training.CAPS), "ellipsoid"]
+    names = [(row["variant"], row["seed"]) for row in rows]
+    assert names[:6] == [(name, "0") for name in ["manual", "stepwise", *further]]
+    assert names[6:8] == [("manual", "1"), ("stepwise", "1")]
+    assert names[8:] == [(name, seed) for seed in "01" for name in late]
+    assert [record["variant"] for record in results["summary"]] == ["manual", "stepwise", *further, *late]
+    for name in ("training_modes.png", "training_cap.png"):
+        assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
+    text = "\n".join(said)
+    assert "against manual" in text and "seeds do: the standard deviation" in text
+    assert {d["steps"] for d in results["equality"]["embedded"]["parameters"]} == {1, 10}
+    of = {row["variant"]: row for row in rows if row["seed"] == "0"}
+    assert float(of["manual"]["longest_list"]) < 2048  # a cap that no list reaches changes nothing
+    assert of["cap 2048"]["psnr"] == of["cap 2048, rendering only"]["psnr"] == of["manual"]["psnr"]
+    assert float(of["cap 128"]["lists_cut"]) > 0
+
+
+def test_modes_train_alike(scene, monkeypatch):
+    monkeypatch.setattr(training, "EVALUATIONS", STEPS)
+    monkeypatch.setattr(training, "COMPARED", ())
+    losses = []
+    for mode in ADJOINTS:
+        trainer = training.make_trainer(scene, {**SCHEDULE, "densify_until_iter": 0}, 0, adjoint=mode)
+        list(training.train_run(trainer, result := training.Run("", mode, 0), {}))
+        losses.append([record["loss"] for record in result.history])
+    assert np.mean(losses[0][-5:]) < 0.9 * np.mean(losses[0][:5])
+    np.testing.assert_allclose(losses[1:], [losses[0]] * 3, rtol=1e-3)
+
+
+def test_cap_of_one_entry_costs_quality(scene):
+    qualities = []
+    for cap in (None, 1):
+        trainer = training.make_trainer(scene, SCHEDULE, 0, max_steps=cap)
+        list(training.train_run(trainer, result := training.Run("", "", 0), {}))
+        qualities.append(result.history[-1]["psnr"])
+    assert qualities[1] < qualities[0] - 1
+
+
+def test_refusal_is_a_row(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda: 0)
+    said = []
+    results = training.run(tmp_path, ["manual", "stored"], scene="folder/other", say=said.append)
+    assert {record["scene"] for record in results["summary"]} == {"embedded", "other"}
+    record = results["summary"][1]
+    assert record["variant"] == "stored" and "take" in record["refused"]
+    assert "stored (refused)" in "\n".join(said)
+    assert json.loads((tmp_path / "training.json").read_text())["summary"][1]["psnr"] is None
+    assert results["equality"] == {"embedded": {}, "other": {}}  # one mode is compared with none
