@@ -1,16 +1,12 @@
 """What the benchmarks share: interleaved timing, the machine's name, and tables."""
 
-import datetime
 import json
-import os
-import platform
-import re
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from warp_splat.report import format_table
+from warp_splat.report import format_table, machine
 
 
 def interleaved_medians(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
@@ -24,16 +20,6 @@ def interleaved_medians(runs: Mapping[str, Callable[[], object]], repeats: int) 
             run()
             seconds[name].append(time.perf_counter() - start)
     return {name: statistics.median(values) for name, values in seconds.items()}
-
-
-def machine() -> str:
-    """Processor, cores, operating system and date."""
-    processor = platform.processor() or platform.machine()
-    try:
-        processor = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())[1]
-    except (OSError, TypeError):
-        pass
-    return f"{processor}, {os.cpu_count()} cores, {platform.system()}, {datetime.date.today()}"
 
 
 def write_table(

@@ -53,8 +53,8 @@ def test_run_writes_its_files(tiny, tmp_path):
     assert names[6:8] == [("manual", "1"), ("stepwise", "1")]
     assert names[8:] == [(name, seed) for seed in "01" for name in late]
     assert [record["variant"] for record in results["summary"]] == ["manual", "stepwise", *further, *late]
-    for name in ("training_modes.png", "training_cap.png"):
-        assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
+    for name, magic in (("training_modes.png", b"\x89PNG"), ("training_cap.jpg", b"\xff\xd8")):
+        assert (tmp_path / "new" / name).read_bytes().startswith(magic)
     text = "\n".join(said)
     assert "against manual" in text and "seeds do: the standard deviation" in text
     assert {d["steps"] for d in results["equality"]["embedded"]["parameters"]} == {1, 10}

@@ -108,7 +108,7 @@ def test_single_gaussian_is_its_color_at_its_depth():
     assert physics.integrate_exact(profile, volume.colors, BACKGROUND) == pytest.approx(expected, abs=1e-14)
 
 
-@pytest.mark.parametrize(("integrate", "order"), zip(INTEGRATORS, (2, 1, 4), strict=True))
+@pytest.mark.parametrize(("integrate", "order"), list(zip(INTEGRATORS, (2, 1, 4), strict=True)))
 def test_orders(integrate, order):
     truth = solve_ivp(
         lambda q, c: wavy(np.array([3 - q]))[1][0, 0] - wavy(np.array([3 - q]))[0][0] * c,

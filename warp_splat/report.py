@@ -5,6 +5,9 @@ Colours are those of Okabe and Ito (2008), which people with colour vision defic
 
 from __future__ import annotations
 
+import datetime
+import os
+import platform
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -49,7 +52,7 @@ def contact_sheet(
     margin, gap, text, heading = 0.1, 0.04, 0.22, 0.26  # inches
     cell = (WIDTH - 2 * margin - (columns - 1) * 2 * gap) / (3 * columns)
     heights = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) * (cell - gap) for line in lines]
-    figure = _figure(WIDTH, heading + sum(heights) + len(lines) * (text + gap) + margin)
+    figure = new_figure(WIDTH, heading + sum(heights) + len(lines) * (text + gap) + margin)
     top = figure.get_figheight() - heading
     for line, height in zip(lines, heights, strict=True):
         top -= text + height
@@ -64,7 +67,7 @@ def contact_sheet(
             x = margin + column * (3 * cell + 2 * gap) + place * cell
             y = figure.get_figheight() - heading + 0.04
             figure.text(x / WIDTH, y / figure.get_figheight(), title, fontsize=9, fontweight="bold", color=INK)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
@@ -82,23 +85,23 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> N
     drawn = [panel for panel in panels if series[panel[0]]]
     if not drawn:
         raise InputError("history: expected records with loss, psnr or gaussians, got none.")
-    figure = _figure(WIDTH, 2.5, layout="constrained")
+    figure = new_figure(WIDTH, 2.5, layout="constrained")
     all_axes = figure.subplots(1, len(drawn), squeeze=False, sharex=True)[0]
     for axes, (key, title, color) in zip(all_axes, drawn, strict=True):
         iterations, values = np.array(series[key], dtype=np.float64).T
-        _plain_axes(axes, title)
+        plain_axes(axes, title)
         if key == "loss":
             axes.plot(iterations, values, color=color, linewidth=0.6, alpha=0.25)
             values = _smooth(values)
         axes.plot(iterations, values, color=color, linewidth=1.8, marker="o" if key == "psnr" else "", markersize=4)
         if key == "psnr":
-            _label(axes, (iterations[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
+            label_point(axes, (iterations[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
         else:
             axes.set_ylim(bottom=0)
         axes.set_xlabel("iteration", fontsize=9, color=INK)
         axes.yaxis.set_major_formatter(_thousands)
         axes.xaxis.set_major_formatter(_thousands)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_profile(path: str | Path, stages: Mapping[str, float]) -> None:
@@ -115,20 +118,20 @@ def plot_profile(path: str | Path, stages: Mapping[str, float]) -> None:
         raise InputError("stages: expected at least one, got none.")
     times = np.array(list(stages.values()), dtype=np.float64)
     total = times.sum()
-    figure = _figure(WIDTH, 0.7 + 0.28 * len(times), layout="constrained")
+    figure = new_figure(WIDTH, 0.7 + 0.28 * len(times), layout="constrained")
     axes = figure.subplots()
-    _plain_axes(axes, f"time by stage, {total:.3g} ms in all")
+    plain_axes(axes, f"time by stage, {total:.3g} ms in all")
     axes.grid(False)
     axes.barh(list(stages), times, color=BLUE, height=0.7)
     for row, time in enumerate(times):
         share = 100 * time / total if total > 0 else 0.0
-        _label(axes, (time, row), f"{time:.3g} ms  ({share:.0f} %)", (4, -3), "left")
+        label_point(axes, (time, row), f"{time:.3g} ms  ({share:.0f} %)", (4, -3), "left")
     axes.invert_yaxis()
     axes.set_xlim(0, 1.2 * max(times.max(), 1e-9))
     axes.set_xticks([])
     axes.spines["bottom"].set_visible(False)
     axes.tick_params(axis="y", length=0)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -160,6 +163,14 @@ def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> st
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def machine() -> str:
+    """Processor, cores, operating system and date."""
+    info = Path("/proc/cpuinfo")
+    named = re.search(r"model name\s*:\s*(.*)", info.read_text() if info.exists() else "")
+    processor = named[1] if named else platform.processor() or platform.machine()
+    return f"{processor}, {os.cpu_count()} cores, {platform.system()}, {datetime.date.today()}"
+
+
 def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
     """[H, W] uint8: mean absolute difference of the channels, amplified and cut at white."""
     if photo.shape != render.shape:
@@ -177,14 +188,15 @@ def _smooth(values: np.ndarray) -> np.ndarray:
     return (sums[last] - sums[first]) / (last - first)
 
 
-def _figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:
+def new_figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:
     """An empty figure in inches that belongs to no pyplot state and needs no display."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
 
     return Figure(figsize=(width, height), dpi=DPI, layout=layout, facecolor="white")
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure, whole or not at all. Raises InputError if the file cannot be written."""
     with atomic_write(path) as temporary:
         figure.savefig(temporary)
 
@@ -205,7 +217,8 @@ def _shorten(name: str, inches: float) -> str:
     return name if len(name) <= letters else "…" + name[1 - letters :]
 
 
-def _plain_axes(axes: Axes, title: str) -> None:
+def plain_axes(axes: Axes, title: str) -> None:
+    """The look of all plots: a bold title in place of a label, few lines, a faint grid."""
     axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(FAINT)
@@ -214,7 +227,7 @@ def _plain_axes(axes: Axes, title: str) -> None:
     axes.set_axisbelow(True)
 
 
-def _label(axes: Axes, at: tuple[float, float], text: str, offset: tuple[float, float], align: str) -> None:
+def label_point(axes: Axes, at: tuple[float, float], text: str, offset: tuple[float, float], align: str) -> None:
     """Write ``text`` beside a point, ``offset`` in points of type."""
     axes.annotate(text, at, offset, textcoords="offset points", ha=align, fontsize=9, color=INK)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullLocator
 
 from warp_splat import report
 from warp_splat.compare.adjoints import Measurement, median, spread
@@ -79,32 +80,39 @@ def knob_table(measurements: Sequence[Measurement]) -> str:
 def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
     """Error of the worst gradient against the time of forward and backward pass, a panel per scene."""
     scenes = list(dict.fromkeys(item.scene for item in measurements))
-    figure = report._figure(report.WIDTH, 0.6 + 2.1 * -(-len(scenes) // 3), layout="constrained")
-    grid = figure.subplots(-(-len(scenes) // 3), 3, squeeze=False, sharey=True)
+    rows = -(-len(scenes) // 3)
+    figure = report.new_figure(report.WIDTH, 0.8 + 2.0 * rows, layout="constrained")
+    grid = figure.subplots(rows, 3, squeeze=False, sharey=True)
     handles = {}
     for axes, scene in zip(grid.flat, scenes, strict=False):
-        report._plain_axes(axes, scene)
-        for item in measurements:
-            if item.scene == scene and item.backward and item.errors:
-                color, marker = STYLES[item.variant]
-                error = max(item.worst[1], LEAST)
-                handles[item.variant] = axes.loglog(
-                    1e3 * _both(item), error, marker, color=color, markersize=6, linestyle="none"
-                )[0]
+        report.plain_axes(axes, scene)
+        here = [item for item in measurements if item.scene == scene and item.backward and item.errors]
+        for item in here:
+            error = max(item.worst[1], LEAST)
+            if item.extrapolated:  # too far to the right to be drawn
+                axes.annotate(f"differences, {_both(item):.0e} s ▸", (1, error), xycoords=("axes fraction", "data"),
+                              ha="right", va="center", fontsize=7, color=STYLES[item.variant][0])  # fmt: skip
+                continue
+            color, marker = STYLES[item.variant]
+            line = axes.loglog(1e3 * _both(item), error, marker, color=color, markersize=6, linestyle="none")[0]
+            handles[item.variant] = line
+        least = min(1e3 * _both(item) for item in here)
+        axes.set_xlim(0.7 * least, 25 * least)
         axes.set_ylim(LEAST, 3.0)
+        _plain_ticks(axes)
+        axes.set_xlabel("forward and backward [ms]", fontsize=8, color=report.INK)
     for axes in grid.flat[len(scenes) :]:
         axes.set_axis_off()
-    figure.supxlabel("forward and backward of the pixel loop [ms]", fontsize=9, color=report.INK)
     figure.supylabel("relative error of the worst gradient", fontsize=9, color=report.INK)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    report._save(figure, path)
+    report.save_figure(figure, path)
 
 
 def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
     """Peak memory against depth complexity, a line per variant."""
-    figure = report._figure(report.WIDTH / 2, 2.8, layout="constrained")
+    figure = report.new_figure(report.WIDTH / 2, 2.8, layout="constrained")
     axes = figure.subplots()
-    report._plain_axes(axes, "peak memory of a pass [MiB]")
+    report.plain_axes(axes, "peak memory of a pass [MiB]")
     for variant in dict.fromkeys(item.variant for item in measurements):
         points = [
             (candidates, item.memory / 2**20)
@@ -117,15 +125,15 @@ def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
             axes.loglog(*np.array(points).T, marker=marker, color=color, linewidth=1.2, markersize=5, label=variant)
     axes.set_xlabel("candidates per pixel", fontsize=9, color=report.INK)
     axes.legend(fontsize=8, frameon=False)
-    report._save(figure, path)
+    report.save_figure(figure, path)
 
 
 def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence[str]) -> None:
     """Share of each stage of rendering and differentiating, a bar per scene and mode."""
     chosen = [item for item in measurements if item.variant in modes and item.stages]
-    figure = report._figure(report.WIDTH, 0.8 + 0.2 * len(chosen), layout="constrained")
+    figure = report.new_figure(report.WIDTH, 0.8 + 0.2 * len(chosen), layout="constrained")
     axes = figure.subplots()
-    report._plain_axes(axes, "share of each stage of rendering and differentiating")
+    report.plain_axes(axes, "share of each stage of rendering and differentiating")
     labels = [f"{item.scene}: {item.variant}" for item in chosen]
     totals = np.array([sum(item.stages.get(stage, 0.0) for stage in STAGES) for item in chosen])
     left = np.zeros(len(chosen))
@@ -136,33 +144,36 @@ def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence
     axes.invert_yaxis()
     axes.grid(False)
     axes.set_xlim(0, 1)
+    axes.margins(y=0.01)
     axes.tick_params(axis="y", labelsize=7, length=0)
     figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    report._save(figure, path)
+    report.save_figure(figure, path)
 
 
 def plot_knobs(path: Path, measurements: Sequence[Measurement]) -> None:
     """Error of image and gradient against time, relative to the default, a row per scene."""
     scenes = list(dict.fromkeys(item.scene for item in measurements))
-    figure = report._figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
+    figure = report.new_figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
     grid = figure.subplots(len(scenes), 2, squeeze=False)
     handles = {}
     for row, scene in zip(grid, scenes, strict=True):
         here = [item for item in measurements if item.scene == scene]
-        for axes, title in zip(row, ("largest error of the image", "error of the worst gradient"), strict=True):
-            report._plain_axes(axes, f"{scene}: {title}")
+        for axes, what in zip(row, ("image", "gradient"), strict=True):
+            report.plain_axes(axes, f"{scene}: error of the {what}")
             for knob, (color, marker) in KNOB_STYLES.items():
                 turned = [item for item in here if item.variant.startswith(f"{knob} ")]
                 times = [_both(item) / _both(_default(here, item)) for item in turned]
-                errors = [item.image_error if "image" in title else item.worst[1] for item in turned]
+                errors = [item.image_error if what == "image" else item.worst[1] for item in turned]
                 errors = [max(error, LEAST) for error in errors]
                 handles[knob] = axes.loglog(times, errors, marker, ls="-", color=color, lw=0.8, markersize=4)[0]
                 for item, *place in zip(turned, times, errors, strict=True):
-                    name = item.variant.removeprefix(f"{knob} ")
-                    axes.annotate(name, place, (3, 3), textcoords="offset points", fontsize=6, color=color)
+                    if place[0] > 1.2 or place[1] > 1e-5:  # the others lie on one spot
+                        name = item.variant.removeprefix(f"{knob} ")
+                        axes.annotate(name, place, (3, 3), textcoords="offset points", fontsize=6, color=color)
+            _plain_ticks(axes)
             axes.set_xlabel("time of the pixel loop, default (*) = 1", fontsize=9, color=report.INK)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    report._save(figure, path)
+    report.save_figure(figure, path)
 
 
 def _default(measurements: Sequence[Measurement], item: Measurement) -> Measurement:
@@ -170,6 +181,13 @@ def _default(measurements: Sequence[Measurement], item: Measurement) -> Measurem
     knob = item.variant.split()[0]
     here = (other for other in measurements if other.scene == item.scene and other.variant.split()[0] == knob)
     return next(other for other in here if other.variant.endswith("*"))
+
+
+def _plain_ticks(axes) -> None:
+    """1, 2, 5, 10 along a logarithmic x axis."""
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _both(item: Measurement) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,7 +11,11 @@ from warp_splat.compare import adjoints, knobs, report, stability, training, vol
 from warp_splat.compare.workloads import Workload, all_workloads
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import write_csv, write_json
+from warp_splat.formats.atomic import atomic_write, write_csv, write_json
+from warp_splat.gradcheck import check_gradients
+from warp_splat.report import machine
+
+DIRECTIONS = 4  # per parameter
 
 
 def compare(config: CompareConfig) -> int:
@@ -23,33 +28,56 @@ def compare(config: CompareConfig) -> int:
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
     launch.prepare(config.device, config.threads)
-    out = Path(config.out)
+    out, log = Path(config.out), []
+
+    def say(text: str = "") -> None:
+        print(text)
+        log.append(text)
+
     if config.stability:
-        print("Kernels of a mode are compiled once on a machine, about 10 s each.")
-        return 1 if stability.run(out, config.modes) else 0
-    if config.volume:
-        volume_report.run(out)
-        return 0
-    _compare_pixel_loops(config, out)
-    training.run(out, config.modes, config.scene, config.full)
-    print(f"\nTables and plots: {out}")
-    return 0
+        name, code = "stability", 1 if stability.run(out, config.modes, say) else 0
+    elif config.volume:
+        name, code = "volume", 0
+        volume_report.run(out, say)
+    else:
+        name, code = "compare", 0
+        _compare_pixel_loops(config, out, say)
+        training.run(out, config.modes, config.scene, config.full, say)
+    say(f"\nMeasured on {machine()}, {launch.get_threads()} threads.")
+    with atomic_write(out / f"{name}.txt") as path:
+        path.write_text("\n".join(log) + "\n", encoding="utf-8")
+    print(f"Tables and plots: {out}")
+    return code
 
 
-def _compare_pixel_loops(config: CompareConfig, out: Path) -> None:
+def _compare_pixel_loops(config: CompareConfig, out: Path, say: Callable[[str], None]) -> None:
     """Adjoints on every workload; knobs on the layered scene and those trained longest."""
-    print("Kernels of every variant are compiled once on a machine, about a minute in all.")
-    workloads = all_workloads(config.scene, print)
-    measured = adjoints.measure(workloads, config.modes, print)
-    print(f"\n{report.adjoint_table(measured)}\n")
+    print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
+    workloads = all_workloads(config.scene, say)
+    measured = adjoints.measure(workloads, config.modes, say)
+    say(f"\n{report.adjoint_table(measured)}\n")
     _write(out, "adjoints", measured)
     report.plot_errors(out / "adjoints.png", measured)
     report.plot_memory(out / "memory.png", measured)
     report.plot_stages(out / "stages.png", measured, config.modes)
-    turned = knobs.measure(_for_knobs(workloads), print)
-    print(f"\n{report.knob_table(turned)}\n")
+    _check_directions(workloads, out, say)
+    turned = knobs.measure(_for_knobs(workloads), say)
+    say(f"\n{report.knob_table(turned)}\n")
     _write(out, "knobs", turned)
     report.plot_knobs(out / "knobs.png", turned)
+
+
+def _check_directions(workloads: list[Workload], out: Path, say: Callable[[str], None]) -> None:
+    """The gradients of the whole image against finite differences, for the scenes in training."""
+    found = {}
+    for workload in workloads:
+        if "," in workload.name:
+            *geometry, sh_dc, sh_rest = workload.gaussians
+            scene = (*geometry, (sh_dc, sh_rest), workload.camera, workload.background)
+            check = check_gradients(*scene, options=workload.options, directions=DIRECTIONS)
+            say(f"{workload.name}: along random directions, against finite differences\n\n{check}\n")
+            found[workload.name] = [asdict(row) for row in check.rows]
+    write_json(out / "directions.json", found)
 
 
 def _for_knobs(workloads: list[Workload]) -> list[Workload]:

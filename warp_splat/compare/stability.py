@@ -106,7 +106,7 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
 
 def plot(path: Path, rows: Sequence[Row]) -> None:
     """Draw the growth of rounding along a chain against its bound, and the error of two formulas for a determinant."""
-    figure = report._figure(report.WIDTH, 3.2, layout="constrained")
+    figure = report.new_figure(report.WIDTH, 3.2, layout="constrained")
     left, right = figure.subplots(1, 2)
     _plot_chains(left, {row.case.name: row for row in rows})
     _plot_determinant(right)
@@ -114,15 +114,15 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.minorticks_off()
-    report._save(figure, path)
+    report.save_figure(figure, path)
 
 
 def _plot_chains(axes, rows: dict[str, Row]) -> None:
-    report._plain_axes(axes, "error of the gradients of n layers")
+    report.plain_axes(axes, "error of the gradients of n layers")
     chains = {layers: rows[f"chain_{layers}"].outcomes for layers in stability_blend.CHAINS}
     lengths = list(chains)
     axes.plot(lengths, [layers * EPS for layers in lengths], color=report.INK, linewidth=1.0, linestyle="--")
-    report._label(axes, (lengths[-1], lengths[-1] * EPS), "n eps", (0, 5), "right")
+    report.label_point(axes, (lengths[-1], lengths[-1] * EPS), "n eps", (0, 5), "right")
     modes = list(chains[lengths[0]])
     colors = (report.BLUE, report.ORANGE, report.GREEN, report.INK)
     for place, (mode, color, marker) in enumerate(zip(modes, colors, MARKERS, strict=False)):
@@ -135,13 +135,13 @@ def _plot_chains(axes, rows: dict[str, Row]) -> None:
 
 
 def _plot_determinant(axes) -> None:
-    report._plain_axes(axes, "error of det, worst of all angles")
+    report.plain_axes(axes, "error of det, worst of all angles")
     errors = stability_numbers.determinant_errors()
     ratios = stability_numbers.RATIOS
     axes.plot(ratios, errors["usual"], color=report.ORANGE, marker="s", markersize=4)
     axes.plot(ratios, errors["ours"], color=report.BLUE, marker="o", markersize=4)
-    report._label(axes, (ratios[-5], errors["usual"][-5]), "a c - b²", (-8, 6), "right")
-    report._label(axes, (ratios[-1], errors["ours"][-1]), "sum of squares", (0, 7), "right")
+    report.label_point(axes, (ratios[-5], errors["usual"][-5]), "a c - b²", (-8, 6), "right")
+    report.label_point(axes, (ratios[-1], errors["ours"][-1]), "sum of squares", (0, 7), "right")
     axes.axhline(1.0, color=report.INK, linewidth=1.0, linestyle="--")
-    report._label(axes, (ratios[0], 1.0), "no digit right", (0, 4), "left")
+    report.label_point(axes, (ratios[0], 1.0), "no digit right", (0, 4), "left")
     axes.set_xlabel("scale ratio of the needle", fontsize=9, color=report.INK)

@@ -87,7 +87,7 @@ def run(
     """Train all variants: about three minutes on two cores for four modes, an hour with ``full``.
 
     Args:
-        out: folder for training.json, training.csv, training_modes.png and training_cap.png (of the last scene).
+        out: folder for training.json, training.csv, training_modes.png and training_cap.jpg (of the last scene).
         modes: adjoints to compare, some of ``warp_splat.config.ADJOINTS``; "manual" is trained in any case.
         scene: folder of a further scene, besides the embedded one.
         full: train by the embedded scene's whole schedule instead of the short one.
@@ -112,7 +112,7 @@ def run(
         results["summary"] += (rows := summarize(found))
         results["equality"][name] = equality = compare_modes(found, names)
         say(f"\n{_table(rows)}\n\n{_verdict(equality) if equality else ''}")
-        plot_cap(out / "training_cap.png", _views(loaded), found)
+        plot_cap(out / "training_cap.jpg", _views(loaded), found)
         runs += found
     results["runs"] = [{key: value for key, value in vars(r).items() if key != "pictures"} for r in runs]
     write_json(out / "training.json", results)
@@ -273,11 +273,11 @@ def _verdict(equality: Mapping[str, Any]) -> str:
 def plot_modes(path: Path, runs: Sequence[Run], modes: Sequence[str]) -> None:
     """Draw PSNR over iterations and over seconds of training steps, by scene: mean and range of the seeds."""
     scenes = list(dict.fromkeys(r.scene for r in runs))
-    figure = report._figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
+    figure = report.new_figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
     grid = figure.subplots(len(scenes), 2, squeeze=False, sharey="row")
     for row, scene in zip(grid, scenes, strict=True):
         for axes, key in zip(row, ("iteration", "seconds"), strict=True):
-            report._plain_axes(axes, f"{scene}: test PSNR [dB]")
+            report.plain_axes(axes, f"{scene}: test PSNR [dB]")
             axes.set_xlabel(key, fontsize=9, color=report.INK)
             for mode, (color, dash) in zip(modes, STYLES, strict=False):
                 histories = [r.history for r in runs if (r.scene, r.variant, r.refused) == (scene, mode, "")]
@@ -286,7 +286,7 @@ def plot_modes(path: Path, runs: Sequence[Run], modes: Sequence[str]) -> None:
                     axes.fill_between(x.mean(0), y.min(0), y.max(0), color=color, alpha=0.15, linewidth=0)
                     axes.plot(x.mean(0), y.mean(0), dash, color=color, linewidth=1.8, label=mode)
     figure.legend(handles=grid[0, 0].get_lines(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    report._save(figure, path)
+    report.save_figure(figure, path)
 
 
 def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Run]) -> None:

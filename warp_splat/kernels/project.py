@@ -11,7 +11,7 @@ The exact outline of the ellipsoid x' Sigma^-1 x = k^2 instead (Qi, Cai and Han 
 dual conic, K (k^2 Sigma - p p') K' for a centre p. With a3 = k / z (third row of W R S) and r = 1 - |a3|^2 that is,
 without a difference of large numbers, the mean moved by -(a1 a3, a2 a3) k / r and, divided by k^2, the covariance
 A (I - a3 a3')^-1 A' / r: rows a_i become (a_i + (a_i a3) / (r + sqrt(r)) a3) / sqrt(r). We take k = 2: against the
-volume (warp_splat.compare.volume) its footprint is better than the affine one by 4 to 9 dB, that of k = 3 worse by 1
+volume (warp_splat.compare.volume) its footprint is better than the affine one by 4 to 8 dB, that of k = 3 worse by 1
 to 6.
 """
 
