@@ -8,16 +8,16 @@ from pathlib import Path
 KERNELS = Path(__file__).parents[1] / "kernels"
 
 _CLAMP = ("blend.adj_alpha_of",)
-_EXP = ("adjoint_lanes.adj_exp2_known", "adjoint_lanes.adj_opaque", *_CLAMP)
-_ROOT = ("adjoint_lanes.conic_from_root",)
+_EXP = ("step.adj_exp2_known", "step.adj_opaque", *_CLAMP)
+_ROOT = ("step.conic_from_root",)
 _READ = ("taped_lanes.adj_spread", "taped_lanes.adj_collect", "taped_lanes.adj_exp2_value", *_ROOT)
 _BEGIN = ("taped_lanes.replay_begin", "taped_lanes.adj_begin")
 _UNDO = ("taped_lanes.replay_front_of", "taped_lanes.adj_front_of", "blend.odds_of")
 _KEPT = ("taped_lanes.replay_front_of_kept", "taped_lanes.adj_front_of_kept")
 
-#: Rules: functions that state a derivative or an inverse. Ends in a factory's name where one name has several homes.
+#: Rules: functions that state a derivative or an inverse. Of overloads, one is counted.
 RULES = {
-    "manual": ("adjoint_lanes.make_manual", "blend.adj_alpha_blend", "blend.odds_of", *_CLAMP),
+    "manual": ("step.make_manual", "step.geometry_from_moments", "blend.adj_alpha_blend", "blend.odds_of", *_CLAMP),
     "stepwise": ("blend.odds_of", *_EXP, *_ROOT),
     "reversible": (*_BEGIN, *_UNDO, *_EXP, *_READ),
     "stored": (*_BEGIN, *_KEPT, *_EXP, *_READ),
@@ -25,11 +25,11 @@ RULES = {
     "plain": (*_EXP, *_READ),
 }
 #: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
-_KNOWN = ("adjoint_lanes.exp2_known", "adjoint_lanes.opaque")
+_KNOWN = ("step.exp2_known", "step.opaque")
 _WALK = ("taped_lanes.walk", "taped_lanes.spread", "taped_lanes.collect", "taped_lanes.exp2_value", *_KNOWN)
 PLUMBING = {
-    "manual": ("adjoint_lanes.adj_blend",),
-    "stepwise": ("adjoint_lanes.adj_blend", "adjoint_lanes.make_stepwise", "adjoint_lanes.Parcel", *_KNOWN),
+    "manual": ("adjoint_lanes.adj_blend", "adjoint_lanes._make_manual_body"),
+    "stepwise": ("adjoint_lanes.adj_blend", "adjoint_lanes._make_stepwise_body", "step.make_stepwise", *_KNOWN),
     "reversible": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of"),
     "stored": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of_kept"),
     "generated": ("taped_lanes.walk", "taped_lanes.begin", "taped_lanes.front_of"),

@@ -134,6 +134,17 @@ def exp2_exact(x: vec16):
 
 
 @wp.func
+def inner(a: float, b: float):
+    """Sum over the lanes of the product."""
+    return a * b
+
+
+@wp.func
+def inner(a: vec16, b: vec16):
+    return wp.dot(a, b)
+
+
+@wp.func
 def total(x: vec16):
     """Sum of the lanes, in a fixed order."""
     s = float(0.0)

@@ -124,7 +124,7 @@ def project(
     scale = scales[i]
     opacity = opacities[i]
     finite = wp.isfinite(mean) and wp.isfinite(quat) and wp.isfinite(scale) and wp.isfinite(opacity)
-    if not finite or wp.max(wp.abs(quat)) == 0.0:
+    if not finite or quat == wp.vec4(0.0):
         radii_out[i] = INVALID
         return
     offset = (mean - camera.center) - camera.center_low

@@ -21,11 +21,11 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.adjoint_lanes import conic_from_root, exp2_known, opaque
 from warp_splat.kernels.blend import Splat2D, alpha_of, exponent, make_exp, odds_of
 from warp_splat.kernels.blend_lanes import BLOCKS, reach
 from warp_splat.kernels.build import FORWARD_ONLY
 from warp_splat.kernels.lanes import LANE_X, LANE_Y, times, total, vec16, where_less
+from warp_splat.kernels.step import conic_from_root, exp2_known, opaque
 
 
 @wp.func

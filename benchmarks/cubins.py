@@ -1,0 +1,116 @@
+"""Compile every CUDA kernel ahead of time, without a GPU, and tell what it needs: registers, stack, shared memory.
+
+    python benchmarks/cubins.py [--out docs/cuda]
+
+Stack must be 0: a kernel that spills registers to memory is slow without a word. Occupancy is the share of the
+threads that fit on a multiprocessor at once, in blocks of 256.
+"""
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import warp as wp
+from common import write_table
+
+from warp_splat.config import ADJOINTS
+from warp_splat.kernels import adam, project, tiles
+from warp_splat.kernels.adjoint_block import make_reverse_block, make_upstream_block
+from warp_splat.kernels.blend_block import make_blend_block
+from warp_splat.kernels.taped_block import make_walk_block
+
+BLOCK = 256
+REGISTERS = 65536  # of a multiprocessor, all architectures below
+#: Architecture: threads, blocks and KiB of shared memory of a multiprocessor (CUDA C++ Programming Guide, table 15).
+LIMITS = {75: (1024, 16, 64), 80: (2048, 32, 164), 86: (1536, 16, 100), 89: (1536, 24, 100), 90: (2048, 32, 228)}
+DEGREE = 5  # of the exponential, the default
+
+PROPERTIES = re.compile(r"Function (\S+):\s+REG:(\d+) STACK:(\d+) SHARED:(\d+)")
+
+
+def modules() -> dict[str, wp.Module]:
+    """What runs on CUDA, by the name under which it is listed."""
+    found = {name: module.module for name, module in (("project", project.project), ("adam", adam.adam_rows))}
+    found["tiles"] = tiles.pack.module
+    for depth in (False, True):
+        suffix = ", depth" if depth else ""
+        found[f"blend{suffix}"] = make_blend_block(depth, DEGREE, False).module
+        found[f"blend, stored{suffix}"] = make_blend_block(depth, DEGREE, True).module
+        found[f"upstream{suffix}"] = make_upstream_block(depth).module
+        for mode in ADJOINTS[:2]:
+            found[f"{mode}{suffix}"] = make_reverse_block(mode, depth, DEGREE).module
+        for mode in ADJOINTS[2:]:
+            found[f"{mode}{suffix}"] = make_walk_block(mode, depth, DEGREE).module
+    return found
+
+
+def cuobjdump() -> str | None:
+    """NVIDIA's disassembler, which comes with triton, which comes with torch on Linux; None elsewhere."""
+    places = (Path(folder) / "triton/backends/nvidia/bin/cuobjdump" for folder in sys.path)
+    return next((str(place) for place in places if place.is_file()), None)
+
+
+def resources(name: str, module: wp.Module, arch: int, tool: str) -> list[dict]:
+    """A record for each kernel of the module, compiled for sm_<arch>."""
+    with tempfile.TemporaryDirectory() as folder:
+        wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=False)
+        cubin = next(Path(folder).glob("*.cubin"))
+        dynamic = json.loads(next(Path(folder).glob("*.meta")).read_text())
+        said = subprocess.run([tool, "-res-usage", str(cubin)], capture_output=True, text=True, check=True).stdout
+    records = []
+    for function, registers, stack, shared in PROPERTIES.findall(said):
+        kernel = re.sub(r"^.*__locals__|_[0-9a-f]{8}(?=_cuda)|_cuda_kernel|_forward$", "", function)
+        record = {
+            "module": name,
+            "kernel": kernel.replace("_backward", ", adjoint"),
+            "arch": arch,
+            "registers": int(registers),
+            "stack": int(stack),
+            "static_shared": int(shared),
+            "dynamic_shared": dynamic.get(f"{function}_smem_bytes", 0),
+        }
+        records.append(record | {"occupancy": occupancy(record)})
+    return records
+
+
+def occupancy(record: dict) -> float:
+    """Share of a multiprocessor's threads in blocks of 256 that registers and shared memory leave room for."""
+    threads, blocks, shared = LIMITS[record["arch"]]
+    by_registers = REGISTERS // (-(-record["registers"] // 8) * 8 * BLOCK)
+    used = record["static_shared"] + record["dynamic_shared"]
+    by_shared = shared * 1024 // used if used else blocks
+    return min(blocks, threads // BLOCK, by_registers, by_shared) * BLOCK / threads
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, help="folder for cubins.md and cubins.json")
+    arguments = parser.parse_args()
+    tool = cuobjdump()
+    if tool is None:
+        raise SystemExit("cuobjdump is missing: it comes with triton, a dependency of torch on Linux.")
+    records = [
+        record
+        for name, module in modules().items()
+        for arch in LIMITS
+        for record in resources(name, module, arch, tool)
+    ]
+    kernels = dict.fromkeys((record["module"], record["kernel"]) for record in records)
+    rows = []
+    for module, kernel in kernels:
+        here = [record for record in records if (record["module"], record["kernel"]) == (module, kernel)]
+        most = lambda key: max(record[key] for record in here)  # noqa: B023, E731
+        shares = (f"{100 * record['occupancy']:.0f}" for record in here)
+        shared = (most("static_shared"), most("dynamic_shared"))
+        rows.append((module, kernel, most("registers"), most("stack"), *shared, *shares))
+    headers = ("module", "kernel", "registers", "stack", "static B", "dynamic B", *(f"sm_{arch} %" for arch in LIMITS))
+    note = "The most of any architecture; occupancy in percent, blocks of 256 threads."
+    write_table("cubins", arguments.out, headers, rows, note, {"records": records})
+
+
+if __name__ == "__main__":
+    main()

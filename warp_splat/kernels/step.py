@@ -1,0 +1,181 @@
+"""The adjoint of one step of the blend, for one pixel or for lanes: by hand, or differentiated by Warp.
+
+Both drivers' reverse loops call one of the two; what they share with the loops that Warp differentiates whole is here,
+too. ``number`` is float or vec16. The step is sliced so that the exponential is called at one place of a kernel: LLVM
+inlines a function of that size only then, and a call costs more than the step (Tried: three calls, 2.9 times slower).
+Hence ``exp2_known``, whose gradient uses a value that is there already.
+"""
+
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from warp_splat.kernels.blend import (
+    LN_2,
+    LOG2_E,
+    adj_alpha_blend,
+    adj_alpha_of,
+    alpha_of,
+    exponent,
+    make_exp,
+    odds_of,
+)
+from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.lanes import fill, inner, times, vec16, where_less
+
+wp.set_module_options(FORWARD_ONLY)
+
+
+@wp.func
+def exp2_known(z: float, value: float):
+    """2^-z, computed before."""
+    return value
+
+
+@wp.func
+def exp2_known(z: vec16, value: vec16):
+    return value
+
+
+@wp.func_grad(exp2_known)
+def adj_exp2_known(z: float, value: float, adj_ret: float):
+    wp.adjoint[z] += times(value, adj_ret) * -LN_2
+
+
+@wp.func_grad(exp2_known)
+def adj_exp2_known(z: vec16, value: vec16, adj_ret: vec16):
+    wp.adjoint[z] += times(value, adj_ret) * -LN_2
+
+
+@wp.func
+def opaque(raw: float, alpha_min: float, here: float, walked: float):
+    """Opacity, 0 for pixels that had stopped."""
+    return alpha_of(where_less(here, walked, raw, -1.0), alpha_min)
+
+
+@wp.func
+def opaque(raw: vec16, alpha_min: float, here: vec16, walked: vec16):
+    return alpha_of(where_less(here, walked, raw, vec16(-1.0)), alpha_min)
+
+
+@wp.func_grad(opaque)
+def adj_opaque(raw: float, alpha_min: float, here: float, walked: float, adj_ret: float):
+    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, -1.0), alpha_min, adj_ret)
+
+
+@wp.func_grad(opaque)
+def adj_opaque(raw: vec16, alpha_min: float, here: vec16, walked: vec16, adj_ret: vec16):
+    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, vec16(-1.0)), alpha_min, adj_ret)
+
+
+@wp.func
+def conic_from_root(adj_root: wp.vec3, root: wp.vec3):
+    """dL/dconic from dL/droot, where root' root = conic log2(e) / 2."""
+    yy = adj_root[2] / root[2]
+    xy = (adj_root[1] - root[1] * yy) / root[0]
+    xx = (adj_root[0] - root[1] * xy) / root[0]
+    return wp.vec3(0.25 * LOG2_E * xx, 0.5 * LOG2_E * xy, 0.25 * LOG2_E * yy)
+
+
+@wp.func
+def geometry_from_moments(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
+    """dL/d(mean, conic) from sums over pixels of d and d d', weighted by dL/dopacity."""
+    adj_u = -2.0 * LN_2 * opacity * (root[0] * s[0] + root[1] * s[1])
+    adj_v = -2.0 * LN_2 * opacity * root[2] * s[1]
+    return (
+        wp.vec2(root[0] * adj_u, root[1] * adj_u + root[2] * adj_v),
+        wp.vec3(-0.5 * opacity * xx, -opacity * xy, -0.5 * opacity * yy),
+    )
+
+
+@functools.cache
+def make_manual(exp_degree: int | None, number: type) -> wp.Function:
+    """The adjoint of a step by hand (top of :mod:`warp_splat.kernels.blend`)."""
+    exp2_minus = make_exp(exp_degree)
+
+    @wp.func
+    def adj_step(
+        z: number,
+        opacity: float,
+        t: number,  # behind
+        behind: number,  # T dL/dT, behind
+        alpha_min: float,
+        here: number,
+        walked: number,
+        lit: number,  # color . u
+    ):
+        """T in front, T dL/dT in front, the weight, and dL/dopacity of every pixel (times opacity: -dL/dq)."""
+        fall = exp2_minus(z)
+        raw = where_less(here, walked, fall * opacity, fill(-1.0, z))
+        odds = odds_of(alpha_of(raw, alpha_min))
+        w = times(t, odds)
+        front = t + w
+        adj_raw = adj_alpha_of(raw, alpha_min, adj_alpha_blend(front, odds, behind, lit))
+        return front, behind + times(w, lit), w, times(adj_raw, fall)
+
+    return adj_step
+
+
+class Stepwise(NamedTuple):
+    """A step for wp.grad, the struct that it is differentiated by, and what recovers the state in front of it."""
+
+    Parcel: type
+    undo: wp.Function
+    step: wp.Function
+
+
+@functools.cache
+def make_stepwise(depth: bool, exp_degree: int | None, number: type) -> Stepwise:
+    """A step whose adjoint is wp.grad(step), as in the rasterizer written in Slang (Bangaru et al. 2023).
+
+    A kernel may call a function that calls wp.grad, but no deeper: Warp 1.19 emits the functions in the wrong order.
+    """
+    exp2_minus = make_exp(exp_degree)
+
+    @wp.struct
+    class Parcel:
+        """A Gaussian as the pixels see it: what its step depends on and is differentiated by."""
+
+        dx: number
+        dy: number
+        xx: number  # of the root
+        xy: number
+        yy: number
+        opacity: number
+        red: number
+        green: number
+        blue: number
+        depth: number
+
+    @wp.func
+    def undo(parcel: Parcel, t: number, alpha_min: float, here: number, walked: number):
+        """2^-z and the transmittance in front, from that behind."""
+        fall = exp2_minus(exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy))
+        odds = odds_of(opaque(times(fall, parcel.opacity), alpha_min, here, walked))
+        return fall, t + times(t, odds)
+
+    @wp.func
+    def step(
+        parcel: Parcel,
+        fall: number,
+        t: number,  # in front
+        adj_behind: number,  # dL/dT behind
+        alpha_min: float,
+        here: number,
+        walked: number,
+        red: number,  # upstream gradients
+        green: number,
+        blue: number,
+        far: number,
+    ):
+        """What the step adds to the loss, T behind it seen as a quantity of weight dL/dT."""
+        z = exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy)
+        alpha = opaque(times(exp2_known(z, fall), parcel.opacity), alpha_min, here, walked)
+        w = times(alpha, t)
+        lit = times(parcel.red, red) + times(parcel.green, green) + times(parcel.blue, blue)
+        if wp.static(depth):
+            lit = lit + times(parcel.depth, far)
+        return inner(w, lit) + inner(adj_behind, t - w)
+
+    return Stepwise(Parcel, undo, step)
