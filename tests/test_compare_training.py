@@ -24,8 +24,7 @@ def scene():
 
 
 @pytest.fixture
-def tiny(scene, monkeypatch):
-    monkeypatch.setattr(training, "load_scene", lambda *_, **__: scene)
+def tiny(monkeypatch):
     monkeypatch.setattr(training, "SHORT", SCHEDULE)
     monkeypatch.setattr(training, "SEEDS", (0, 1))
     monkeypatch.setattr(training, "EVALUATIONS", 4)
@@ -37,9 +36,9 @@ def test_short_schedule_is_whole_within_its_steps():
     assert training.COMPARED[-1] < 2 * training.SHORT["densification_interval"] < training.SHORT["densify_until_iter"]
 
 
-def test_run_writes_its_files(tiny, tmp_path):
+def test_run_writes_its_files(tiny, scene, tmp_path):
     said = []
-    results = training.run(tmp_path / "new", ["manual", "stepwise"], say=said.append)
+    results = training.run(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)
     assert set(json.loads((tmp_path / "new/training.json").read_text())) == set(results)
     assert results["schedule"]["iterations"] == STEPS
     with open(tmp_path / "new/training.csv", newline="") as file:
@@ -85,10 +84,10 @@ def test_cap_of_one_entry_costs_quality(scene):
     assert qualities[1] < qualities[0] - 1
 
 
-def test_refusal_is_a_row(tiny, tmp_path, monkeypatch):
+def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
     monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda: 0)
     said = []
-    results = training.run(tmp_path, ["manual", "stored"], scene="folder/other", say=said.append)
+    results = training.run(tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append)
     assert {record["scene"] for record in results["summary"]} == {"embedded", "other"}
     record = results["summary"][1]
     assert record["variant"] == "stored" and "take" in record["refused"]

@@ -2,8 +2,8 @@
 
 All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
 instance (:mod:`warp_splat.adjoints` says where they differ). Beside the modes of ``rasterize`` stand ``generated``
-(``reversible`` without any gradient by hand), ``plain`` (the loop recorded naively: wrong), the thesis's loop cap, and
-central differences.
+(``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong), the thesis's
+loop cap, and central differences.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ class Measurement:
     def worst(self) -> tuple[str, float]:
         """The parameter with the largest relative error; not the background: behind much, its gradient is next to 0."""
         known = {name: error.relative for name, error in self.errors.items() if error.relative == error.relative}
-        return max(((name, known[name]) for name in known if name != "background"), key=lambda item: item[1])
+        found = [(name, known[name]) for name in known if name != "background"]
+        return max(found, key=lambda item: item[1]) if found else ("-", float("nan"))
 
 
 def variants_of(modes: Sequence[str]) -> list[Variant]:
@@ -101,7 +102,8 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
         result.note = str(error)
         return result
     result.errors = errors_of(gradients, truth)
-    result.image_error = float((image - truth.image).abs()[truth.sure].max())
+    sure = (image - truth.image).abs()[truth.sure]
+    result.image_error = float(sure.max()) if len(sure) else float("nan")
     result.memory = peak_memory(lambda: _differentiate(workload, variant))
     return result
 

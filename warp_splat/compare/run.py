@@ -8,12 +8,13 @@ from pathlib import Path
 
 from warp_splat import launch
 from warp_splat.compare import adjoints, knobs, report, stability, training, volume_report
-from warp_splat.compare.workloads import Workload, all_workloads
+from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write, write_csv, write_json
 from warp_splat.gradcheck import check_gradients
 from warp_splat.report import machine
+from warp_splat.scene.types import Scene
 
 DIRECTIONS = 4  # per parameter
 
@@ -27,8 +28,15 @@ def compare(config: CompareConfig) -> int:
     unknown = [mode for mode in config.modes if mode not in ADJOINTS]
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
+    if config.stability and config.volume:
+        raise InputError("--stability, --volume: expected one of them, got both; run the command twice.")
+    if (config.stability or config.volume) and (config.scene or config.full):
+        raise InputError("--scene, --full: these belong to the comparison without --stability and --volume.")
     launch.prepare(config.device, config.threads)
     out, log = Path(config.out), []
+    with atomic_write(out / "running.txt") as path:  # before hours of measuring, not after
+        path.write_text("A comparison is running, or was interrupted.\n")
+    scenes = named_scenes(config.scene, print)
 
     def say(text: str = "") -> None:
         print(text)
@@ -41,19 +49,22 @@ def compare(config: CompareConfig) -> int:
         volume_report.run(out, say)
     else:
         name, code = "compare", 0
-        _compare_pixel_loops(config, out, say)
-        training.run(out, config.modes, config.scene, config.full, say)
+        _compare_pixel_loops(config, scenes, out, say)
+        training.run(out, config.modes, scenes, config.full, say)
     say(f"\nMeasured on {machine()}, {launch.get_threads()} threads.")
     with atomic_write(out / f"{name}.txt") as path:
         path.write_text("\n".join(log) + "\n", encoding="utf-8")
+    (out / "running.txt").unlink(missing_ok=True)
     print(f"Tables and plots: {out}")
     return code
 
 
-def _compare_pixel_loops(config: CompareConfig, out: Path, say: Callable[[str], None]) -> None:
+def _compare_pixel_loops(
+    config: CompareConfig, scenes: dict[str, Scene], out: Path, say: Callable[[str], None]
+) -> None:
     """Adjoints on every workload; knobs on the layered scene and those trained longest."""
     print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
-    workloads = all_workloads(config.scene, say)
+    workloads = all_workloads(scenes, say)
     measured = adjoints.measure(workloads, config.modes, say)
     say(f"\n{report.adjoint_table(measured)}\n")
     _write(out, "adjoints", measured)

@@ -211,7 +211,7 @@ CASES = (
     rendered(
         "inside_ellipsoid",
         "camera",
-        "left out too where the ellipsoid of one sigma reaches the camera's plane: no outline",
+        "left out too where the ellipsoid of three sigma reaches the camera's plane: no outline",
         functools.partial(inside, ELLIPSOID),
     ),
     *(

@@ -12,7 +12,6 @@ up every 100 steps, the rate of the means at its end at step 300. PSNR is measur
 
 from __future__ import annotations
 
-import csv
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,11 +27,10 @@ from warp_splat import report
 from warp_splat.binning import bin_tiles
 from warp_splat.config import EMBEDDED_DEFAULTS, TrainConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write, write_json
+from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.metrics import psnr, ssim
 from warp_splat.renderer import Dropped, Project, camera_view
-from warp_splat.scene import Scene, View, load_scene
-from warp_splat.train import embedded_scene
+from warp_splat.scene import Scene, View
 from warp_splat.trainer import Trainer
 
 SHORT: dict[str, Any] = {
@@ -82,14 +80,14 @@ class Run:
 
 
 def run(
-    out: Path, modes: Sequence[str], scene: str = "", full: bool = False, say: Callable[[str], None] = print
+    out: Path, modes: Sequence[str], scenes: Mapping[str, Scene], full: bool = False, say: Callable[[str], None] = print
 ) -> dict[str, Any]:
     """Train all variants: about three minutes on two cores for four modes, an hour with ``full``.
 
     Args:
         out: folder for training.json, training.csv, training_modes.png and training_cap.jpg (of the last scene).
         modes: adjoints to compare, some of ``warp_splat.config.ADJOINTS``; "manual" is trained in any case.
-        scene: folder of a further scene, besides the embedded one.
+        scenes: by name, with views held out.
         full: train by the embedded scene's whole schedule instead of the short one.
         say: receives a line for each run when those of its seed are done, and the tables.
 
@@ -97,17 +95,15 @@ def run(
         ``schedule``, ``runs``, ``summary`` (by variant) and ``equality`` (by scene), as written to training.json.
 
     Raises:
-        InputError: if a scene cannot be read or a file cannot be written.
+        InputError: if a file cannot be written.
     """
     out, schedule, names = Path(out), EMBEDDED_DEFAULTS if full else SHORT, list(dict.fromkeys(("manual", *modes)))
     variants: dict[str, dict[str, Any]] = {name: {"adjoint": name} for name in names}
     variants |= {f"cap {cap}": {"max_steps": cap} for cap in CAPS} | {"ellipsoid": {"projection": "ellipsoid"}}
     results: dict[str, Any] = {"schedule": schedule, "runs": [], "summary": [], "equality": {}}
     runs: list[Run] = []
-    sources = {"embedded": embedded_scene()} | ({Path(scene).resolve().name: Path(scene)} if scene else {})
-    for name, path in sources.items():
+    for name, loaded in scenes.items():
         say(f"\nTraining on {name}, {schedule['iterations']} steps\n")
-        loaded = load_scene(path, eval=True, report=say)
         found = train_all(loaded, name, variants, names, schedule, say)
         results["summary"] += (rows := summarize(found))
         results["equality"][name] = equality = compare_modes(found, names)
@@ -116,11 +112,8 @@ def run(
         runs += found
     results["runs"] = [{key: value for key, value in vars(r).items() if key != "pictures"} for r in runs]
     write_json(out / "training.json", results)
-    with atomic_write(out / "training.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        flat = [{k: v for k, v in record.items() if not isinstance(v, list)} for record in results["runs"]]
-        writer = csv.DictWriter(file, list(flat[0]))
-        writer.writeheader()
-        writer.writerows(flat)
+    flat = [{k: v for k, v in record.items() if not isinstance(v, list)} for record in results["runs"]]
+    write_csv(out / "training.csv", flat)
     plot_modes(out / "training_modes.png", runs, names)
     return results
 

@@ -77,11 +77,24 @@ def in_training(name: str, scene: Scene, say: Callable[[str], None]) -> list[Wor
     return found
 
 
-def all_workloads(scene: str, say: Callable[[str], None]) -> list[Workload]:
-    """The layered scenes, the embedded scene in training, and ``scene`` in training if one is named."""
+def named_scenes(scene: str, say: Callable[[str], None]) -> dict[str, Scene]:
+    """The embedded scene, and the one in the folder ``scene`` if that is not empty, by names that differ.
+
+    Raises:
+        InputError: if the folder holds no scene.
+    """
+    found = {"embedded": load_scene(embedded_scene(), eval=True, report=say)}
+    if scene:
+        name = Path(scene).resolve().name.replace(",", " ")
+        found[name if name not in found else f"{name} (2)"] = load_scene(scene, eval=True, report=say)
+    return found
+
+
+def all_workloads(scenes: dict[str, Scene], say: Callable[[str], None]) -> list[Workload]:
+    """The layered scenes, and the others in training."""
     found = [layered(candidates) for candidates in CANDIDATES]
-    for name, path in {"embedded": embedded_scene(), **({Path(scene).name: Path(scene)} if scene else {})}.items():
-        found += in_training(name, load_scene(path, eval=True, report=say), say)
+    for name, scene in scenes.items():
+        found += in_training(name, scene, say)
     return found
 
 
