@@ -83,7 +83,9 @@ def bin_by_sorting(
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
     support = [options.alpha_min, int(options.extent == "square")]
-    launch(tiles.pack, total, [order, *tensors, camera.height, *support], [splats, view(counts, wp.int64)], device=device)
+    launch(
+        tiles.pack, total, [order, *tensors, camera.height, *support], [splats, view(counts, wp.int64)], device=device
+    )
     inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, *support]
 
     def list_tiles(slot_ends: torch.Tensor, *lists: torch.Tensor) -> None:

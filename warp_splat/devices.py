@@ -37,13 +37,12 @@ def why_no_cuda() -> str | None:
     built += f", Warp {wp.__version__} for CUDA {_dotted(toolkit)}"
     if driver is None:
         return f"no NVIDIA driver found ({built}); install NVIDIA's driver"
-    needed = tuple(int(part) for part in torch.version.cuda.split("."))
-    if driver[0] < max(needed[0], toolkit[0]) and not (torch.cuda.is_available() and wp.is_cuda_available()):
-        return f"the NVIDIA driver is too old: it supports CUDA {_dotted(driver)}, but {built}; update the driver"
     if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        if driver[0] < max(int(torch.version.cuda.split(".")[0]), toolkit[0]):  # minor versions are compatible
+            return f"the NVIDIA driver is too old: it supports CUDA {_dotted(driver)}, but {built}; update the driver"
         return (
-            f"the NVIDIA driver (CUDA {_dotted(driver)}) shows no GPU that can be used ({built}); "
-            "see what nvidia-smi says and whether CUDA_VISIBLE_DEVICES hides it"
+            f"the NVIDIA driver (for CUDA {_dotted(driver)}) shows no GPU ({built}); see what nvidia-smi says and "
+            "whether CUDA_VISIBLE_DEVICES hides it"
         )
     try:
         torch.zeros(1, device="cuda").item()

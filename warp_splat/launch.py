@@ -205,7 +205,7 @@ def empty(count: int, dtype, device: torch.device | str) -> wp.array:
     array = wp.array(
         ptr=memory.data_ptr(), dtype=dtype, shape=count, device=wp.device_from_torch(memory.device), copy=False
     )
-    array._tensor = memory
+    array._tensor = memory  # pyright: ignore[reportAttributeAccessIssue] - as wp.from_torch does
     return array
 
 
