@@ -196,7 +196,7 @@ def test_modes_share_the_image_and_agree_on_the_gradients(name, adjoint, device)
 
 
 def test_stored_refuses_what_does_not_fit(device, monkeypatch):
-    monkeypatch.setattr(adjoints, "available_memory", lambda: 2**20)
+    monkeypatch.setattr(adjoints, "available_memory", lambda device: 2**20)
     scene = SCENES["dense_tile"]().to(device)
     with pytest.raises(InputError, match=r"'stored': the transmittances of \d+ tile instances take .* GiB"):
         rasterize(scene, leaves_of(scene), adjoint="stored")

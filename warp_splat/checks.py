@@ -39,17 +39,17 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     Raises:
         InputError: naming the first argument whose type, shape, dtype, device or range is not as it should be.
     """
-    _check_tensor("means", means, (None, 3))
-    count = means.shape[0]
-    _check_tensor("quats", quats, (count, 4))
-    _check_tensor("scales", scales, (count, 3))
-    _check_tensor("opacities", opacities, (count,))
+    _check_tensor("means", means, (None, 3), None)
+    count, device = means.shape[0], means.device
+    _check_tensor("quats", quats, (count, 4), device)
+    _check_tensor("scales", scales, (count, 3), device)
+    _check_tensor("opacities", opacities, (count,), device)
     if isinstance(sh, (tuple, list)) and len(sh) == 2:
         sh_dc, sh_rest = sh
-        _check_tensor("sh[0]", sh_dc, (count, 1, 3))
-        _check_tensor("sh[1]", sh_rest, (count, None, 3))
+        _check_tensor("sh[0]", sh_dc, (count, 1, 3), device)
+        _check_tensor("sh[1]", sh_rest, (count, None, 3), device)
     else:
-        _check_tensor("sh", sh, (count, None, 3))
+        _check_tensor("sh", sh, (count, None, 3), device)
         sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
     if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
         raise InputError(
@@ -64,7 +64,7 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     return tuple(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest))
 
 
-def _check_tensor(name: str, tensor, shape: tuple[int | None, ...]) -> None:
+def _check_tensor(name: str, tensor, shape: tuple[int | None, ...], device: torch.device | None) -> None:
     wanted = "[" + ", ".join("N" if size is None else str(size) for size in shape) + "]"
     if not isinstance(tensor, torch.Tensor):
         raise InputError(f"{name}: expected a float32 torch tensor {wanted}, got {type(tensor).__name__}.")
@@ -75,8 +75,29 @@ def _check_tensor(name: str, tensor, shape: tuple[int | None, ...]) -> None:
         raise InputError(
             f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float()."
         )
-    if tensor.device.type != "cpu":
-        raise InputError(f"{name}: expected a tensor on the CPU, got one on {tensor.device}; move it with .cpu().")
+    if tensor.device.type not in ("cpu", "cuda"):
+        raise InputError(
+            f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
+        )
+    if device is not None and tensor.device != device:
+        raise InputError(f"{name}: expected a tensor on {device}, as the means, got one on {tensor.device}.")
+
+
+def check_background(background, device: torch.device) -> torch.Tensor:
+    """The background as a tensor [3] on ``device``. Raises InputError if it is not three finite numbers there."""
+    if not isinstance(background, torch.Tensor):
+        try:
+            background = torch.tensor([float(value) for value in background], device=device)
+        except (TypeError, ValueError):
+            raise InputError(f"background: expected three numbers or a tensor [3], got {background!r}.") from None
+    if background.device != device:
+        raise InputError(f"background: expected a tensor on {device}, as the means, got one on {background.device}.")
+    if background.shape != (3,) or background.dtype != torch.float32 or not bool(torch.isfinite(background).all()):
+        raise InputError(
+            f"background: expected three finite numbers (a tensor: float32 [3]), got {background.dtype} "
+            f"{list(background.shape)}: {background.tolist()}."
+        )
+    return background
 
 
 def check_range(name: str, tensor: torch.Tensor, outside: bool, wanted: str) -> None:

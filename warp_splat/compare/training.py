@@ -167,7 +167,7 @@ def train_run(trainer: Trainer, result: Run, reference: dict[int, torch.Tensor])
         start = time.perf_counter()
         if iteration > 1:  # the last update is left out: a set that was densified a moment ago is unsettled
             trainer.update(iteration - 1)
-        losses.append(trainer.differentiate(iteration))
+        losses.append(trainer.differentiate(iteration).item())
         seconds += time.perf_counter() - start
         if iteration in checks:
             record = {"iteration": iteration, "seconds": seconds, "loss": float(np.mean(losses))}
