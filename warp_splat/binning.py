@@ -13,9 +13,11 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.blend import Splat2D
-from warp_splat.launch import empty, even_slices, get_threads, launch, view
+from warp_splat.launch import available_memory, empty, even_slices, get_threads, launch, view
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
+MANY = 10**7  # instances from which on their memory is asked for
+BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the lanes count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 
@@ -61,12 +63,12 @@ def bin_by_counting(
     support = [options.alpha_min, int(options.extent == "square")]
     launch(tiles.pack, drawn, [order, *tensors, camera.height, *support], [splats, row_ends])
     rows = _scan(row_ends)
-    _check_count(rows, camera, drawn)
+    _check_count(rows, camera, drawn, radii.device)
     spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
     size = [camera.width, camera.height, tiles_x]
     launch(tiles.find_spans, drawn, [splats, row_ends, *size, *support], [spans, slot_ends])
     count = _scan(slot_ends)
-    _check_count(count, camera, drawn)
+    _check_count(count, camera, drawn, radii.device)
     instances, ends = _sort_by_tile(spans, row_ends, slot_ends, count, tiles_x * tiles_y)
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     return Bins(order, splats, slot_ends, instances, ranges, balanced_slices(ends), tiles_x, invalid)
@@ -95,7 +97,7 @@ def bin_by_sorting(
     list_tiles(counts[:0], *torch.empty(2, 0, dtype=torch.int32, device=device))
     slot_ends = torch.cumsum(counts, 0)
     count = int(slot_ends[-1]) if total else 0
-    _check_count(count, camera, total)
+    _check_count(count, camera, total, device)
     listed, ranks = torch.empty(2, count, dtype=torch.int32, device=device)
     list_tiles(slot_ends, listed, ranks)
     # the fewer bits, the fewer passes of the sort
@@ -165,11 +167,16 @@ def _scan(counts: wp.array) -> int:
     return int(counts.numpy()[-1])
 
 
-def _check_count(count: int, camera: Camera, drawn: int) -> None:
+def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:
+    touch = f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times"
     if count > MAX_INSTANCES:
         raise InputError(
-            f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times, more "
-            f"than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
+            f"{touch}, more than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
+        )
+    if count > MANY and BYTES * count > (available := available_memory(device)):
+        raise InputError(
+            f"{touch}, which takes {BYTES * count / 2**30:.1f} GiB, but only {available / 2**30:.1f} GiB are free; "
+            "render a smaller image or fewer, smaller Gaussians."
         )
 
 

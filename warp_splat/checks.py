@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numbers
+from dataclasses import replace
+
 import torch
 
 from warp_splat.camera import Camera
@@ -10,7 +13,7 @@ from warp_splat.errors import InputError
 
 
 def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -> RasterOptions:
-    """The options to use. Raises InputError for an unknown adjoint, option or camera."""
+    """The options to use, numbers as Python's. Raises InputError for an unknown adjoint, option or camera."""
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
     if adjoint not in ADJOINTS:
@@ -24,13 +27,24 @@ def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -
         if getattr(options, name) not in choices:
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
+    for name in ("depth", "antialiasing"):
+        if not isinstance(getattr(options, name), bool):
+            raise InputError(f"options.{name}: expected True or False, got {getattr(options, name)!r}.")
     for name in ("alpha_min", "t_min"):
         value = getattr(options, name)
-        if not (isinstance(value, (int, float)) and 0 <= value < 1):
+        if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < 1.0):
             raise InputError(f"options.{name}: expected a number from 0 to below 1, got {value!r}.")
-    if options.max_steps is not None and not (isinstance(options.max_steps, int) and options.max_steps >= 0):
-        raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {options.max_steps!r}.")
-    return options
+    steps = options.max_steps
+    if steps is not None and not (isinstance(steps, numbers.Integral) and int(steps) >= 0):
+        raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {steps!r}.")
+    return replace(
+        options,
+        sh_degree=None if options.sh_degree is None else int(options.sh_degree),
+        exp_degree=None if options.exp_degree is None else int(options.exp_degree),
+        alpha_min=float(options.alpha_min),
+        t_min=float(options.t_min),
+        max_steps=None if steps is None else int(steps),
+    )
 
 
 def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, ...]:
@@ -126,6 +140,6 @@ def explain_invalid(invalid: int, quats: torch.Tensor) -> None:
     too_large = invalid - int((quats == 0).all(1).sum())
     if too_large > 0:
         raise InputError(
-            f"scales: {too_large} Gaussians are too large on this image for float32 (over about 4e9 px); "
-            "remove them or move the camera away."
+            f"scales, sh: {too_large} Gaussians are too large on this image for float32 (over about 4e9 px), or their "
+            "color overflows; remove them, move the camera away, or scale the coefficients down."
         )

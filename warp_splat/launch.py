@@ -28,6 +28,7 @@ from warp_splat.devices import choose_device
 from warp_splat.errors import InputError
 
 BLOCK = 256  # threads of a block: one per pixel of a tile
+MOST_THREADS = 1024
 SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
@@ -51,14 +52,14 @@ def get_threads() -> int:
 
 
 def set_threads(count: int) -> None:
-    """Use ``count`` threads (at least 1) for CPU launches. Results do not depend on it.
+    """Use ``count`` threads (1 to 1024) for CPU launches. Results do not depend on it.
 
     Raises:
-        InputError: if ``count`` is below 1.
+        InputError: if ``count`` is out of that range.
     """
     global _threads, _pool
-    if count < 1:
-        raise InputError(f"threads: expected at least 1, got {count}.")
+    if not 1 <= count <= MOST_THREADS:
+        raise InputError(f"threads: expected 1 to {MOST_THREADS}, got {count}.")
     if count != _threads:
         if _pool is not None:
             _pool.shutdown()
@@ -147,13 +148,14 @@ def launch(
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, stream=_stream(device), **adjoint)
         return
     bounds = bounds or even_slices(dim)
-    slices = iter([(low, high) for low, high in itertools.pairwise(bounds) if high > low])
+    full = [(low, high) for low, high in itertools.pairwise(bounds) if high > low]
+    slices = iter(full)
 
     def work():
         for low, high in slices:  # shared by the threads: whoever is free takes the next one
             wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
 
-    helpers = min(_threads, len(bounds) - 1) - 1
+    helpers = min(_threads, len(full)) - 1
     if helpers <= 0:
         work()
         return

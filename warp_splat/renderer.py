@@ -49,7 +49,7 @@ class RenderOutput:
     alpha: torch.Tensor  # [H, W], 1 - transmittance
     depth: torch.Tensor | None  # [H, W] world units, expected z (0 where alpha is 0), if asked for
     means2d: torch.Tensor  # [N, 2] px; 0 if culled
-    radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= 1/255; 0 if culled
+    radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
     conics: torch.Tensor  # [N, 3] 1/px^2, (xx, xy, yy) of the inverse 2D covariance; 0 if culled, as all that follow
     colors: torch.Tensor  # [N, 3]
     depths: torch.Tensor  # [N] world units, z in the camera
