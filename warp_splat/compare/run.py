@@ -27,7 +27,9 @@ def compare(config: CompareConfig) -> int:
     unknown = [mode for mode in config.modes if mode not in ADJOINTS]
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
-    launch.prepare(config.device, config.threads)
+    if config.device == "cuda":
+        raise InputError("--device cuda: the comparison measures the CPU's kernels only; use --device cpu.")
+    launch.prepare("cpu", config.threads)
     out, log = Path(config.out), []
 
     def say(text: str = "") -> None:
