@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_splat import Camera, InputError, RasterOptions, binning, set_threads
+from warp_splat import Camera, InputError, RasterOptions, binning, renderer, set_threads
 from warp_splat.launch import get_threads
 from warp_splat.renderer import Dropped, Project, camera_view
 
@@ -104,6 +104,23 @@ def test_sorting_breaks_ties_by_index_and_leaves_out_what_is_invalid():
     counted, by_sorting = counted_and_sorted(camera, projected)
     assert torch.equal(by_sorting.instances, counted.instances) and torch.equal(by_sorting.ranges, counted.ranges)
     assert int(by_sorting.invalid) == counted.invalid == 1
+
+
+def test_images_and_gradients_are_the_same_from_sorted_lists(monkeypatch):
+    """A GPU ranks the Gaussians that are not drawn, too."""
+    generator, results = torch.Generator().manual_seed(5), []
+    means = torch.randn(400, 3, generator=generator) * 1.5 + torch.tensor([0.0, 0.0, 3.0])
+    scales = torch.exp(torch.randn(400, 3, generator=generator) - 3.0)
+    tensors = (means, torch.randn(400, 4, generator=generator), scales, torch.rand(400, generator=generator))
+    sh = torch.randn(400, 4, 3, generator=generator)
+    camera = Camera(*SIZE, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
+    for bin_on in (binning.bin_by_counting, binning.bin_by_sorting):
+        monkeypatch.setattr(renderer, "bin_tiles", bin_on)
+        leaves = [tensor.clone().requires_grad_() for tensor in (*tensors, sh)]
+        out = renderer.rasterize(*leaves, camera)
+        assert 0 < (out.radii > 0).sum() < 400
+        results.append([out.image, *torch.autograd.grad(out.image.square().sum(), leaves)])
+    assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
 
 
 def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):

@@ -1,4 +1,4 @@
-"""Which device is chosen, why a GPU is refused, and a self-test that finds a device that computes nothing or wrongly."""
+"""Which device is chosen, why a GPU is refused, and a self-test that finds one that computes nothing, or wrongly."""
 
 import pytest
 import torch

@@ -216,7 +216,7 @@ def test_extent_of_the_reference(device):
 def test_loop_cap(device):
     """Entries of the tile's list beyond ``max_steps`` are as if they were not there."""
     scene = SCENES["layers_4000"]().to(device)
-    depths = torch.tensor(scene.camera.rotation[2], dtype=torch.float32) @ scene.means.T
+    depths = torch.tensor(scene.camera.rotation[2], dtype=torch.float32, device=device) @ scene.means.T
     nearest = depths.argsort()[:100]
     few = {name: getattr(scene, name)[nearest] for name in PARAMETERS}
     leaves = leaves_of(scene)

@@ -154,7 +154,7 @@ def train_all(scene: Scene, name: str, variants: Mapping, seeded: Sequence[str],
 
 def make_trainer(scene: Scene, schedule: Mapping, seed: int, max_steps: int | None = None, **options) -> Trainer:
     """A trainer that has done nothing yet; ``max_steps`` caps the loop in training and in rendering."""
-    trainer = Trainer(scene, TrainConfig(**schedule, seed=seed, **options))
+    trainer = Trainer(scene, TrainConfig(**schedule, device="cpu", seed=seed, **options))
     trainer.options = replace(trainer.options, max_steps=max_steps)
     return trainer
 
