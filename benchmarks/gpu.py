@@ -4,8 +4,8 @@
     python benchmarks/gpu.py --expected cpu.npz [--out docs/benchmarks]
     python benchmarks/gpu.py --device cpu                # a dry run of this program at small sizes
 
-Checks: CUDA agrees with the CPU (image 1e-4, gradients 1e-4 relative; a Warp made for a GPU machine may have no CPU
-kernels, hence the file), two runs give the same bits, a small case is clean under compute-sanitizer, where there is one.
+Checks: CUDA agrees with the CPU (image 1e-4, gradients 1e-4 relative; a Warp built for a GPU machine may have no CPU
+kernels, hence the file), two runs give the same bits, a small case is clean under compute-sanitizer, if there is one.
 Measures, by events and medians: forward, forward with the loop cap, forward and backward, and peak memory, for every
 adjoint at 100k, 1M and 5M Gaussians.
 """

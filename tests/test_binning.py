@@ -4,21 +4,22 @@ import numpy as np
 import pytest
 import torch
 
-from warp_splat import Camera, InputError, RasterOptions, binning, set_threads
+from warp_splat import Camera, InputError, RasterOptions, binning, renderer, set_threads
 from warp_splat.launch import get_threads
 from warp_splat.renderer import Dropped, Project, camera_view
 
 SIZE = (70, 53)
+PLAIN = RasterOptions()
 
 
-def project(count=300, seed=0):
-    """Random Gaussians, needles among them, as the renderer projects them."""
+def project(count=300, seed=0, size=SIZE, stretch=1.0, options=PLAIN):
+    """Random Gaussians, needles among them (the more, the larger ``stretch``), as the renderer projects them."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.randn(count, 3, generator=generator) * 1.5 + torch.tensor([0.0, 0.0, 4.0])
-    scales = torch.exp(torch.randn(count, 3, generator=generator) - 3.0)
+    scales = torch.exp(stretch * torch.randn(count, 3, generator=generator) - 3.0)
     quats, opacities = torch.randn(count, 4, generator=generator), torch.rand(count, generator=generator)
-    camera = Camera(*SIZE, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
-    view = camera_view(camera, 0, RasterOptions())
+    camera = Camera(*size, 60.0, 55.0, 0.43 * size[0], 0.51 * size[1], np.eye(3), np.zeros(3))
+    view = camera_view(camera, 0, options)
     tensors = (means, quats, scales, opacities, torch.zeros(count, 1, 3), torch.zeros(count, 0, 3))
     return camera, Project.apply(*tensors, view, Dropped())
 
@@ -72,11 +73,63 @@ def test_the_number_of_threads_changes_nothing():
         assert torch.equal(other.instances, results[0].instances) and torch.equal(other.ranges, results[0].ranges)
 
 
+def counted_and_sorted(camera, projected, options=PLAIN):
+    return [bin_on(*projected, camera, options) for bin_on in (binning.bin_by_counting, binning.bin_by_sorting)]
+
+
+@pytest.mark.parametrize("options", [PLAIN, RasterOptions(extent="square"), RasterOptions(alpha_min=0.0)], ids=str)
+@pytest.mark.parametrize("size", [SIZE, (1, 1), (1, 2000), (2000, 1), (3000, 2900)], ids=str)
+@pytest.mark.parametrize(("count", "stretch"), [(300, 1.0), (5000, 1.0), (300, 3.0), (1, 1.0), (0, 1.0)])
+def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, options):
+    """What a GPU does, on the CPU: the same instances, slots and ranges, bit for bit."""
+    camera, projected = project(count, 4, size, stretch, options)
+    counted, by_sorting = counted_and_sorted(camera, projected, options)
+    drawn = len(counted.order)
+    assert torch.equal(by_sorting.instances, counted.instances) and torch.equal(by_sorting.ranges, counted.ranges)
+    assert by_sorting.instances.dtype == by_sorting.ranges.dtype == torch.int32
+    for name in ("order", "splats", "slot_ends"):
+        first, second = getattr(counted, name).numpy(), getattr(by_sorting, name).numpy()
+        assert first.tobytes() == second[:drawn].tobytes(), name
+        assert len(second) == count
+    assert (by_sorting.slot_ends.numpy()[drawn:] == len(counted.instances)).all()
+    assert int(by_sorting.invalid) == counted.invalid
+
+
+def test_sorting_breaks_ties_by_index_and_leaves_out_what_is_invalid():
+    camera, projected = project(400)
+    *_, depths, _, radii = projected
+    with torch.no_grad():
+        depths[:] = (4.0 * depths).round() / 4.0
+        radii[7] = -1
+    counted, by_sorting = counted_and_sorted(camera, projected)
+    assert torch.equal(by_sorting.instances, counted.instances) and torch.equal(by_sorting.ranges, counted.ranges)
+    assert int(by_sorting.invalid) == counted.invalid == 1
+
+
+def test_images_and_gradients_are_the_same_from_sorted_lists(monkeypatch):
+    """A GPU ranks the Gaussians that are not drawn, too."""
+    generator, results = torch.Generator().manual_seed(5), []
+    means = torch.randn(400, 3, generator=generator) * 1.5 + torch.tensor([0.0, 0.0, 3.0])
+    scales = torch.exp(torch.randn(400, 3, generator=generator) - 3.0)
+    tensors = (means, torch.randn(400, 4, generator=generator), scales, torch.rand(400, generator=generator))
+    sh = torch.randn(400, 4, 3, generator=generator)
+    camera = Camera(*SIZE, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
+    for bin_on in (binning.bin_by_counting, binning.bin_by_sorting):
+        monkeypatch.setattr(renderer, "bin_tiles", bin_on)
+        leaves = [tensor.clone().requires_grad_() for tensor in (*tensors, sh)]
+        out = renderer.rasterize(*leaves, camera)
+        assert 0 < (out.radii > 0).sum() < 400
+        results.append([out.image, *torch.autograd.grad(out.image.square().sum(), leaves)])
+    assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
+
+
 def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
     camera, projected = project()
     monkeypatch.setattr(binning, "MAX_INSTANCES", 100)
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
         binning.bin_tiles(*projected, camera, RasterOptions())
+    with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
+        binning.bin_by_sorting(*projected, camera, RasterOptions())
     counts = binning.wp.array(np.full(3, 2**30, np.int64), dtype=binning.wp.int64, device="cpu")
     assert binning._scan(counts) == 3 * 2**30  # a 32-bit scan would have wrapped
 

@@ -135,7 +135,7 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
 
 
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
-    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda: 2**10)
+    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda device: 2**10)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     measured = adjoints.measure([workload()], ["stored"], lambda _: None)
     row = next(item for item in measured if item.variant == "stored")

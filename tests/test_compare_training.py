@@ -85,7 +85,7 @@ def test_cap_of_one_entry_costs_quality(scene):
 
 
 def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda: 0)
+    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda device: 0)
     said = []
     results = training.run(tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append)
     assert {record["scene"] for record in results["summary"]} == {"embedded", "other"}

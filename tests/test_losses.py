@@ -5,7 +5,7 @@ import torch
 
 from warp_splat import InputError, set_threads
 from warp_splat.launch import get_threads
-from warp_splat.losses import image_loss
+from warp_splat.losses import image_loss, loss_by_convolution
 
 
 def oracle(x, y, share):
@@ -34,6 +34,38 @@ def test_value_and_gradient(size, share):
     expected.backward()
     assert abs(loss.item() - expected.item()) < 1e-6
     assert (image.grad - exact.grad).norm() < 1e-5 * exact.grad.norm()
+
+
+def both(image, target, share=0.2):
+    """Value and gradient by the kernels and by torch's convolutions, as on a GPU."""
+    found = []
+    for loss_of in (image_loss, loss_by_convolution):
+        leaf = image.clone().requires_grad_()
+        loss = loss_of(leaf, target, share)
+        loss.backward()
+        found.append((loss.item(), leaf.grad))
+    return found
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (7, 3), (33, 50), (100, 67)])
+@pytest.mark.parametrize("kind", ["floats", "bytes", "far apart"])
+def test_convolutions_agree_with_the_kernels(kind, size, share):
+    generator = torch.Generator().manual_seed(sum(size))
+    image, target = torch.rand(2, *size, 3, generator=generator)
+    if kind == "bytes":
+        target = (255 * target).to(torch.uint8)
+    if kind == "far apart":
+        image = image + 20.0
+    (loss, gradient), (found, found_gradient) = both(image, target, share)
+    assert abs(found - loss) < 1e-6 * max(1.0, abs(loss))
+    assert (found_gradient - gradient).norm() < 1e-5 * gradient.norm()
+
+
+def test_convolutions_find_equal_images_equal():
+    image = torch.rand(24, 35, 3, generator=torch.Generator().manual_seed(1))
+    for loss, gradient in both(image, image):
+        assert abs(loss) < 1e-6 and gradient.abs().max() < 1e-6 / 24
 
 
 def test_bytes_are_divided_by_255():

@@ -196,7 +196,7 @@ def test_modes_share_the_image_and_agree_on_the_gradients(name, adjoint, device)
 
 
 def test_stored_refuses_what_does_not_fit(device, monkeypatch):
-    monkeypatch.setattr(adjoints, "available_memory", lambda: 2**20)
+    monkeypatch.setattr(adjoints, "available_memory", lambda device: 2**20)
     scene = SCENES["dense_tile"]().to(device)
     with pytest.raises(InputError, match=r"'stored': the transmittances of \d+ tile instances take .* GiB"):
         rasterize(scene, leaves_of(scene), adjoint="stored")
@@ -216,7 +216,7 @@ def test_extent_of_the_reference(device):
 def test_loop_cap(device):
     """Entries of the tile's list beyond ``max_steps`` are as if they were not there."""
     scene = SCENES["layers_4000"]().to(device)
-    depths = torch.tensor(scene.camera.rotation[2], dtype=torch.float32) @ scene.means.T
+    depths = torch.tensor(scene.camera.rotation[2], dtype=torch.float32, device=device) @ scene.means.T
     nearest = depths.argsort()[:100]
     few = {name: getattr(scene, name)[nearest] for name in PARAMETERS}
     leaves = leaves_of(scene)

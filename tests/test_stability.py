@@ -79,8 +79,8 @@ def test_a_wrong_gradient_fails(monkeypatch):
 @pytest.mark.parametrize("name", ["invalid", "dropped"])
 def test_a_wrong_count_fails(monkeypatch, name):
     def change(out):
-        out.invalid += name == "invalid"
-        out.dropped.gaussians += name == "dropped"
+        out.invalid_count += name == "invalid"
+        out.dropped.gaussian_count += name == "dropped"
 
     failures = broken(monkeypatch, change).failures
     assert len(failures) == 1 and name in failures[0]

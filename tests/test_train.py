@@ -1,5 +1,6 @@
 """Whole runs from the command line, on the embedded scene made small: what they write, repeat, and survive."""
 
+import importlib
 import json
 import os
 import signal
@@ -176,7 +177,7 @@ def test_help_answers_without_torch_or_warp():
     ("options", "words"),
     [
         (("--iterations", "0"), ("--iterations", "at least 1", "0")),
-        (("--device", "cuda"), ("--device cuda", "CPU")),
+        (("--device", "cpu", "--data_device", "cuda"), ("--data_device cuda", "GPU")),
         (("--start_checkpoint", "x.pth"), ("--start_checkpoint", "not")),
         (("--iteratons", "5"), ("--iteratons", "--iterations")),
         (("--lambda_dssim", "2"), ("--lambda_dssim", "0 to 1")),
@@ -246,20 +247,50 @@ def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, 
     assert "preview.png" in errors and "point_cloud" in errors and "Traceback" not in errors
 
 
+def fail_at(monkeypatch, target, call, error):
+    """Let a function raise ``error`` when it is called for the ``call``-th time."""
+    module, name = target.rsplit(".", 1)
+    function, calls = getattr(importlib.import_module(module), name), []
+
+    def failing(*arguments):
+        calls.append(0)
+        if len(calls) == call:
+            raise error
+        return function(*arguments)
+
+    monkeypatch.setattr(target, failing)
+
+
 def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
-    from warp_splat.trainer import Trainer  # noqa: PLC0415
-
-    differentiate = Trainer.differentiate
-
-    def failing(self, iteration):
-        if iteration == 10:
-            raise MemoryError("planted")
-        return differentiate(self, iteration)
-
-    monkeypatch.setattr(Trainer, "differentiate", failing)
-    with pytest.raises(MemoryError):
+    fail_at(monkeypatch, "warp_splat.trainer.image_loss", 11, RuntimeError("planted"))  # the first call warms up
+    with pytest.raises(RuntimeError, match="planted"):
         train(tmp_path)
     assert len(load_ply(ply_path(tmp_path, 9)).means) == 4500
+
+
+@pytest.mark.parametrize(
+    ("target", "error", "where"),
+    [
+        ("warp_splat.renderer.bin_tiles", MemoryError(), "in stage 'bin'"),
+        ("warp_splat.renderer.bin_tiles", RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), "'bin'"),
+        ("warp_splat.renderer.adjoint_of_lanes", torch.OutOfMemoryError("CUDA out of memory."), "'adjoint of blend'"),
+        (
+            "warp_splat.trainer.image_loss",
+            RuntimeError("[enforce fail] . not enough memory: you"),
+            "between two stages",
+        ),
+    ],
+)
+def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
+    target, error, where, tmp_path, monkeypatch, capsys
+):
+    fail_at(monkeypatch, target, 6, error)  # of steps one to three there is an evaluation of seven views
+    assert train(tmp_path) == 1
+    text = capsys.readouterr()
+    (saved,) = tmp_path.glob("point_cloud/*/point_cloud.ply")
+    assert len(load_ply(saved).means) == 4500 and str(saved) in text.out
+    assert where in text.err and "4500 Gaussians on" in text.err and "Traceback" not in text.err
+    assert "--max_gaussians" in text.err and "-r" in text.err
 
 
 def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkeypatch, capsys):

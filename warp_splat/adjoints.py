@@ -37,13 +37,13 @@ def memory_for_states(bins: Bins) -> torch.Tensor:
         InputError: if that does not fit.
     """
     count = len(bins.instances)
-    needed, available = 4 * BLOCKS * LANES * count, available_memory()
+    needed, available = 4 * BLOCKS * LANES * count, available_memory(bins.instances.device)
     if needed > 0.8 * available:
         raise InputError(
             f"adjoint 'stored': the transmittances of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
             f"{available / 2**30:.1f} GiB are free; use 'reversible', which needs none, or a smaller image."
         )
-    return torch.empty(count, BLOCKS, LANES)
+    return torch.empty(count, BLOCKS, LANES, device=bins.instances.device)
 
 
 def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list[torch.Tensor], steps, slots) -> None:

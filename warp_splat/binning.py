@@ -13,31 +13,45 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.blend import Splat2D
-from warp_splat.launch import even_slices, get_threads, launch, view
+from warp_splat.launch import available_memory, empty, even_slices, get_threads, launch, view
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
+MANY = 10**7  # instances from which on their memory is asked for
+BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the lanes count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 
 
 @dataclass
 class Bins:
-    """Tile lists: V Gaussians drawn, M tile instances, T tiles."""
+    """Tile lists: V Gaussians drawn (on a GPU: all, those not drawn behind), M tile instances, T tiles."""
 
     order: wp.array  # [V] Gaussian, nearest first
     splats: wp.array  # [V] Splat2D
     slot_ends: wp.array  # [V] int64, inclusive scan of a Gaussian's instances
     instances: torch.Tensor  # [M, 2] int32 (rank, slot), by tile, nearest first
     ranges: torch.Tensor  # [T, 2] int32, first and last instance
-    slices: list[int]  # bounds of slices of tiles with about equal work
+    slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU
     tiles_x: int
-    invalid: int
+    invalid: int | torch.Tensor
 
 
 def bin_tiles(
     means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
 ) -> Bins:
-    """Sort the drawn Gaussians by depth (ties by index) and list those of each tile."""
+    """Sort the drawn Gaussians by depth (ties by index) and list those of each tile.
+
+    Raises:
+        InputError: if the tile instances are more than the kernels can number.
+    """
+    bin_on = bin_by_sorting if means2d.is_cuda else bin_by_counting
+    return bin_on(means2d, conics, opacities, colors, depths, extents, radii, camera, options)
+
+
+def bin_by_counting(
+    means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
+) -> Bins:
+    """:func:`bin_tiles` for the CPU: a counting sort by tile, a band of Gaussians per thread."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     invalid = int(np.count_nonzero(radii.numpy() < 0))
     order = sort_by_depth(depths, radii)
@@ -49,15 +63,51 @@ def bin_tiles(
     support = [options.alpha_min, int(options.extent == "square")]
     launch(tiles.pack, drawn, [order, *tensors, camera.height, *support], [splats, row_ends])
     rows = _scan(row_ends)
-    _check_count(rows, camera, drawn)
+    _check_count(rows, camera, drawn, radii.device)
     spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
     size = [camera.width, camera.height, tiles_x]
     launch(tiles.find_spans, drawn, [splats, row_ends, *size, *support], [spans, slot_ends])
     count = _scan(slot_ends)
-    _check_count(count, camera, drawn)
+    _check_count(count, camera, drawn, radii.device)
     instances, ends = _sort_by_tile(spans, row_ends, slot_ends, count, tiles_x * tiles_y)
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     return Bins(order, splats, slot_ends, instances, ranges, balanced_slices(ends), tiles_x, invalid)
+
+
+def bin_by_sorting(
+    means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
+) -> Bins:
+    """:func:`bin_tiles` for a GPU: the host waits for the number of tile instances, and for nothing else."""
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    device, total = radii.device, len(radii)
+    keys = torch.where(radii > 0, depths.detach(), torch.inf)
+    order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
+    splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
+    tensors = views2d((means2d, conics, opacities, colors, depths, extents))
+    support = [options.alpha_min, int(options.extent == "square")]
+    launch(
+        tiles.pack, total, [order, *tensors, camera.height, *support], [splats, view(counts, wp.int64)], device=device
+    )
+    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, *support]
+
+    def list_tiles(slot_ends: torch.Tensor, *lists: torch.Tensor) -> None:
+        outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]
+        launch(tiles.list_tiles, total, [*inputs, view(slot_ends, wp.int64)], outputs, device=device)
+
+    list_tiles(counts[:0], *torch.empty(2, 0, dtype=torch.int32, device=device))
+    slot_ends = torch.cumsum(counts, 0)
+    count = int(slot_ends[-1]) if total else 0
+    _check_count(count, camera, total, device)
+    listed, ranks = torch.empty(2, count, dtype=torch.int32, device=device)
+    list_tiles(slot_ends, listed, ranks)
+    # the fewer bits, the fewer passes of the sort
+    narrow = torch.int16 if tiles_x * tiles_y < 2**15 else torch.int32
+    listed, slots = torch.sort(listed.to(narrow), stable=True)
+    instances = torch.stack([ranks[slots], slots.int()], 1)
+    bounds = torch.searchsorted(listed, torch.arange(tiles_x * tiles_y + 1, dtype=narrow, device=device)).int()
+    ranges = torch.stack([bounds[:-1], bounds[1:]], 1)
+    invalid = torch.count_nonzero(radii < 0)
+    return Bins(order, splats, wp.from_torch(slot_ends), instances, ranges, [], tiles_x, invalid)
 
 
 def _sort_by_tile(
@@ -117,11 +167,16 @@ def _scan(counts: wp.array) -> int:
     return int(counts.numpy()[-1])
 
 
-def _check_count(count: int, camera: Camera, drawn: int) -> None:
+def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:
+    touch = f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times"
     if count > MAX_INSTANCES:
         raise InputError(
-            f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times, more "
-            f"than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
+            f"{touch}, more than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
+        )
+    if count > MANY and BYTES * count > (available := available_memory(device)):
+        raise InputError(
+            f"{touch}, which takes {BYTES * count / 2**30:.1f} GiB, but only {available / 2**30:.1f} GiB are free; "
+            "render a smaller image or fewer, smaller Gaussians."
         )
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numbers
+from dataclasses import replace
+
 import torch
 
 from warp_splat.camera import Camera
@@ -10,7 +13,7 @@ from warp_splat.errors import InputError
 
 
 def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -> RasterOptions:
-    """The options to use. Raises InputError for an unknown adjoint, option or camera."""
+    """The options to use, numbers as Python's. Raises InputError for an unknown adjoint, option or camera."""
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
     if adjoint not in ADJOINTS:
@@ -24,13 +27,24 @@ def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -
         if getattr(options, name) not in choices:
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
+    for name in ("depth", "antialiasing"):
+        if not isinstance(getattr(options, name), bool):
+            raise InputError(f"options.{name}: expected True or False, got {getattr(options, name)!r}.")
     for name in ("alpha_min", "t_min"):
         value = getattr(options, name)
-        if not (isinstance(value, (int, float)) and 0 <= value < 1):
+        if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < 1.0):
             raise InputError(f"options.{name}: expected a number from 0 to below 1, got {value!r}.")
-    if options.max_steps is not None and not (isinstance(options.max_steps, int) and options.max_steps >= 0):
-        raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {options.max_steps!r}.")
-    return options
+    steps = options.max_steps
+    if steps is not None and not (isinstance(steps, numbers.Integral) and int(steps) >= 0):
+        raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {steps!r}.")
+    return replace(
+        options,
+        sh_degree=None if options.sh_degree is None else int(options.sh_degree),
+        exp_degree=None if options.exp_degree is None else int(options.exp_degree),
+        alpha_min=float(options.alpha_min),
+        t_min=float(options.t_min),
+        max_steps=None if steps is None else int(steps),
+    )
 
 
 def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, ...]:
@@ -39,17 +53,17 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     Raises:
         InputError: naming the first argument whose type, shape, dtype, device or range is not as it should be.
     """
-    _check_tensor("means", means, (None, 3))
-    count = means.shape[0]
-    _check_tensor("quats", quats, (count, 4))
-    _check_tensor("scales", scales, (count, 3))
-    _check_tensor("opacities", opacities, (count,))
+    _check_tensor("means", means, (None, 3), None)
+    count, device = means.shape[0], means.device
+    _check_tensor("quats", quats, (count, 4), device)
+    _check_tensor("scales", scales, (count, 3), device)
+    _check_tensor("opacities", opacities, (count,), device)
     if isinstance(sh, (tuple, list)) and len(sh) == 2:
         sh_dc, sh_rest = sh
-        _check_tensor("sh[0]", sh_dc, (count, 1, 3))
-        _check_tensor("sh[1]", sh_rest, (count, None, 3))
+        _check_tensor("sh[0]", sh_dc, (count, 1, 3), device)
+        _check_tensor("sh[1]", sh_rest, (count, None, 3), device)
     else:
-        _check_tensor("sh", sh, (count, None, 3))
+        _check_tensor("sh", sh, (count, None, 3), device)
         sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
     if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
         raise InputError(
@@ -64,7 +78,7 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     return tuple(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest))
 
 
-def _check_tensor(name: str, tensor, shape: tuple[int | None, ...]) -> None:
+def _check_tensor(name: str, tensor, shape: tuple[int | None, ...], device: torch.device | None) -> None:
     wanted = "[" + ", ".join("N" if size is None else str(size) for size in shape) + "]"
     if not isinstance(tensor, torch.Tensor):
         raise InputError(f"{name}: expected a float32 torch tensor {wanted}, got {type(tensor).__name__}.")
@@ -75,8 +89,29 @@ def _check_tensor(name: str, tensor, shape: tuple[int | None, ...]) -> None:
         raise InputError(
             f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float()."
         )
-    if tensor.device.type != "cpu":
-        raise InputError(f"{name}: expected a tensor on the CPU, got one on {tensor.device}; move it with .cpu().")
+    if tensor.device.type not in ("cpu", "cuda"):
+        raise InputError(
+            f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
+        )
+    if device is not None and tensor.device != device:
+        raise InputError(f"{name}: expected a tensor on {device}, as the means, got one on {tensor.device}.")
+
+
+def check_background(background, device: torch.device) -> torch.Tensor:
+    """The background as a tensor [3] on ``device``. Raises InputError if it is not three finite numbers there."""
+    if not isinstance(background, torch.Tensor):
+        try:
+            background = torch.tensor([float(value) for value in background], device=device)
+        except (TypeError, ValueError):
+            raise InputError(f"background: expected three numbers or a tensor [3], got {background!r}.") from None
+    if background.device != device:
+        raise InputError(f"background: expected a tensor on {device}, as the means, got one on {background.device}.")
+    if background.shape != (3,) or background.dtype != torch.float32 or not bool(torch.isfinite(background).all()):
+        raise InputError(
+            f"background: expected three finite numbers (a tensor: float32 [3]), got {background.dtype} "
+            f"{list(background.shape)}: {background.tolist()}."
+        )
+    return background
 
 
 def check_range(name: str, tensor: torch.Tensor, outside: bool, wanted: str) -> None:
@@ -105,6 +140,6 @@ def explain_invalid(invalid: int, quats: torch.Tensor) -> None:
     too_large = invalid - int((quats == 0).all(1).sum())
     if too_large > 0:
         raise InputError(
-            f"scales: {too_large} Gaussians are too large on this image for float32 (over about 4e9 px); "
-            "remove them or move the camera away."
+            f"scales, sh: {too_large} Gaussians are too large on this image for float32 (over about 4e9 px), or their "
+            "color overflows; remove them, move the camera away, or scale the coefficients down."
         )

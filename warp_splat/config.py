@@ -72,6 +72,7 @@ class TrainConfig:
     white_background: bool = flag(False, "composite on white instead of black", "-w")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    data_device: str = flag("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
     seed: int = flag(0, "seed of everything random")
     quiet: bool = flag(False, "print only the summary")
@@ -172,7 +173,6 @@ FOREIGN_FLAGS = {
     "--exposure_lr_delay_steps": "exposure compensation is not supported",
     "--exposure_lr_delay_mult": "exposure compensation is not supported",
     "--position_lr_delay_mult": "the delay of the means' rate has no effect in the reference and is left out",
-    "--data_device": "images stay in host memory",
     "--convert_SHs_python": "colors are always computed by the kernels",
     "--compute_cov3D_python": "covariances are always computed by the kernels",
     "--ip": "there is no network viewer",

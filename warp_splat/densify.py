@@ -36,9 +36,10 @@ class Densifier:
         self._clear()
 
     def _clear(self) -> None:
-        self.gradient = torch.zeros(len(self.model))  # sum over views of |dL/dmean2d|, NDC units
-        self.views = torch.zeros(len(self.model))  # in which the Gaussian was drawn
-        self.radius = torch.zeros(len(self.model), dtype=torch.int32)  # px, largest in any view
+        new = self.model.parameters["means"].new_zeros
+        self.gradient = new(len(self.model))  # sum over views of |dL/dmean2d|, NDC units
+        self.views = new(len(self.model))  # in which the Gaussian was drawn
+        self.radius = new(len(self.model), dtype=torch.int32)  # px, largest in any view
 
     def observe(self, out: RenderOutput, width: int, height: int) -> None:
         """Take in the gradient of one view's 2D means."""
@@ -96,7 +97,8 @@ class Densifier:
         """Two samples of each Gaussian in ``split``, smaller than it."""
         twice = split.repeat(2)
         rows = {name: tensor[twice] for name, tensor in raw.items()}
-        offsets = torch.exp(rows["scales"]) * torch.randn(len(twice), 3, generator=self.random)
+        sample = torch.randn(len(twice), 3, generator=self.random)  # on the host: one seed, one result on any device
+        offsets = torch.exp(rows["scales"]) * sample.to(rows["scales"].device)
         rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
         rows["scales"] = rows["scales"] - float(torch.tensor(SPLIT_SHRINK).log())
         return rows

@@ -90,7 +90,7 @@ class MovableScene:
         with torch.no_grad():
             self.extents, self.radii = Project.apply(*_gaussians(self.inputs), view, Dropped())[5:]
         self.generator = torch.Generator().manual_seed(seed)
-        self.weights = torch.randn(self.picture.shape, generator=self.generator)
+        self.weights = torch.randn(self.picture.shape, generator=self.generator).to(self.picture.device)
 
     def tensor(self, name: str) -> torch.Tensor:
         """The parameter in the graph of ``picture``."""
@@ -142,7 +142,7 @@ def _growth(scene: MovableScene, name: str, step: torch.Tensor) -> torch.Tensor:
     determinant's growth comes from det(I + covariance step): the entries of a needle's conic cancel in the determinant.
     """
     if name not in ("conics", "opacities2d"):
-        return torch.ones(1)
+        return torch.ones(1, device=step.device)
     least = max(scene.options.alpha_min, 1e-37)
     opacities = scene.out.opacities2d.double()
     reach = (2 * (opacities / least).log()).clamp_min(1e-6)
@@ -184,7 +184,7 @@ def _random_step(scene: MovableScene, name: str, share: float) -> torch.Tensor:
     Only a ``share`` of the rows moves.
     """
     value = scene.tensor(name)
-    signs = 2.0 * torch.randint(0, 2, value.shape, generator=scene.generator) - 1
+    signs = 2.0 * torch.randint(0, 2, value.shape, generator=scene.generator).to(value.device) - 1
     if name == "conics":  # root' signs root: the ellipse changes by the same share along either axis
         xx, xy, yy = value.double().unbind(1)
         a = xx.sqrt()
@@ -198,7 +198,7 @@ def _random_step(scene: MovableScene, name: str, share: float) -> torch.Tensor:
     step = wanted.sign() * torch.maximum(LEAST * wanted.abs(), 4 * place)
     step = torch.nan_to_num((value + step.float()) - value)
     if share < 1:
-        step[torch.rand(len(step), generator=scene.generator) >= share] = 0
+        step[(torch.rand(len(step), generator=scene.generator) >= share).to(step.device)] = 0
     return step
 
 

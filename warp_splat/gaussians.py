@@ -31,6 +31,15 @@ class GaussianModel:
     def __len__(self) -> int:
         return len(self.parameters["means"])
 
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters live."""
+        return self.parameters["means"].device
+
+    def to(self, device: torch.device) -> GaussianModel:
+        """A copy on ``device``."""
+        return GaussianModel({name: tensor.to(device) for name, tensor in self.parameters.items()})
+
     @classmethod
     def from_points(cls, points: np.ndarray, colors: np.ndarray, sh_degree: int) -> GaussianModel:
         """Start from points [P, 3] with colors [P, 3] uint8, as the reference does.
@@ -69,7 +78,7 @@ class GaussianModel:
 
     def save(self, path: Path, comments: tuple[str, ...] = ()) -> None:
         """Write a PLY file in the reference's layout."""
-        raw = {name: tensor.detach() for name, tensor in self.parameters.items()}
+        raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
         sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
         arrays = (tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
         save_ply(path, *arrays, comments=comments)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.checks import check_gaussians, check_options, explain_invalid
+from warp_splat.checks import check_background, check_gaussians, check_options, explain_invalid
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.differences import INPUTS, INTERMEDIATES, RUNGS, MovableScene, Trial, try_direction, try_directions
 from warp_splat.errors import InputError
-from warp_splat.renderer import as_background
 from warp_splat.report import format_table
 
 MODES = (*ADJOINTS, "generated", "plain")  # the last two, which rasterize refuses, are there to be compared
@@ -131,7 +130,7 @@ def check_gradients(
     options = _check(adjoint, options, camera, parameters, directions, tolerance)
     names = INPUTS if parameters is None else tuple(parameters)
     *geometry, sh_dc, sh_rest = check_gaussians(means, quats, scales, opacities, sh)
-    values = (*geometry, torch.cat([sh_dc, sh_rest], 1), as_background(background))
+    values = (*geometry, torch.cat([sh_dc, sh_rest], 1), check_background(background, means.device))
     scene = MovableScene(dict(zip(INPUTS, values, strict=True)), camera, options, adjoint, seed)
     if scene.out.invalid:
         explain_invalid(scene.out.invalid, quats)

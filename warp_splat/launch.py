@@ -1,13 +1,17 @@
-"""The only place that calls ``wp.launch``: threads, slices, timers, and views of torch tensors.
+"""The only place that calls ``wp.launch``: threads, slices, streams, timers, and views of torch tensors.
 
 A Warp launch on the CPU runs on the thread that makes it and releases the interpreter's lock. Every kernel here takes
 the first index of its slice, so that a pool of threads can share a launch. A kernel writes each element from one
-index only; hence the result does not depend on the slices, bit for bit.
+index only; hence the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on torch's
+current stream: kernels of Warp and of torch follow each other in the order of the calls.
+
+All memory is torch's, on either device: what a stage frees, its caching allocator gives to the next.
 """
 
 from __future__ import annotations
 
 import ctypes
+import functools
 import itertools
 import os
 import time
@@ -20,8 +24,11 @@ import psutil
 import torch
 import warp as wp
 
+from warp_splat.devices import choose_device
 from warp_splat.errors import InputError
 
+BLOCK = 256  # threads of a block: one per pixel of a tile
+MOST_THREADS = 1024
 SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
@@ -45,35 +52,42 @@ def get_threads() -> int:
 
 
 def set_threads(count: int) -> None:
-    """Use ``count`` threads (at least 1) for CPU launches. Results do not depend on it.
+    """Use ``count`` threads (1 to 1024) for CPU launches. Results do not depend on it.
 
     Raises:
-        InputError: if ``count`` is below 1.
+        InputError: if ``count`` is out of that range.
     """
     global _threads, _pool
-    if count < 1:
-        raise InputError(f"threads: expected at least 1, got {count}.")
+    if not 1 <= count <= MOST_THREADS:
+        raise InputError(f"threads: expected 1 to {MOST_THREADS}, got {count}.")
     if count != _threads:
         if _pool is not None:
             _pool.shutdown()
         _threads, _pool = count, None
 
 
-def prepare(device: str, threads: int) -> None:
-    """Set up the process for a run: device, number of threads (0: all cores), Warp's messages, torch's threads, memory.
+def prepare(device: str, threads: int) -> torch.device:
+    """Set up the process for a run: Warp's messages, torch's threads, number of threads (0: all cores), memory.
+
+    Args:
+        device: "auto", "cpu" or "cuda".
+        threads: of CPU launches.
+
+    Returns:
+        The device to work on.
 
     Raises:
-        InputError: if there is no such device here.
+        InputError: if that device cannot be used here; the message says why.
     """
-    if device == "cuda":
-        raise InputError("--device cuda: this version has kernels for the CPU only; use --device auto or cpu.")
     wp.config.log_level = wp.LOG_ERROR  # no list of devices and modules
+    chosen = choose_device(device)
     # torch: one thread. Its elementwise work here is bound by memory (Adam on 200k Gaussians: 6.7 ms against 5.7 ms
     # with two), its sums would depend on the number of threads, and its idle threads would spin beside ours
     torch.set_num_threads(1)
     if threads:
         set_threads(threads)
     _keep_freed_memory()
+    return chosen
 
 
 def _keep_freed_memory() -> None:
@@ -91,9 +105,12 @@ def _keep_freed_memory() -> None:
     mallopt(m_trim_threshold, 2**31 - 1)
 
 
-def available_memory() -> int:
-    """Bytes that can be had without swapping."""
-    return psutil.virtual_memory().available
+def available_memory(device: torch.device) -> int:
+    """Bytes that can be had on ``device``: without swapping, or with what torch holds in reserve."""
+    if device.type == "cpu":
+        return psutil.virtual_memory().available
+    reserve = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + reserve
 
 
 def even_slices(dim: int) -> list[int]:
@@ -103,9 +120,16 @@ def even_slices(dim: int) -> list[int]:
 
 
 def launch(
-    kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Sequence = (), *, bounds: list[int] | None = None, **adjoint
-):
-    """Launch ``kernel`` on ``dim`` indices, sliced over the threads.
+    kernel: wp.Kernel,
+    dim: int,
+    inputs: Sequence,
+    outputs: Sequence = (),
+    *,
+    bounds: list[int] | None = None,
+    device: torch.device | str = "cpu",
+    **adjoint,
+) -> None:
+    """Launch ``kernel`` on ``dim`` indices, sliced over the threads of the CPU, or at once on a GPU.
 
     Args:
         kernel: takes the first index of its slice before ``inputs``.
@@ -113,20 +137,25 @@ def launch(
         inputs: Warp arrays, :func:`view` results, structs or scalars.
         outputs: likewise.
         bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
+        device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
     if dim == 0:
         return
-    bounds = bounds or even_slices(dim)
-    slices = iter([(low, high) for low, high in itertools.pairwise(bounds) if high > low])
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
+    if torch.device(device).type == "cuda":
+        wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, stream=_stream(device), **adjoint)
+        return
+    bounds = bounds or even_slices(dim)
+    full = [(low, high) for low, high in itertools.pairwise(bounds) if high > low]
+    slices = iter(full)
 
     def work():
         for low, high in slices:  # shared by the threads: whoever is free takes the next one
             wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
 
-    helpers = min(_threads, len(bounds) - 1) - 1
+    helpers = min(_threads, len(full)) - 1
     if helpers <= 0:
         work()
         return
@@ -143,22 +172,67 @@ def launch(
         future.result()
 
 
+def launch_blocks(
+    kernel: wp.Kernel, blocks: int, inputs: Sequence, outputs: Sequence, device: torch.device | str, **adjoint
+) -> None:
+    """Launch ``kernel``, which uses tiles of Warp, on ``blocks`` blocks of BLOCK threads; nothing happens for 0.
+
+    With ``adj_inputs`` and ``adj_outputs``, the generated adjoint instead.
+    On the CPU that is a check of the kernels and no way to work: only ``wp.config.enable_cpu_blocks`` makes a block of
+    more than one thread there, out of slow fibers.
+    """
+    if blocks == 0:
+        return
+    where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
+    if adjoint:
+        where["adjoint"] = True
+    wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, block_dim=BLOCK, **where, **adjoint)
+
+
+def _stream(device: torch.device | str) -> wp.Stream:
+    """Torch's current stream as one of Warp's."""
+    return _wrap(torch.cuda.current_stream(device))
+
+
+@functools.cache  # one per stream in use, mostly one: wrapping costs tens of microseconds
+def _wrap(stream: torch.cuda.Stream) -> wp.Stream:
+    return wp.stream_from_torch(stream)
+
+
 def view(tensor: torch.Tensor, dtype):
     """``tensor`` as a kernel argument of element type ``dtype``, without a copy. The caller keeps the tensor alive."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
 
 
+def empty(count: int, dtype, device: torch.device | str) -> wp.array:
+    """A Warp array of ``count`` elements in memory of torch's that lives as long as the array."""
+    memory = torch.empty(count * wp.types.type_size_in_bytes(dtype), dtype=torch.uint8, device=device)
+    array = wp.array(
+        ptr=memory.data_ptr(), dtype=dtype, shape=count, device=wp.device_from_torch(memory.device), copy=False
+    )
+    array._tensor = memory  # pyright: ignore[reportAttributeAccessIssue] - as wp.from_torch does
+    return array
+
+
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Add the block's time to stage ``name``, if :func:`profile` is on."""
-    if _seconds is None:
-        yield
-        return
-    start, table = time.perf_counter(), _seconds
+    """Name the block for whoever reads its errors; add its time to stage ``name``, if :func:`profile` is on."""
+    start, table = _now(), _seconds
     try:
         yield
+    except (MemoryError, RuntimeError) as error:  # of what ran out of memory, one wants to know where
+        error.add_note(f"in stage '{name}'")
+        raise
     finally:
-        table[name] += time.perf_counter() - start
+        if table is not None:
+            table[name] += _now() - start
+
+
+def _now() -> float:
+    """Seconds on the clock of :func:`profile`; while that is on, once the GPU has done what it was given."""
+    if _seconds is not None and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 @contextmanager

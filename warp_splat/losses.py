@@ -1,4 +1,4 @@
-"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM), one pass over the rows of two images."""
+"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM); on the CPU, one pass over the rows of two images."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import math
 import numpy as np
 import torch
 import warp as wp
+from torch.nn import functional
 
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
@@ -33,7 +34,49 @@ def image_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 
         raise InputError(
             f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
         )
+    if image.is_cuda:
+        return loss_by_convolution(image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim)
+
+
+def loss_by_convolution(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float) -> torch.Tensor:
+    """:func:`image_loss` for a GPU: the formula of ``kernels.ssim`` in torch's convolutions, which derives it."""
+    with stage("loss"):
+        p, q = _centers(image, target)
+        # planes [3, H, W], dense: then grouped convolutions are torch's own, which do not round to TF32 as cuDNN's do
+        x, y = (
+            (picture / 255.0 if picture.dtype == torch.uint8 else picture).permute(2, 0, 1).contiguous() - center
+            for picture, center in ((image, p), (target, q))
+        )
+        m1, m2, e11, e22, e12 = _blur(torch.stack([x, y, x * x, y * y, x * y]))
+        s = _inside(image.shape[0], image.shape[1], image.device)
+        mu1, mu2 = m1 + p * s, m2 + q * s
+        var1 = e11 - m1 * m1 + (1.0 - s) * (2.0 * p * m1 + p * p * s)
+        var2 = e22 - m2 * m2 + (1.0 - s) * (2.0 * q * m2 + q * q * s)
+        covariance = e12 - m1 * m2 + (1.0 - s) * (p * m2 + q * m1 + p * q * s)
+        above = (2.0 * mu1 * mu2 + ssim.C1) * (2.0 * covariance + ssim.C2)
+        below = (mu1 * mu1 + mu2 * mu2 + ssim.C1) * (var1 + var2 + ssim.C2)
+        l1 = (x - y + (p - q)).abs().mean()
+        return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - (above / below).mean())
+
+
+def _blur(planes: torch.Tensor) -> torch.Tensor:
+    """Weighted mean over the window around each pixel, [B, 3, H, W], with zeros outside the image."""
+    window = _window(planes.device)
+    rows = functional.conv2d(planes, window, padding=(0, ssim.RADIUS), groups=ssim.CHANNELS)
+    return functional.conv2d(rows, window.mT, padding=(ssim.RADIUS, 0), groups=ssim.CHANNELS)
+
+
+@functools.cache  # copied once: a copy from the host would wait for the GPU in every step
+def _window(device: torch.device) -> torch.Tensor:
+    """The window's weights for each channel, [3, 1, 1, 11]."""
+    return torch.tensor(list(ssim.WEIGHTS), device=device).repeat(ssim.CHANNELS, 1, 1, 1)
+
+
+@functools.lru_cache(16)
+def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
+    """The share of the window inside the image around each pixel, [1, H, W]."""
+    return _blur(torch.ones(1, ssim.CHANNELS, height, width, device=device))[0, :1]
 
 
 class ImageLoss(torch.autograd.Function):

@@ -70,6 +70,7 @@ class Optimizer:
             len(radii),
             [view(radii, wp.int32), view(grad, wp.float32), group["lr"], *group["betas"], group["eps"]],
             [view(table, wp.float32) for table in tables],
+            device=radii.device,
         )
 
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:

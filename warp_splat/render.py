@@ -20,6 +20,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.renderer import render as render_gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
+from warp_splat.selftest import check_device
 from warp_splat.trainer import to_bytes
 
 ORBIT_SIZE = (980, 545)  # px
@@ -34,19 +35,21 @@ def render(config: RenderConfig) -> int:
     Raises:
         InputError: if the model, its scene or an option is not usable.
     """
-    launch.prepare(config.device, config.threads)
+    device = launch.prepare(config.device, config.threads)
     say = (lambda *_: None) if config.quiet else print
     if not config.model_path:
         raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
     folder = Path(config.model_path)
     iteration = model_folder.find_iteration(folder, config.iteration)
-    model = GaussianModel.load(model_folder.ply_path(folder, iteration))
+    model = GaussianModel.load(model_folder.ply_path(folder, iteration)).to(device)
     trained = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() or not config.orbit else {}
     options = RasterOptions(
         antialiasing=bool(trained.get("antialiasing")),
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
     picture = make_picture(model, bool(trained.get("white_background")), options)
+    if device.type == "cuda":
+        check_device(device)
     say(f"{len(model)} Gaussians from iteration {iteration} of {folder}")
     if config.orbit:
         scene = _load(config, trained, say) if config.orbit_center == "focus" else None
@@ -82,7 +85,7 @@ def make_picture(
     model: GaussianModel, white_background: bool, options: RasterOptions
 ) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to the model's image, [H, W, 3] uint8."""
-    background = torch.full((3,), float(white_background))
+    background = torch.full((3,), float(white_background), device=model.device)
     with torch.no_grad():
         gaussians = model.activated()
 

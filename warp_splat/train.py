@@ -13,10 +13,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from warp_splat import launch, report
 from warp_splat.config import TrainConfig, check_train
+from warp_splat.devices import is_out_of_memory
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views
 from warp_splat.formats import model_folder
@@ -25,6 +27,7 @@ from warp_splat.formats.ply import save_points
 from warp_splat.formats.png import save_png
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
+from warp_splat.selftest import check_device
 from warp_splat.trainer import Trainer
 
 EVALUATIONS = 20  # over the run, besides --test_iterations
@@ -40,7 +43,7 @@ class Run:
     folder: Path
     start: float  # of the process's work, on time.perf_counter
     history: list[dict[str, float]] = field(default_factory=list)
-    losses: list[float] = field(default_factory=list)  # since the last record
+    losses: list[torch.Tensor] = field(default_factory=list)  # since the last record, scalars on the device
     iteration: int = 0
     seconds: float = 0.0  # of training steps alone, without evaluations and pictures
     preview: float = 0.0  # when last drawn
@@ -56,7 +59,9 @@ def train(config: TrainConfig) -> int:
     problem = check_train(config)
     if problem:
         raise InputError(problem)
-    launch.prepare(config.device, config.threads)
+    device = launch.prepare(config.device, config.threads)
+    if config.data_device == "cuda" and device.type != "cuda":
+        raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
     config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
     say = (lambda *_: None) if config.quiet else tqdm.write
     if config.model_path and any(Path(config.model_path).glob("point_cloud/*/*.ply")):
@@ -83,14 +88,17 @@ def train(config: TrainConfig) -> int:
     _write_inputs(run.folder, config, scene)
     say("Preparing kernels (compiled once on a machine, about 15 s) ...")
     start = time.perf_counter()
-    trainer.warm_up()
-    say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
-    with _interruptible() as interrupted:
-        try:
-            _loop(trainer, run, interrupted)
-        finally:  # whatever happened, the model comes first
-            print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")
-    _finish(trainer, run, say)
+    if device.type == "cuda":
+        check_device(device, config.adjoint)
+    with _memory_explained(trainer):
+        trainer.warm_up()
+        say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
+        with _interruptible() as interrupted:
+            try:
+                _loop(trainer, run, interrupted)
+            finally:  # whatever happened, the model comes first
+                print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")
+        _finish(trainer, run, say)
     return 130 if run.iteration < config.iterations else 0
 
 
@@ -106,10 +114,29 @@ def embedded_scene() -> Path:
 def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
     model_folder.write_cfg_args(
         folder,
-        {**asdict(config), "model_path": str(folder), "data_device": "cpu", "depths": "", "train_test_exp": False},
+        {**asdict(config), "model_path": str(folder), "depths": "", "train_test_exp": False},
     )
     model_folder.write_cameras(folder, scene.test, scene.train)
     save_points(folder / "input.ply", scene.points, scene.colors)
+
+
+@contextmanager
+def _memory_explained(trainer: Trainer):
+    """Turn an error that means that memory ran out into an InputError that says where, and what takes less."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        where = getattr(error, "__notes__", ["between two stages"])[0]
+        camera = max((view.camera for view in trainer.scene.train), key=lambda camera: camera.width * camera.height)
+        fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
+        if trainer.config.data_device == "cuda":
+            fewer.append("--data_device cpu")
+        raise InputError(
+            f"Out of memory on {trainer.device.type} {where}, with {len(trainer.model)} Gaussians on {camera.width} x "
+            f"{camera.height} px; train with {' or '.join(fewer)}."
+        ) from error
 
 
 @contextmanager
@@ -173,7 +200,7 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         views = views[:: -(-len(views) // PROGRESS_VIEWS)]
     record = {
         "iteration": run.iteration,
-        "loss": float(np.mean(run.losses)),
+        "loss": float(np.mean(torch.stack(run.losses).double().cpu().numpy())),
         "psnr": trainer.evaluate(views),
         "gaussians": len(trainer.model),
         "seconds": run.seconds,
@@ -227,7 +254,7 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
         "peak_memory_mb": _peak_memory(),
-        "dropped": asdict(trainer.quarantine),
+        "dropped": trainer.quarantine.read(),
     }
     means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)
     sheet, plot = run.folder / "contact_sheet.png", run.folder / "training.png"
@@ -250,13 +277,13 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
     )
     for name, where in lines:
         print(f"  {name:9s} {where}")
-    dropped = trainer.quarantine
-    if dropped.prunings:
-        print(f"  warning   {dropped.prunings} prunings would have removed every Gaussian and were refused")
-    if dropped.pixels or dropped.gradients or dropped.gaussians:
+    dropped = trainer.quarantine.read()
+    if dropped["prunings"]:
+        print(f"  warning   {dropped['prunings']} prunings would have removed every Gaussian and were refused")
+    if dropped["pixels"] or dropped["gradients"] or dropped["gaussians"]:
         print(
-            f"  kept from spreading: {dropped.pixels} pixels and {dropped.gradients} Gaussians with gradients, and "
-            f"{dropped.gaussians} Gaussians with parameters, that were not finite"
+            f"  kept from spreading: {dropped['pixels']} pixels and {dropped['gradients']} Gaussians with gradients, "
+            f"and {dropped['gaussians']} Gaussians with parameters, that were not finite"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions, TrainConfig
 from warp_splat.densify import Densifier
+from warp_splat.devices import choose_device
 from warp_splat.gaussians import GaussianModel
 from warp_splat.launch import stage
 from warp_splat.losses import image_loss
@@ -22,12 +23,16 @@ from warp_splat.scene.types import Scene, View
 
 @dataclass
 class Quarantine:
-    """What was kept from spreading, counted over the run."""
+    """What was kept from spreading, counted over the run on the device."""
 
-    pixels: int = 0  # with an upstream gradient that was not finite
-    gradients: int = 0  # of Gaussians, not finite: no update in that step
-    gaussians: int = 0  # left out of an image because a parameter was not finite (once per image)
+    pixels: int | torch.Tensor = 0  # with an upstream gradient that was not finite
+    gradients: int | torch.Tensor = 0  # of Gaussians, not finite: no update in that step
+    gaussians: int | torch.Tensor = 0  # left out of an image because a parameter was not finite (once per image)
     prunings: int = 0  # refused, because they would have emptied the scene
+
+    def read(self) -> dict[str, int]:
+        """The counts by name."""
+        return {name: int(count) for name, count in asdict(self).items()}
 
 
 class Trainer:
@@ -36,25 +41,29 @@ class Trainer:
     Args:
         scene: views and points.
         config: options.
+
+    Raises:
+        InputError: if the device cannot be used.
     """
 
     def __init__(self, scene: Scene, config: TrainConfig):
-        self.scene, self.config = scene, config
+        self.scene, self.config, self.device = scene, config, choose_device(config.device)
         extent = scene.extent
-        self.model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
+        self.model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree).to(self.device)
         self.optimizer = Optimizer(self.model, config, extent)
         self.densifier = Densifier(self.model, self.optimizer, config, extent)
         self.quarantine = Quarantine()
         self.options = RasterOptions(antialiasing=config.antialiasing, projection=config.projection)
-        self.background = torch.full((3,), float(config.white_background))
+        self.background = torch.full((3,), float(config.white_background), device=self.device)
         self.degree = 0
         self._views_random = random.Random(config.seed)
         self._background_random = torch.Generator().manual_seed(config.seed)
         self._deck: list[View] = []
-        self._radii = torch.zeros(0, dtype=torch.int32)  # of the view that was differentiated last
+        self._photographs: dict[View, torch.Tensor] = {}  # those that were used, [H, W, 3] uint8
+        self._radii = torch.zeros(0, dtype=torch.int32, device=self.device)  # of the view that was differentiated last
 
-    def differentiate(self, iteration: int) -> float:
-        """Gradients of the loss of one view; returns the loss. Iterations count from 1.
+    def differentiate(self, iteration: int) -> torch.Tensor:
+        """Gradients of the loss of one view; returns the loss, a scalar. Iterations count from 1.
 
         The reference evaluates and saves between this and :meth:`update`: a set that was densified a moment ago is
         unsettled and renders several dB worse.
@@ -65,20 +74,20 @@ class Trainer:
         view = self._next_view()
         background = self.background
         if config.random_background:
-            background = torch.rand(3, generator=self._background_random)
+            background = torch.rand(3, generator=self._background_random).to(self.device)
         out = self._render(view.camera, background)
         out.means2d.retain_grad()
         # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
-        loss = image_loss(out.image.clamp(0.0, 1.0), torch.from_numpy(view.image), config.lambda_dssim)
+        loss = image_loss(out.image.clamp(0.0, 1.0), self._photograph(view), config.lambda_dssim)
         loss.backward()
         if iteration < config.densify_until_iter:
             with stage("densify"):
                 self.densifier.observe(out, view.camera.width, view.camera.height)
-        self.quarantine.pixels += out.dropped.pixels
-        self.quarantine.gradients += out.dropped.gaussians
-        self.quarantine.gaussians += out.invalid
+        self.quarantine.pixels += out.dropped.pixel_count
+        self.quarantine.gradients += out.dropped.gaussian_count
+        self.quarantine.gaussians += out.invalid_count
         self._radii = out.radii
-        return loss.item()
+        return loss.detach()
 
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
@@ -102,6 +111,17 @@ class Trainer:
             self._deck = list(self.scene.train)
         return self._deck.pop(self._views_random.randrange(len(self._deck)))
 
+    def _photograph(self, view: View) -> torch.Tensor:
+        """The photograph of ``view`` on the device; for a GPU, it waits there or in page-locked memory of the host."""
+        kept = self._photographs.get(view)
+        if kept is None:
+            with stage("photographs"):
+                kept = torch.from_numpy(view.image).to(self.config.data_device)
+                if kept.device.type != self.device.type:
+                    kept = kept.pin_memory()
+            self._photographs[view] = kept
+        return kept.to(self.device, non_blocking=True)
+
     def _render(self, camera: Camera, background: torch.Tensor):
         options = replace(self.options, sh_degree=self.degree)
         return render(self.model.activated(), camera, background, options, self.config.adjoint)
@@ -118,4 +138,4 @@ class Trainer:
 
 def to_bytes(image: torch.Tensor) -> np.ndarray:
     """[H, W, 3] float image, clamped to 0..1, as uint8."""
-    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()

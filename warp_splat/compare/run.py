@@ -32,11 +32,12 @@ def compare(config: CompareConfig) -> int:
         raise InputError("--stability, --volume: expected one of them, got both; run the command twice.")
     if (config.stability or config.volume) and (config.scene or config.full):
         raise InputError("--scene, --full: these belong to the comparison without --stability and --volume.")
-    launch.prepare(config.device, config.threads)
+    if config.device == "cuda":
+        raise InputError("--device cuda: the comparison measures the CPU's kernels only; use --device cpu.")
+    launch.prepare("cpu", config.threads)
     out, log = Path(config.out), []
     with atomic_write(out / "running.txt") as path:  # before hours of measuring, not after
         path.write_text("A comparison is running, or was interrupted.\n")
-    scenes = named_scenes(config.scene, print)
 
     def say(text: str = "") -> None:
         print(text)
@@ -49,6 +50,7 @@ def compare(config: CompareConfig) -> int:
         volume_report.run(out, say)
     else:
         name, code = "compare", 0
+        scenes = named_scenes(config.scene, print)
         _compare_pixel_loops(config, scenes, out, say)
         training.run(out, config.modes, scenes, config.full, say)
     say(f"\nMeasured on {machine()}, {launch.get_threads()} threads.")

@@ -154,7 +154,7 @@ def train_all(scene: Scene, name: str, variants: Mapping, seeded: Sequence[str],
 
 def make_trainer(scene: Scene, schedule: Mapping, seed: int, max_steps: int | None = None, **options) -> Trainer:
     """A trainer that has done nothing yet; ``max_steps`` caps the loop in training and in rendering."""
-    trainer = Trainer(scene, TrainConfig(**schedule, seed=seed, **options))
+    trainer = Trainer(scene, TrainConfig(**schedule, device="cpu", seed=seed, **options))
     trainer.options = replace(trainer.options, max_steps=max_steps)
     return trainer
 
@@ -167,7 +167,7 @@ def train_run(trainer: Trainer, result: Run, reference: dict[int, torch.Tensor])
         start = time.perf_counter()
         if iteration > 1:  # the last update is left out: a set that was densified a moment ago is unsettled
             trainer.update(iteration - 1)
-        losses.append(trainer.differentiate(iteration))
+        losses.append(trainer.differentiate(iteration).item())
         seconds += time.perf_counter() - start
         if iteration in checks:
             record = {"iteration": iteration, "seconds": seconds, "loss": float(np.mean(losses))}

@@ -59,7 +59,7 @@ def layered(candidates: int) -> Workload:
 
 def in_training(name: str, scene: Scene, say: Callable[[str], None]) -> list[Workload]:
     """The first held-out view of a scene after each of :data:`STAGES` of the short schedule."""
-    trainer = Trainer(scene, TrainConfig(**SHORT))
+    trainer = Trainer(scene, TrainConfig(**SHORT, device="cpu"))
     camera = scene.evaluated[1][0].camera
     found = []
     for iteration in range(max(STAGES) + 1):

@@ -4,6 +4,9 @@ Exact tile lists without a sort of tile instances: Gaussians come sorted by dept
 keeps their order does it (Tried on the CPU: radix sort of the tile numbers, 11 ms for 1.14M instances). A Gaussian's
 tiles are found once, in floating point, as one span per row of tiles; all that follows is integer work, so that no
 two kernels can round differently. Slots, where the adjoint writes, number the instances Gaussian by Gaussian.
+
+A GPU sorts the instances instead. There one kernel runs twice, first to count a Gaussian's tiles and then to write
+them: it is the same machine code, and rounds alike.
 """
 
 import warp as wp
@@ -72,6 +75,52 @@ def pack(
     rows_out[rank] = wp.int64(wp.max(span[1] // TILE - span[0] // TILE + 1, 0))
 
 
+@wp.struct
+class Outline:
+    """The ellipse q <= reach / 2, or the square around it, cut by rows of tiles.
+
+    At height dy it spans dx = slope dy +- half sqrt(1 - (dy / extent y)^2).
+    """
+
+    slope: float
+    half: float
+    turn: float  # dy at its right end
+    top: int  # first row of tiles
+    bottom: int  # last
+
+
+@wp.func
+def outline_of(splat: Splat2D, height: int, alpha_min: float):
+    outline = Outline()
+    rows = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
+    outline.top = rows[0] // TILE
+    outline.bottom = rows[1] // TILE
+    outline.slope = -splat.root[1] / splat.root[0]
+    outline.half = wp.sqrt(0.5 * LOG2_E * reach_of(splat.opacity, alpha_min)) / splat.root[0]
+    outline.turn = outline.slope * splat.extent[1] * splat.extent[1] / splat.extent[0]
+    return outline
+
+
+@wp.func
+def cut(splat: Splat2D, outline: Outline, row: int, width: int, square: int):
+    """First tile of a row of tiles that the outline touches, and how many."""
+    low = float(row * TILE) + 0.5 - splat.mean[1] - MARGIN
+    high = low + float(TILE - 1) + 2.0 * MARGIN
+    low = wp.max(low, -splat.extent[1])
+    high = wp.min(high, splat.extent[1])
+    dy_right = wp.clamp(outline.turn, low, high)
+    dy_left = wp.clamp(-outline.turn, low, high)
+    f_right = dy_right / splat.extent[1]
+    f_left = dy_left / splat.extent[1]
+    right = outline.slope * dy_right + outline.half * wp.sqrt(wp.max(1.0 - f_right * f_right, 0.0))
+    left = outline.slope * dy_left - outline.half * wp.sqrt(wp.max(1.0 - f_left * f_left, 0.0))
+    if square != 0:
+        right = splat.extent[0]
+        left = -splat.extent[0]
+    span = pixels(splat.mean[0] + left, splat.mean[0] + right, width)
+    return wp.vec2i(span[0] // TILE, wp.max(span[1] // TILE - span[0] // TILE + 1, 0))
+
+
 @wp.kernel
 def find_spans(
     first: int,
@@ -88,35 +137,54 @@ def find_spans(
 ):
     rank = first + wp.tid()
     splat = splats[rank]
-    top = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)[0] // TILE
+    outline = outline_of(splat, height, alpha_min)
     end = int(row_ends[rank])
     begin = int(0)
     if rank > 0:
         begin = int(row_ends[rank - 1])
-    # at height dy the ellipse q <= reach / 2 spans dx = slope dy +- half sqrt(1 - (dy / extent y)^2)
-    slope = -splat.root[1] / splat.root[0]
-    half = wp.sqrt(0.5 * LOG2_E * reach_of(splat.opacity, alpha_min)) / splat.root[0]
-    turn = slope * splat.extent[1] * splat.extent[1] / splat.extent[0]  # dy at its right end
     found = int(0)
     for row in range(end - begin):
-        low = float((top + row) * TILE) + 0.5 - splat.mean[1] - MARGIN
-        high = low + float(TILE - 1) + 2.0 * MARGIN
-        low = wp.max(low, -splat.extent[1])
-        high = wp.min(high, splat.extent[1])
-        dy_right = wp.clamp(turn, low, high)
-        dy_left = wp.clamp(-turn, low, high)
-        f_right = dy_right / splat.extent[1]
-        f_left = dy_left / splat.extent[1]
-        right = slope * dy_right + half * wp.sqrt(wp.max(1.0 - f_right * f_right, 0.0))
-        left = slope * dy_left - half * wp.sqrt(wp.max(1.0 - f_left * f_left, 0.0))
-        if square != 0:
-            right = splat.extent[0]
-            left = -splat.extent[0]
-        span = pixels(splat.mean[0] + left, splat.mean[0] + right, width)
-        count = wp.max(span[1] // TILE - span[0] // TILE + 1, 0)
-        spans_out[begin + row] = wp.vec2i((top + row) * tiles_x + span[0] // TILE, count)
-        found += count
+        span = cut(splat, outline, outline.top + row, width, square)
+        spans_out[begin + row] = wp.vec2i((outline.top + row) * tiles_x + span[0], span[1])
+        found += span[1]
     instances_out[rank] = wp.int64(found)
+
+
+@wp.kernel
+def list_tiles(
+    first: int,
+    order: wp.array[int],  # [N] Gaussian, nearest first, those that are not drawn last
+    radii: wp.array[int],  # [N]
+    splats: wp.array[Splat2D],  # [N] by rank; undefined where not drawn
+    width: int,
+    height: int,
+    tiles_x: int,
+    alpha_min: float,
+    square: int,
+    slot_ends: wp.array[wp.int64],  # [N] inclusive scan of what the first run counted; [0] in that run
+    # out
+    instances_out: wp.array[wp.int64],  # [N] tiles in all, in the first run
+    tiles_out: wp.array[int],  # [M] by slot, in the second run
+    ranks_out: wp.array[int],  # [M]
+):
+    rank = first + wp.tid()
+    writes = slot_ends.shape[0] > 0
+    begin = int(0)
+    if writes and rank > 0:
+        begin = int(slot_ends[rank - 1])
+    found = int(0)
+    if radii[order[rank]] > 0:
+        splat = splats[rank]
+        outline = outline_of(splat, height, alpha_min)
+        for row in range(outline.top, outline.bottom + 1):
+            span = cut(splat, outline, row, width, square)
+            if writes:
+                for column in range(span[1]):
+                    tiles_out[begin + found + column] = row * tiles_x + span[0] + column
+                    ranks_out[begin + found + column] = rank
+            found += span[1]
+    if not writes:
+        instances_out[rank] = wp.int64(found)
 
 
 @wp.kernel

@@ -1,0 +1,77 @@
+"""The CUDA kernels on the CPU, by Warp's fibers: equal to the float64 oracle and to the CPU's driver, in every mode.
+
+What is replaced is the choice of the driver alone; all else is the renderer as users call it.
+"""
+
+import pytest
+import torch
+import warp as wp
+from test_rasterize import check_gradients, check_image, relative_error, run, truth
+
+from warp_splat import RasterOptions, renderer
+from warp_splat.blocks import adjoint_of_blocks, blend_blocks
+from warp_splat.config import ADJOINTS
+
+SCENES = ("degree1", "dense_tile", "saturated", "needles", "ties", "size_1x1", "size_17x33", "single", "empty")
+PLAIN = RasterOptions()
+
+
+@pytest.fixture
+def blocks(monkeypatch):
+    """The renderer with the driver of a GPU, in fibers."""
+    before = wp.config.enable_cpu_blocks
+    wp.config.enable_cpu_blocks = True
+    monkeypatch.setattr(renderer, "blend_lanes", blend_blocks)
+    monkeypatch.setattr(renderer, "adjoint_of_lanes", adjoint_of_blocks)
+    yield
+    wp.config.enable_cpu_blocks = before
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+@pytest.mark.parametrize("name", SCENES)
+def test_against_the_oracle(name, adjoint, blocks):
+    out, gradients = run(name, "cpu", adjoint=adjoint)
+    expected = truth(name, PLAIN)
+    check_image(out, expected.out)
+    check_gradients(gradients, expected.gradients)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_against_the_lanes(adjoint, blocks, monkeypatch):
+    options = RasterOptions(depth=True, alpha_min=1e-3, t_min=1e-3)
+    first, gradients = run("dense_tile", "cpu", options, adjoint)
+    monkeypatch.undo()
+    second, expected = run("dense_tile", "cpu", options, adjoint)
+    for key in ("image", "alpha"):
+        assert (getattr(first, key) - getattr(second, key)).abs().max() < 1e-6, key
+    # expected depth: rounding of alpha, which is 1e-3 and more where there is anything, divided by alpha
+    assert (first.depth - second.depth).abs().max() < 1e-4 * second.depth.max()
+    for key, gradient in gradients.items():
+        assert relative_error(gradient, expected[key]) < 1e-5, key
+
+
+def test_two_runs_give_the_same_bits(blocks):
+    (first, gradients), (second, again) = (run("dense_tile", "cpu") for _ in range(2))
+    assert torch.equal(first.image, second.image)
+    assert all(torch.equal(gradients[key], again[key]) for key in gradients)
+
+
+def test_pixels_that_are_not_finite_are_dropped(blocks):
+    expected = truth("degree1", PLAIN)
+    upstream = {key: weight.clone() for key, weight in expected.upstream.items()}
+    results = []
+    for value in (0.0, float("nan")):
+        upstream["image"][5, 7], upstream["alpha"][5, 7] = value, 0.0
+        leaves = [tensor.clone().requires_grad_() for tensor in expected.scene.parameters()]
+        out = renderer.rasterize(*leaves, expected.scene.camera, expected.scene.background)
+        torch.autograd.backward([out.image, out.alpha], [upstream["image"], upstream["alpha"]])
+        results.append([leaf.grad for leaf in leaves])
+        assert out.dropped.pixels == (value != 0.0)
+    assert all(map(torch.equal, *results))
+
+
+def test_loop_cap(blocks, monkeypatch):
+    options = RasterOptions(max_steps=100)
+    image = run("dense_tile", "cpu", options)[0].image
+    monkeypatch.undo()
+    assert (image - run("dense_tile", "cpu", options)[0].image).abs().max() < 1e-6

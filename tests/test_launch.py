@@ -1,0 +1,75 @@
+"""Launches: one on a GPU, blocks of threads where they are made of fibers, memory that torch owns."""
+
+import gc
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warp_splat import launch
+
+DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
+
+
+@wp.kernel
+def add_index(first: int, values: wp.array[float], sums_out: wp.array[float]):
+    i = first + wp.tid()
+    sums_out[i] = values[i] + float(i)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_index_once(device):
+    values, sums = torch.rand(5000, device=device), torch.zeros(5000, device=device)
+    for bounds in (None, [0, 1, 1, 4000, 5000]):
+        launch.launch(
+            add_index,
+            5000,
+            [launch.view(values, wp.float32)],
+            [launch.view(sums, wp.float32)],
+            bounds=bounds,
+            device=device,
+        )
+        assert torch.equal(sums, values + torch.arange(5000.0, device=device))
+
+
+def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
+    calls = []
+    monkeypatch.setattr(launch, "_stream", lambda device: f"stream of {device}")
+    monkeypatch.setattr(wp, "launch", lambda kernel, **options: calls.append(options))
+    monkeypatch.setattr(wp, "launch_tiled", lambda kernel, **options: calls.append(options))
+    launch.launch(add_index, 9000, ["in"], ["out"], bounds=[0, 4000, 9000], device=torch.device("cuda", 1))
+    launch.launch(add_index, 7, ["in"], ["out"], device="cuda", adj_inputs=["grad"], adj_outputs=["up"])
+    launch.launch_blocks(add_index, 12, ["in"], ["out"], torch.device("cuda", 1))
+    launch.launch(add_index, 0, ["in"], ["out"], device="cuda")
+    launch.launch_blocks(add_index, 0, ["in"], ["out"], "cuda")
+    whole, adjoint, blocks = calls
+    assert whole == {"dim": 9000, "inputs": [0, "in"], "outputs": ["out"], "stream": "stream of cuda:1"}
+    assert adjoint["adjoint"] and adjoint["adj_inputs"] == [None, "grad"] and adjoint["adj_outputs"] == ["up"]
+    assert blocks == {"dim": [12], "inputs": ["in"], "outputs": ["out"], "block_dim": 256, "stream": "stream of cuda:1"}
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_blocks_of_threads(device, monkeypatch):
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False, "block_dim": launch.BLOCK})
+    def total(values: wp.array[float], sums_out: wp.array[float]):
+        block, thread = wp.tid()
+        value = values[block * 256 + thread] + 0.0
+        wp.tile_store(sums_out, wp.tile_sum(wp.tile(value)), offset=block)
+
+    values, sums = torch.arange(3 * 256.0, device=device), torch.zeros(3, device=device)
+    launch.launch_blocks(total, 3, [launch.view(values, wp.float32)], [launch.view(sums, wp.float32)], device)
+    assert torch.equal(sums, values.view(3, 256).sum(1))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_memory_lives_as_long_as_its_array(device):
+    array = launch.empty(1000, wp.vec3, device)
+    array.fill_(7.0)
+    gc.collect()
+    others = [torch.zeros(3000, device=device) for _ in range(20)]
+    assert array.shape == (1000,) and array.dtype == wp.vec3 and len(others) == 20
+    assert (array.numpy() == np.float32(7)).all()
+    assert launch.empty(0, wp.vec3, device).shape == (0,)

@@ -1,0 +1,75 @@
+"""The blend and its adjoint on a GPU: a block of threads per tile; see ``lanes``, which offers the same for the CPU."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warp_splat.adjoints import list_inputs, memory_for_states
+from warp_splat.binning import MAX_INSTANCES, Bins
+from warp_splat.camera import Camera
+from warp_splat.config import T_LEAST, TILE, RasterOptions
+from warp_splat.kernels.adjoint_block import make_reverse_block, make_upstream_block
+from warp_splat.kernels.blend_block import make_blend_block
+from warp_splat.kernels.taped_block import make_walk_block
+from warp_splat.launch import launch_blocks, view
+
+THREADS = TILE * TILE
+
+
+def blend_blocks(
+    bins: Bins, camera: Camera, background: torch.Tensor, options: RasterOptions, keep: bool
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, tuple[torch.Tensor, ...]]:
+    """See :func:`warp_splat.lanes.blend_lanes`."""
+    height, width, tile_count, new = camera.height, camera.width, len(bins.ranges), background.new_empty
+    image, alpha = new(height, width, 3), new(height, width)
+    depth = new(height, width) if options.depth else new(0, 0)
+    final, count = new(tile_count, THREADS), new(tile_count, THREADS, dtype=torch.int32)
+    kept = memory_for_states(bins).view(-1, THREADS) if keep else new(0, THREADS)
+    steps = [
+        max(options.t_min, T_LEAST),
+        min(MAX_INSTANCES, MAX_INSTANCES if options.max_steps is None else options.max_steps),
+    ]
+    launch_blocks(
+        make_blend_block(options.depth, options.exp_degree, keep),
+        tile_count,
+        [*list_inputs(bins, options), *steps, _float(background)],
+        [*map(_float, (image, alpha, depth, final)), view(count, wp.int32), _float(kept)],
+        background.device,
+    )
+    return image, alpha, depth, (final, count, kept)
+
+
+def adjoint_of_blocks(
+    mode: str, bins: Bins, options: RasterOptions, background: torch.Tensor, saved, adj_image, adj_alpha, adj_depth
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """See :func:`warp_splat.lanes.adjoint_of_lanes`."""
+    final, count, kept = saved
+    device, tile_count, new = background.device, len(bins.ranges), background.new_empty
+    slots = new(len(bins.instances), 10 if options.depth else 9)
+    up, adj_final, adj_background = new(tile_count, THREADS, 4), torch.empty_like(final), new(tile_count, 3)
+    dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
+    lists, states = list_inputs(bins, options), [_float(final), view(count, wp.int32)]
+    upstream = [view(up, wp.vec4), _float(adj_final)]
+    launch_blocks(
+        make_upstream_block(options.depth),
+        tile_count,
+        [*lists[:3], _float(background), *states, *map(_float, (adj_image, adj_alpha, adj_depth))],
+        [*upstream, _float(adj_background), view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],
+        device,
+    )
+    if mode in ("manual", "stepwise"):
+        inputs = [*lists, *states, view(steps, wp.int32), *upstream]
+        launch_blocks(
+            make_reverse_block(mode, options.depth, options.exp_degree), tile_count, inputs, [_float(slots)], device
+        )
+    else:
+        walk, inputs = make_walk_block(mode, options.depth, options.exp_degree), [*lists, *states, _float(kept)]
+        inputs += [view(steps, wp.int32), _float(slots)]
+        adjoint = {"adj_inputs": [None] * len(inputs), "adj_outputs": upstream}
+        launch_blocks(walk, tile_count, inputs, upstream, device, **adjoint)
+    return slots, adj_background.sum(0), dropped
+
+
+def _float(tensor: torch.Tensor):
+    return view(tensor, wp.float32)

@@ -1,0 +1,64 @@
+"""Which device a run uses, why a GPU cannot be used, and whether an error means that memory ran out."""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+
+from warp_splat.errors import InputError
+
+OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", "Failed to allocate")
+
+
+def choose_device(name: str) -> torch.device:
+    """The device called "cpu" or "cuda"; for "auto", a GPU if one can be used.
+
+    Raises:
+        InputError: if "cuda" cannot be used here; the message says why and what to do.
+    """
+    if name == "cpu":
+        return torch.device("cpu")
+    problem = why_no_cuda()
+    if problem is None:
+        return torch.device("cuda", torch.cuda.current_device())
+    if name == "cuda":
+        raise InputError(f"--device cuda: {problem}, or use --device cpu.")
+    return torch.device("cpu")
+
+
+def why_no_cuda() -> str | None:
+    """What keeps kernels from running on a GPU here, and what to do about it; None if nothing does."""
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} was built without CUDA; install a build with it (pytorch.org says how)"
+    driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
+    built = f"torch {torch.__version__} was built for CUDA {torch.version.cuda}"
+    if toolkit is None:
+        return f"Warp {wp.__version__} was built without CUDA; install warp-lang from PyPI"
+    built += f", Warp {wp.__version__} for CUDA {_dotted(toolkit)}"
+    if driver is None:
+        return f"no NVIDIA driver found ({built}); install NVIDIA's driver"
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        if driver[0] < max(int(torch.version.cuda.split(".")[0]), toolkit[0]):  # minor versions are compatible
+            return f"the NVIDIA driver is too old: it supports CUDA {_dotted(driver)}, but {built}; update the driver"
+        return (
+            f"the NVIDIA driver (for CUDA {_dotted(driver)}) shows no GPU ({built}); see what nvidia-smi says and "
+            "whether CUDA_VISIBLE_DEVICES hides it"
+        )
+    try:
+        torch.zeros(1, device="cuda").item()
+    except RuntimeError as error:
+        if is_out_of_memory(error):
+            return "the GPU's memory is full; end other programs that use it (nvidia-smi lists them)"
+        return f"the GPU does not answer torch {torch.__version__} ({str(error).splitlines()[0]}); update the driver"
+    return None
+
+
+def _dotted(version: tuple[int, int]) -> str:
+    return f"{version[0]}.{version[1]}"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether ``error`` says that memory ran out: Python's, NumPy's, torch's on either device, or Warp's."""
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
