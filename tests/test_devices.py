@@ -71,6 +71,21 @@ def test_kernels_that_do_nothing_are_found(monkeypatch):
         selftest.check_device(CPU)
 
 
+def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
+    def fail(device, adjoint):
+        raise InputError("wrong.")
+
+    monkeypatch.setattr(selftest, "check_device", fail)
+    said = []
+    assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append) == CPU
+    assert "wrong. Going on with the CPU." in said[-1]
+    with pytest.raises(InputError):
+        selftest.settle_device(torch.device("cuda"), "cuda", say=said.append)
+    assert selftest.settle_device(CPU, "cpu", say=said.append) == CPU
+    monkeypatch.setattr(selftest, "check_device", lambda device, adjoint: None)
+    assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append).type == "cuda"
+
+
 @pytest.mark.parametrize("factor", [0.0, 1.001, float("nan")])
 def test_a_wrong_gradient_is_found(factor, monkeypatch):
     def wrong(*arguments):

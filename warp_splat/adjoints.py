@@ -7,7 +7,6 @@ differ in the kernel between them alone. Two exceptions: ``stored`` has a forwar
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import warp as wp
 
@@ -15,11 +14,11 @@ from warp_splat.binning import Bins
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.adjoint_lanes import make_reverse
-from warp_splat.kernels.blend import LN_2, Splat2D
+from warp_splat.kernels.blend import Splat2D
 from warp_splat.kernels.blend_lanes import BLOCKS
 from warp_splat.kernels.lanes import LANES, vec16
-from warp_splat.kernels.taped_lanes import make_walk
-from warp_splat.launch import available_memory, launch, view
+from warp_splat.kernels.taped_lanes import make_walk, rows_of_copies
+from warp_splat.launch import available_memory, empty, launch, view
 
 SPLATS = 3  # place of the Gaussians in the list
 
@@ -62,21 +61,9 @@ def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list
     if mode != "generated":
         launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
         return
-    lists[SPLATS] = wp.array(bins.splats.numpy()[bins.instances.numpy()[:, 0]], dtype=Splat2D, device="cpu")
-    adj_splats = wp.zeros(len(bins.instances), dtype=Splat2D, device="cpu")
-    adjoint["adj_inputs"][SPLATS] = adj_splats
+    copies, adj_copies = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
+    copies.assign(bins.splats.numpy()[bins.instances.numpy()[:, 0]])
+    adj_copies.zero_()
+    lists[SPLATS], adjoint["adj_inputs"][SPLATS] = copies, adj_copies
     launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
-    found = _rows(adj_splats.numpy(), lists[SPLATS].numpy(), slots.shape[1])
-    slots[bins.instances[:, 1].long()] = torch.from_numpy(found)
-
-
-def _rows(adj: np.ndarray, splats: np.ndarray, width: int) -> np.ndarray:
-    """Rows [M, width] of gradients of Splat2D: mean, conic, opacity, color, depth."""
-    root, adj_root = splats["root"], adj["root"]
-    yy = adj_root[:, 2] / root[:, 2]
-    xy = (adj_root[:, 1] - root[:, 1] * yy) / root[:, 0]
-    xx = (adj_root[:, 0] - root[:, 1] * xy) / root[:, 0]
-    conic = np.stack([0.25 * xx, 0.5 * xy, 0.25 * yy], 1) / LN_2
-    return np.concatenate([adj["mean"], conic, adj["opacity"][:, None], adj["color"], adj["depth"][:, None]], 1)[
-        :, :width
-    ]
+    launch(rows_of_copies, len(bins.instances), [view(bins.instances, wp.vec2i), copies, adj_copies], [rows])

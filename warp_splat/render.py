@@ -20,7 +20,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.renderer import render as render_gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
-from warp_splat.selftest import check_device
+from warp_splat.selftest import settle_device
 from warp_splat.trainer import to_bytes
 
 ORBIT_SIZE = (980, 545)  # px
@@ -35,8 +35,8 @@ def render(config: RenderConfig) -> int:
     Raises:
         InputError: if the model, its scene or an option is not usable.
     """
-    device = launch.prepare(config.device, config.threads)
     say = (lambda *_: None) if config.quiet else print
+    device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     if not config.model_path:
         raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
     folder = Path(config.model_path)
@@ -48,8 +48,6 @@ def render(config: RenderConfig) -> int:
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
     picture = make_picture(model, bool(trained.get("white_background")), options)
-    if device.type == "cuda":
-        check_device(device)
     say(f"{len(model)} Gaussians from iteration {iteration} of {folder}")
     if config.orbit:
         scene = _load(config, trained, say) if config.orbit_center == "focus" else None

@@ -11,6 +11,8 @@ near ball's first scale is that of sum (c1 - b) a1 dx^2 / v1^2 (f / z1)^2 s1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
@@ -26,6 +28,27 @@ CAMERA = Camera(24, 18, 20.0, 20.0, 12.3, 8.6, np.eye(3), np.zeros(3))
 DEPTHS, SCALES, OPACITIES = (4.0, 2.0), (1.4, 0.6), (0.8, 0.6)
 COLORS, BACKGROUND = ((0.9, 0.2, 0.4), (0.3, 0.7, 0.5)), (0.1, 0.3, 0.6)
 TOLERANCE = 1e-4  # of the image, and relative of the gradient
+
+
+def settle_device(
+    device: torch.device, requested: str, adjoint: str = "manual", say: Callable[[str], object] = print
+) -> torch.device:
+    """``device``, if it passes the self-test; a GPU that "auto" chose and that fails gives way to the CPU, with a word.
+
+    Raises:
+        InputError: if a GPU was asked for by name and fails.
+    """
+    if device.type == "cpu":
+        return device
+    say("Testing the GPU; its kernels are compiled once on a machine ...")
+    try:
+        check_device(device, adjoint)
+    except InputError as error:
+        if requested != "auto":
+            raise
+        say(f"warning: {error} Going on with the CPU.")
+        return torch.device("cpu")
+    return device
 
 
 def check_device(device: torch.device, adjoint: str = "manual") -> None:

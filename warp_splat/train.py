@@ -27,7 +27,7 @@ from warp_splat.formats.ply import save_points
 from warp_splat.formats.png import save_png
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
-from warp_splat.selftest import check_device
+from warp_splat.selftest import settle_device
 from warp_splat.trainer import Trainer
 
 EVALUATIONS = 20  # over the run, besides --test_iterations
@@ -59,11 +59,12 @@ def train(config: TrainConfig) -> int:
     problem = check_train(config)
     if problem:
         raise InputError(problem)
-    device = launch.prepare(config.device, config.threads)
+    say = (lambda *_: None) if config.quiet else tqdm.write
+    device = settle_device(launch.prepare(config.device, config.threads), config.device, config.adjoint, say)
+    config.device = device.type
     if config.data_device == "cuda" and device.type != "cuda":
         raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
     config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
-    say = (lambda *_: None) if config.quiet else tqdm.write
     if config.model_path and any(Path(config.model_path).glob("point_cloud/*/*.ply")):
         raise InputError(
             f"-m {config.model_path}: this folder already holds a trained model; choose another, or move it."
@@ -88,8 +89,6 @@ def train(config: TrainConfig) -> int:
     _write_inputs(run.folder, config, scene)
     say("Preparing kernels (compiled once on a machine, about 15 s) ...")
     start = time.perf_counter()
-    if device.type == "cuda":
-        check_device(device, config.adjoint)
     with _memory_explained(trainer):
         trainer.warm_up()
         say(f"Kernels ready after {time.perf_counter() - start:.1f} s")

@@ -110,6 +110,30 @@ def adj_collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slo
         wp.adjoint[m][grad] = vec16(0.0)
 
 
+@wp.kernel(enable_backward=False)
+def rows_of_copies(
+    first: int,
+    instances: wp.array[wp.vec2i],  # [M] (splat, slot)
+    copies: wp.array[Splat2D],  # [M] a Gaussian per tile instance
+    adj_copies: wp.array[Splat2D],  # [M]
+    # out
+    slots_out: wp.array2d[float],  # [M, GRADS]
+):
+    """The rows of ``generated``, from the gradients of its copies."""
+    k = first + wp.tid()
+    adj = adj_copies[k]
+    conic = conic_from_root(adj.root, copies[k].root)
+    slot = instances[k][1]
+    slots_out[slot, 0] = adj.mean[0]
+    slots_out[slot, 1] = adj.mean[1]
+    for i in range(3):
+        slots_out[slot, 2 + i] = conic[i]
+        slots_out[slot, 6 + i] = adj.color[i]
+    slots_out[slot, 5] = adj.opacity
+    if slots_out.shape[1] > 9:
+        slots_out[slot, 9] = adj.depth
+
+
 @functools.cache
 def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
