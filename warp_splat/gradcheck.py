@@ -149,7 +149,7 @@ def _check(adjoint, options, camera, parameters, directions, tolerance) -> Raste
     if adjoint not in MODES:
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
     known = INPUTS + INTERMEDIATES
-    if parameters is not None and (isinstance(parameters, str) or not set(parameters) <= set(known)):
+    if parameters is not None and (isinstance(parameters, str) or not all(name in known for name in parameters)):
         raise InputError(f"parameters: expected a list of some of {', '.join(known)}, got {parameters!r}.")
     if not (isinstance(directions, int) and directions >= 1):
         raise InputError(f"directions: expected a whole number, at least 1, got {directions!r}.")

@@ -96,8 +96,8 @@ def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
             color, marker = STYLES[item.variant]
             line = axes.loglog(1e3 * _both(item), error, marker, color=color, markersize=6, linestyle="none")[0]
             handles[item.variant] = line
-        least = min(1e3 * _both(item) for item in here)
-        axes.set_xlim(0.7 * least, 25 * least)
+        drawn = [1e3 * _both(item) for item in here if not item.extrapolated]
+        axes.set_xlim(0.7 * min(drawn), 1.5 * max(drawn))
         axes.set_ylim(LEAST, 3.0)
         _plain_ticks(axes)
         axes.set_xlabel("forward and backward [ms]", fontsize=8, color=report.INK)

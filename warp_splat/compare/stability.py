@@ -118,7 +118,7 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _plot_chains(axes, rows: dict[str, Row]) -> None:
-    report.plain_axes(axes, "error of the gradients of n layers")
+    report.plain_axes(axes, "error of gradients and of T, n layers")
     chains = {layers: rows[f"chain_{layers}"].outcomes for layers in stability_blend.CHAINS}
     lengths = list(chains)
     axes.plot(lengths, [layers * EPS for layers in lengths], color=report.INK, linewidth=1.0, linestyle="--")
@@ -130,6 +130,8 @@ def _plot_chains(axes, rows: dict[str, Row]) -> None:
         shifted = [layers * 1.25 ** (place - 0.5 * (len(modes) - 1)) for layers in lengths]
         errors = [chains[layers][mode].gradient_error for layers in lengths]
         axes.plot(shifted, errors, color=color, marker=marker, markersize=5, linestyle="", label=mode)
+    recovered = [stability_numbers.recovery_error(layers) for layers in lengths]
+    axes.plot(lengths, recovered, color="#999999", linewidth=1.2, label="T recovered")
     axes.legend(frameon=False, fontsize=9, labelcolor=report.INK, loc="upper left")
     axes.set_xlabel("n", fontsize=9, color=report.INK)
 

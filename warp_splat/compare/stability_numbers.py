@@ -20,7 +20,7 @@ from warp_splat.compare.stability_check import (
     relative_error,
 )
 from warp_splat.compare.stability_scenes import cloud, look, tensors
-from warp_splat.config import BLUR, TILE, RasterOptions, TrainConfig
+from warp_splat.config import ALPHA_MAX, BLUR, TILE, RasterOptions, TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.losses import image_loss
@@ -85,6 +85,29 @@ def determinant_errors() -> dict[str, list[float]]:
             found = [Fraction(float(value)) for value in formula(*rows)]
             errors[name].append(max(float(abs(value / truth - 1)) for value, truth in zip(found, exact, strict=True)))
     return errors
+
+
+@functools.cache
+def recovery_error(layers: int) -> float:
+    """|T - 1| after a chain of ``layers`` and its inverse, by the pieces of the kernels in float32 on 64 pixels.
+
+    Opacities are random and small enough that T falls to about 0.01.
+    """
+    rng, one = np.random.default_rng(layers), np.float32(1.0)
+    alphas = rng.uniform(0.0, 9.0 / layers, (layers, 64)).clip(0.0, ALPHA_MAX).astype(np.float32)
+    t = np.ones(64, dtype=np.float32)
+    for alpha in alphas:
+        t = t - alpha * t
+    for alpha in alphas[::-1]:
+        t = t + t * (alpha / (one - alpha))
+    return float(np.abs(t - one).max())
+
+
+def recovery(layers: int, _mode: str) -> Outcome:
+    """T recovered by division through the whole chain; rounding may grow like n eps, two roundings a step each way."""
+    error, limit = recovery_error(layers), 4 * layers * EPS
+    failures = () if error < limit else (f"T off by {error:.1e} > {limit:.1e}",)
+    return Outcome("T = 1 in front of all", error, limit, None, 0.0, "-", failures)
 
 
 def determinant(_mode: str) -> Outcome:
@@ -192,6 +215,10 @@ def too_many_tiles(_mode: str) -> Outcome:
 
 
 CASES = (
+    *(
+        Case(f"recovery_{layers}", "numbers", "T back at 1 within 4 n eps", functools.partial(recovery, layers), False)
+        for layers in (100, 1_000, 10_000, 100_000)
+    ),
     Case("determinant", "numbers", "needles to 1e8 at every angle: error below 16 eps in float32", determinant, False),
     *(
         Case(name, "loss", "value and gradient as in float64", functools.partial(loss, scale, noise), False)
