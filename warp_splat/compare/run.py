@@ -36,8 +36,9 @@ def compare(config: CompareConfig) -> int:
         raise InputError("--device cuda: the comparison measures the CPU's kernels only; use --device cpu.")
     launch.prepare("cpu", config.threads)
     out, log = Path(config.out), []
-    with atomic_write(out / "running.txt") as path:  # before hours of measuring, not after
-        path.write_text("A comparison is running, or was interrupted.\n")
+    with atomic_write(out / ".writable") as path:  # to fail before all measuring, not after
+        path.touch()
+    (out / ".writable").unlink()
 
     def say(text: str = "") -> None:
         print(text)
@@ -56,7 +57,6 @@ def compare(config: CompareConfig) -> int:
     say(f"\nMeasured on {machine()}, {launch.get_threads()} threads.")
     with atomic_write(out / f"{name}.txt") as path:
         path.write_text("\n".join(log) + "\n", encoding="utf-8")
-    (out / "running.txt").unlink(missing_ok=True)
     print(f"Tables and plots: {out}")
     return code
 
