@@ -18,13 +18,13 @@ import torch
 
 from warp_splat import launch
 from warp_splat.compare.source import derivative_lines
+from warp_splat.compare.training import CAPS
 from warp_splat.compare.truth import Error, Truth, compute_truth, errors_of, gradients_of
 from warp_splat.compare.workloads import Workload
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.renderer import render
 
-CAPS = (2048, 512, 128)  # the thesis's loop cap, and two that bite in smaller scenes
 REPEATS = 5
 BUDGET = 12.0  # s for the repeats of a workload; slow ones get fewer
 DIFFERENCES = 12  # parameters at which central differences are computed
@@ -112,14 +112,18 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
     """Interleaved repeats over all variants that ran, fewer where one round takes long."""
     runnable = {variant: result for variant, result in found.items() if result.errors}
     start, rounds = time.perf_counter(), 0
+    stages_of: dict[Variant, list[dict[str, float]]] = {variant: [] for variant in runnable}
     while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
-        for variant, result in runnable.items():
+        for variant in runnable:
             with launch.profile() as stages:
                 _differentiate(workload, variant)
-            result.forward.append(stages["blend"])
-            result.backward.append(stages["adjoint of blend"])
-            result.stages = dict(stages)
+            stages_of[variant].append(dict(stages))
         rounds += 1
+    for variant, result in runnable.items():
+        measured = stages_of[variant]
+        result.forward = [stages["blend"] for stages in measured]
+        result.backward = [stages["adjoint of blend"] for stages in measured]
+        result.stages = {name: float(np.median([stages[name] for stages in measured])) for name in measured[0]}
 
 
 def _differentiate(workload: Workload, variant: Variant) -> None:

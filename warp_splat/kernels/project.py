@@ -111,9 +111,7 @@ def project(
     colors_out: wp.array[wp.vec3],  # [N]
     depths_out: wp.array[float],  # [N] z in the camera
     extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= alpha_min
-    radii_out: wp.array[
-        int
-    ],  # [N] px, farthest point where alpha >= alpha_min, rounded up; CULLED or INVALID if not drawn; read first
+    radii_out: wp.array[int],  # [N] px, farthest point where alpha >= alpha_min; CULLED, INVALID if not; read first
 ):
     i = first + wp.tid()
     if radii_out[i] <= 0:  # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
