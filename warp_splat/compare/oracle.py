@@ -188,6 +188,15 @@ def _decide(alpha, error, alpha_min, t_min):
     return blended, ((at_threshold | at_stop) & reached & seen).any(1)
 
 
+def _swappable(alpha, blended, key):
+    """Pixels that blend two neighbors whose float32 depths differ by rounding only: a renderer may swap them, [P]."""
+    gap = key[1:] - key[:-1]
+    close = (gap > 0) & (gap < 8 * ROUNDING * key[1:].abs())  # equal ones are ordered by index, everywhere
+    both = blended[:, 1:] & blended[:, :-1] & close
+    before = torch.cumprod(1 - torch.where(blended, alpha.clamp_max(ALPHA_MAX), 0), 1)[:, 1:]
+    return (both & (before * alpha[:, :-1] * alpha[:, 1:] > UNSEEN)).any(1)
+
+
 def _culling(splats, alpha, order, camera, alpha_min):
     """Which splats a renderer must keep, which it may keep, and how far they reach."""
     touches = torch.zeros_like(splats.live)
@@ -233,6 +242,7 @@ def render(
     with torch.no_grad():
         raw, error = _alphas(splats, order, camera, pixels)
         blended, fragile = _decide(raw, error, alpha_min, t_min)
+        fragile |= _swappable(raw, blended, key[order])
         touches, near_image, reach = _culling(splats, raw, order, camera, alpha_min)
         seen = blended.any(0)  # the others have no gradient, and need no memory for it
     order, blended = order[seen], blended[:, seen]
