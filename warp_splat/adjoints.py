@@ -10,8 +10,8 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warp_splat.binning import Bins
-from warp_splat.config import RasterOptions
+from warp_splat.binning import MAX_INSTANCES, Bins
+from warp_splat.config import T_LEAST, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.adjoint_lanes import make_reverse
 from warp_splat.kernels.blend import Splat2D
@@ -27,6 +27,12 @@ def list_inputs(bins: Bins, options: RasterOptions) -> list:
     """What every blend kernel reads first."""
     ranges, instances = view(bins.ranges, wp.vec2i), view(bins.instances, wp.vec2i)
     return [bins.tiles_x, ranges, instances, bins.splats, options.alpha_min]
+
+
+def stop_inputs(options: RasterOptions) -> list:
+    """Where a pixel stops: its least transmittance, and the entries of the list that it looks at."""
+    steps = MAX_INSTANCES if options.max_steps is None else min(options.max_steps, MAX_INSTANCES)
+    return [max(options.t_min, T_LEAST), steps]
 
 
 def memory_for_states(bins: Bins) -> torch.Tensor:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warp_splat.adjoints import list_inputs, memory_for_states
-from warp_splat.binning import MAX_INSTANCES, Bins
+from warp_splat.adjoints import list_inputs, memory_for_states, stop_inputs
+from warp_splat.binning import Bins
 from warp_splat.camera import Camera
-from warp_splat.config import T_LEAST, TILE, RasterOptions
+from warp_splat.config import TILE, RasterOptions
 from warp_splat.kernels.adjoint_block import make_reverse_block, make_upstream_block
 from warp_splat.kernels.blend_block import make_blend_block
 from warp_splat.kernels.taped_block import make_walk_block
@@ -26,14 +26,10 @@ def blend_blocks(
     depth = new(height, width) if options.depth else new(0, 0)
     final, count = new(tile_count, THREADS), new(tile_count, THREADS, dtype=torch.int32)
     kept = memory_for_states(bins).view(-1, THREADS) if keep else new(0, THREADS)
-    steps = [
-        max(options.t_min, T_LEAST),
-        min(MAX_INSTANCES, MAX_INSTANCES if options.max_steps is None else options.max_steps),
-    ]
     launch_blocks(
         make_blend_block(options.depth, options.exp_degree, keep),
         tile_count,
-        [*list_inputs(bins, options), *steps, _float(background)],
+        [*list_inputs(bins, options), *stop_inputs(options), _float(background)],
         [*map(_float, (image, alpha, depth, final)), view(count, wp.int32), _float(kept)],
         background.device,
     )

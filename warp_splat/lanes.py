@@ -8,10 +8,10 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from warp_splat.adjoints import adjoint_of_blend, list_inputs, memory_for_states
-from warp_splat.binning import MAX_INSTANCES, Bins
+from warp_splat.adjoints import adjoint_of_blend, list_inputs, memory_for_states, stop_inputs
+from warp_splat.binning import Bins
 from warp_splat.camera import Camera
-from warp_splat.config import T_LEAST, RasterOptions
+from warp_splat.config import RasterOptions
 from warp_splat.kernels.blend_lanes import BLOCKS, make_blend, make_upstream
 from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.launch import launch, view
@@ -35,14 +35,10 @@ def blend_lanes(
     tile_count = len(bins.ranges)
     final, count = torch.empty(tile_count, BLOCKS, LANES), torch.empty(tile_count, BLOCKS, LANES)
     kept = memory_for_states(bins) if keep else torch.empty(0, 0, LANES)
-    steps = [
-        max(options.t_min, T_LEAST),
-        min(MAX_INSTANCES, MAX_INSTANCES if options.max_steps is None else options.max_steps),
-    ]
     launch(
         make_blend(options.depth, options.exp_degree, keep),
         tile_count,
-        [*list_inputs(bins, options), *steps, view(background, wp.float32)],
+        [*list_inputs(bins, options), *stop_inputs(options), view(background, wp.float32)],
         [*_pixel_views(image, alpha, depth), *(view(lanes, vec16) for lanes in (final, count, kept))],
         bounds=bins.slices,
     )
