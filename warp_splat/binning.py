@@ -60,13 +60,13 @@ def bin_by_counting(
     row_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
     slot_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
-    support = [options.alpha_min, int(options.extent == "square")]
-    launch(tiles.pack, drawn, [order, *tensors, camera.height, *support], [splats, row_ends])
+    square = int(options.extent == "square")
+    launch(tiles.pack, drawn, [order, *tensors, camera.height, options.alpha_min, square], [splats, row_ends])
     rows = _scan(row_ends)
     _check_count(rows, camera, drawn, radii.device)
     spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
     size = [camera.width, camera.height, tiles_x]
-    launch(tiles.find_spans, drawn, [splats, row_ends, *size, *support], [spans, slot_ends])
+    launch(tiles.find_spans, drawn, [splats, row_ends, *size, square], [spans, slot_ends])
     count = _scan(slot_ends)
     _check_count(count, camera, drawn, radii.device)
     instances, ends = _sort_by_tile(spans, row_ends, slot_ends, count, tiles_x * tiles_y)
@@ -84,11 +84,15 @@ def bin_by_sorting(
     order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
-    support = [options.alpha_min, int(options.extent == "square")]
+    square = int(options.extent == "square")
     launch(
-        tiles.pack, total, [order, *tensors, camera.height, *support], [splats, view(counts, wp.int64)], device=device
+        tiles.pack,
+        total,
+        [order, *tensors, camera.height, options.alpha_min, square],
+        [splats, view(counts, wp.int64)],
+        device=device,
     )
-    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, *support]
+    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
 
     def list_tiles(slot_ends: torch.Tensor, *lists: torch.Tensor) -> None:
         outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]

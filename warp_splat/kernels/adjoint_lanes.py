@@ -9,10 +9,12 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.blend import Splat2D, exponent
-from warp_splat.kernels.blend_lanes import BLOCKS, mat_blocks, offset_x, offset_y, reach, vec4i
+from warp_splat.kernels.blend_lanes import BLOCKS, offset_x, offset_y, reach, vec4i
 from warp_splat.kernels.build import IN_LANES
 from warp_splat.kernels.lanes import LANES, times, total, vec16
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
+
+vec5 = wp.types.vector(length=5, dtype=float)
 
 
 @functools.cache
@@ -59,10 +61,10 @@ def _make_manual_body(depth: bool, exp_degree: int | None) -> tuple[wp.Function,
         return front, adj_front, part
 
     @wp.func
-    def adj_geometry(m: wp.array[vec16], splat: Splat2D):
+    def adj_geometry(sums: vec5, splat: Splat2D):
         """dL/d(mean, conic)."""
-        s = wp.vec2(total(m[0]), total(m[1]))
-        return geometry_from_moments(s, total(m[2]), total(m[3]), total(m[4]), splat.root, splat.opacity)
+        s = wp.vec2(sums[0], sums[1])
+        return geometry_from_moments(s, sums[2], sums[3], sums[4], splat.root, splat.opacity)
 
     return body, adj_geometry
 
@@ -119,10 +121,10 @@ def _make_stepwise_body(depth: bool, exp_degree: int | None) -> tuple[wp.Functio
         return front, adj_front, part
 
     @wp.func
-    def adj_geometry(m: wp.array[vec16], splat: Splat2D):
+    def adj_geometry(sums: vec5, splat: Splat2D):
         """dL/d(mean, conic)."""
-        adj_root = wp.vec3(total(m[2]), total(m[3]), total(m[4]))
-        return wp.vec2(total(m[0]), total(m[1])), conic_from_root(adj_root, splat.root)
+        adj_root = wp.vec3(sums[2], sums[3], sums[4])
+        return wp.vec2(sums[0], sums[1]), conic_from_root(adj_root, splat.root)
 
     return body, adj_geometry
 
@@ -138,7 +140,9 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
     """The reverse loop with the body of ``mode``."""
     CHANNELS = 4 if depth else 3
     GRADS = 6 + CHANNELS
-    mat_state = wp.types.matrix(shape=(BLOCKS * CHANNELS, LANES), dtype=float)
+    # all in one matrix: a matrix of which only rows of known numbers are used would be taken apart into scalars
+    ADJ_T, WALKED, UP, SUMS = BLOCKS, 2 * BLOCKS, 3 * BLOCKS, (3 + CHANNELS) * BLOCKS
+    mat_state = wp.types.matrix(shape=(SUMS + GRADS, LANES), dtype=float)
     make_body = {"manual": _make_manual_body, "stepwise": _make_stepwise_body}[mode]
     body, adj_geometry = make_body(depth, exp_degree)
 
@@ -162,19 +166,15 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
         start = ranges[tile][0]
         x0 = float((tile % tiles_x) * TILE) + 0.5
         y0 = float((tile // tiles_x) * TILE) + 0.5
-        t = mat_blocks()
-        adj_t = mat_blocks()
-        walked = mat_blocks()
-        u = mat_state()
-        m = wp.zeros(shape=(GRADS,), dtype=vec16)
+        s = mat_state()  # T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
         for block in range(BLOCKS):
-            t[block] = final[tile, block]
-            adj_t[block] = adj_final[tile, block]
+            s[block] = final[tile, block]
+            s[ADJ_T + block] = adj_final[tile, block]
             if wp.static(mode == "manual"):
-                adj_t[block] = times(t[block], adj_t[block])
-            walked[block] = count[tile, block]
+                s[ADJ_T + block] = times(final[tile, block], adj_final[tile, block])
+            s[WALKED + block] = count[tile, block]
             for channel in range(CHANNELS):
-                u[channel * BLOCKS + block] = up[tile, block * CHANNELS + channel]
+                s[UP + channel * BLOCKS + block] = up[tile, block * CHANNELS + channel]
         far = vec16(0.0)
         ahead = vec4i(0)
         for back in range(steps[tile]):
@@ -187,7 +187,7 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
             ahead = reach(following.mean, following.extent, x0, y0)
             here = vec16(float(k - start))
             for grad in range(GRADS):
-                m[grad] = vec16(0.0)
+                s[SUMS + grad] = vec16(0.0)
             by = box[2]
             while by <= box[3]:
                 dy = offset_y(splat.mean, y0, by)
@@ -196,25 +196,28 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
                     block = (4 * by + bx) & (BLOCKS - 1)
                     dx = offset_x(splat.mean, x0, bx)
                     if wp.static(depth):
-                        far = u[3 * BLOCKS + block]
+                        far = s[UP + 3 * BLOCKS + block]
                     front, adj_front, part = body(
-                        splat, dx, dy, t[block], adj_t[block], alpha_min, here, walked[block],
-                        u[block], u[BLOCKS + block], u[2 * BLOCKS + block], far,
+                        splat, dx, dy, s[block], s[ADJ_T + block], alpha_min, here, s[WALKED + block],
+                        s[UP + block], s[UP + BLOCKS + block], s[UP + 2 * BLOCKS + block], far,
                     )  # fmt: skip
-                    t[block] = front
-                    adj_t[block] = adj_front
+                    s[block] = front
+                    s[ADJ_T + block] = adj_front
                     for grad in range(GRADS):
-                        m[grad] = m[grad] + part[grad]
+                        s[SUMS + grad] = s[SUMS + grad] + part[grad]
                     bx += 1
                 by += 1
             slot = instances[k][1]
-            adj_mean, adj_conic = adj_geometry(m, splat)
+            sums = vec5()
+            for grad in range(5):
+                sums[grad] = total(s[SUMS + grad])
+            adj_mean, adj_conic = adj_geometry(sums, splat)
             slots_out[slot, 0] = adj_mean[0]
             slots_out[slot, 1] = adj_mean[1]
             slots_out[slot, 2] = adj_conic[0]
             slots_out[slot, 3] = adj_conic[1]
             slots_out[slot, 4] = adj_conic[2]
             for grad in range(5, GRADS):
-                slots_out[slot, grad] = total(m[grad])
+                slots_out[slot, grad] = total(s[SUMS + grad])
 
     return adj_blend

@@ -24,6 +24,8 @@ from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, total, vec16, where_
 BLOCKS = TILE * TILE // LANES  # per tile
 STRIDE = 32  # instances between two looks at whether the whole tile has stopped
 
+MAX_FLOAT = wp.constant(3.4028234663852886e38)
+
 vec4i = wp.types.vector(length=4, dtype=int)
 mat_blocks = wp.types.matrix(shape=(BLOCKS, LANES), dtype=float)  # a number per pixel of a tile
 
@@ -53,6 +55,12 @@ def offset_x(mean: wp.vec2, x0: float, bx: int):
 @wp.func
 def offset_y(mean: wp.vec2, y0: float, by: int):
     return (vec16(mean[1] - y0) - LANE_Y) - vec16(float(4 * by))
+
+
+@wp.func
+def finite(x: float):
+    """Neither infinite nor NaN; wp.isfinite is a call on the CPU."""
+    return wp.abs(x) <= MAX_FLOAT
 
 
 @functools.cache
@@ -132,18 +140,21 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
             t[block] = wp.max(t[block], -t[block])
             final_out[tile, block] = t[block]
             count_out[tile, block] = count[block]
-        for pixel in range(TILE * TILE):
-            block = pixel // LANES
-            lane = pixel % LANES
-            x = column + 4 * (block % 4) + lane % 4
-            y = line + 4 * (block // 4) + lane // 4
-            if y < image_out.shape[0] and x < image_out.shape[1]:
-                final = t[block][lane]
-                for channel in range(3):
-                    image_out[y, x, channel] = c[channel * BLOCKS + block][lane] + final * background[channel]
-                alpha_out[y, x] = 1.0 - final
-                if wp.static(depth):
-                    depth_out[y, x] = c[3 * BLOCKS + block][lane]
+        block = int(0)
+        while block < BLOCKS:
+            left = column + 4 * (block & 3)
+            top = line + 4 * (block >> 2)
+            for lane in range(LANES):
+                x = left + lane % 4
+                y = top + lane // 4
+                if y < image_out.shape[0] and x < image_out.shape[1]:
+                    final = t[block, lane]
+                    for channel in range(3):
+                        image_out[y, x, channel] = c[channel * BLOCKS + block, lane] + final * background[channel]
+                    alpha_out[y, x] = 1.0 - final
+                    if wp.static(depth):
+                        depth_out[y, x] = c[3 * BLOCKS + block, lane]
+            block += 1
 
     return blend
 
@@ -153,6 +164,7 @@ def make_upstream(depth: bool) -> wp.Kernel:
     """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
     CHANNELS = 4 if depth else 3
     STATE = BLOCKS * CHANNELS
+    mat_state = wp.types.matrix(shape=(STATE, LANES), dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def upstream(
@@ -177,30 +189,37 @@ def make_upstream(depth: bool) -> wp.Kernel:
         tile = first + wp.tid()
         column = (tile % tiles_x) * TILE
         line = (tile // tiles_x) * TILE
-        up = wp.zeros(shape=(STATE,), dtype=vec16)
-        adj_final = wp.zeros(shape=(BLOCKS,), dtype=vec16)
+        up = mat_state(0.0)
+        adj_final = mat_blocks(0.0)
+        t = mat_blocks()
+        for block in range(BLOCKS):
+            t[block] = final[tile, block]
         adj_background = wp.vec3(0.0)
         dropped = int(0)
-        for pixel in range(TILE * TILE):
-            block = pixel // LANES
-            lane = pixel % LANES
-            x = column + 4 * (block % 4) + lane % 4
-            y = line + 4 * (block // 4) + lane // 4
-            if y < adj_image.shape[0] and x < adj_image.shape[1]:
-                u = wp.vec4(adj_image[y, x, 0], adj_image[y, x, 1], adj_image[y, x, 2], 0.0)
-                adj_t = -adj_alpha[y, x]
-                if wp.static(depth):
-                    u[3] = adj_depth[y, x]
-                if wp.isfinite(u) and wp.isfinite(adj_t):
-                    for channel in range(CHANNELS):
-                        up[block * CHANNELS + channel][lane] = u[channel]
-                    t = final[tile, block][lane]
-                    for channel in range(3):
-                        adj_t += u[channel] * background[channel]
-                        adj_background[channel] += u[channel] * t
-                    adj_final[block][lane] = adj_t
-                else:
-                    dropped += 1
+        block = int(0)
+        while block < BLOCKS:
+            left = column + 4 * (block & 3)
+            top = line + 4 * (block >> 2)
+            for lane in range(LANES):
+                x = left + lane % 4
+                y = top + lane // 4
+                if y < adj_image.shape[0] and x < adj_image.shape[1]:
+                    u = wp.vec3(adj_image[y, x, 0], adj_image[y, x, 1], adj_image[y, x, 2])
+                    adj_t = -adj_alpha[y, x]
+                    far = float(0.0)
+                    if wp.static(depth):
+                        far = adj_depth[y, x]
+                    if finite(u[0]) and finite(u[1]) and finite(u[2]) and finite(adj_t) and finite(far):
+                        for channel in range(3):
+                            up[block * CHANNELS + channel, lane] = u[channel]
+                            adj_t += u[channel] * background[channel]
+                            adj_background[channel] += u[channel] * t[block, lane]
+                        if wp.static(depth):
+                            up[block * CHANNELS + 3, lane] = far
+                        adj_final[block, lane] = adj_t
+                    else:
+                        dropped += 1
+            block += 1
         for i in range(STATE):
             up_out[tile, i] = up[i]
         longest = float(0.0)
