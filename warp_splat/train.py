@@ -60,7 +60,7 @@ def train(config: TrainConfig) -> int:
     if problem:
         raise InputError(problem)
     say = (lambda *_: None) if config.quiet else tqdm.write
-    device = settle_device(launch.prepare(config.device, config.threads), config.device, config.adjoint, say)
+    device = settle_device(launch.prepare(config.device, config.threads), config.device, [config.adjoint], say)
     config.device = device.type
     if config.data_device == "cuda" and device.type != "cuda":
         raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
