@@ -59,7 +59,7 @@ def compare(config: CompareConfig) -> int:
         name, code = "compare", 0
         scenes = named_scenes(config.scene, print)
         _compare_pixel_loops(config, scenes, device, out, say)
-        training.run(out, config.modes, scenes, config.full, say, device)
+        training.run(out, config.modes, scenes, config.full, say, device.type)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {launch.get_threads()} threads.")
     with atomic_write(out / f"{name}.txt") as path:
