@@ -205,9 +205,8 @@ def _judge(trainer: Trainer, result: Run) -> None:
 def _list_lengths(trainer: Trainer, view: View) -> np.ndarray:
     """Entries in the list of each tile of a view."""
     gaussians = trainer.model.activated()
-    cam = camera_view(view.camera, gaussians[5].shape[1], trainer.options)
-    bins = bin_tiles(*Project.apply(*gaussians, cam, Dropped()), view.camera, trainer.options)
-    return np.diff(bins.ranges.cpu().numpy())
+    projected = Project.apply(*gaussians, camera_view(view.camera, gaussians[5].shape[1], trainer.options), Dropped())
+    return np.diff(bin_tiles(*projected, view.camera, trainer.options).ranges.cpu().numpy())
 
 
 def _views(scene: Scene) -> list[View]:
