@@ -35,7 +35,7 @@ def image_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 
             f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
         )
     if image.is_cuda:
-        return loss_by_convolution(image, target, lambda_dssim)
+        return LossByConvolution.apply(image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim)
 
 
@@ -77,6 +77,22 @@ def _window(device: torch.device) -> torch.Tensor:
 def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
     """The share of the window inside the image around each pixel, [1, H, W]."""
     return _blur(torch.ones(1, ssim.CHANNELS, height, width, device=device))[0, :1]
+
+
+class LossByConvolution(torch.autograd.Function):
+    """:func:`loss_by_convolution` with its adjoint as a stage of its own."""
+
+    @staticmethod
+    def forward(ctx, image, target, lambda_dssim):
+        with torch.set_grad_enabled(ctx.needs_input_grad[0]):
+            ctx.image = image.detach().requires_grad_(ctx.needs_input_grad[0])
+            ctx.loss = loss_by_convolution(ctx.image, target, lambda_dssim)
+        return ctx.loss.detach()
+
+    @staticmethod
+    def backward(ctx, adj_loss):
+        with stage("adjoint of loss"):
+            return *torch.autograd.grad(ctx.loss, ctx.image, adj_loss), None, None
 
 
 class ImageLoss(torch.autograd.Function):

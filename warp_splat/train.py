@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from warp_splat import launch, report
 from warp_splat.config import TrainConfig, check_train
-from warp_splat.devices import is_out_of_memory
+from warp_splat.devices import memory_explained
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views
 from warp_splat.formats import model_folder
@@ -60,7 +60,7 @@ def train(config: TrainConfig) -> int:
     if problem:
         raise InputError(problem)
     say = (lambda *_: None) if config.quiet else tqdm.write
-    device = settle_device(launch.prepare(config.device, config.threads), config.device, config.adjoint, say)
+    device = settle_device(launch.prepare(config.device, config.threads), config.device, [config.adjoint], say)
     config.device = device.type
     if config.data_device == "cuda" and device.type != "cuda":
         raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
@@ -119,23 +119,13 @@ def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
     save_points(folder / "input.ply", scene.points, scene.colors)
 
 
-@contextmanager
 def _memory_explained(trainer: Trainer):
-    """Turn an error that means that memory ran out into an InputError that says where, and what takes less."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        where = getattr(error, "__notes__", ["between two stages"])[0]
-        camera = max((view.camera for view in trainer.scene.train), key=lambda camera: camera.width * camera.height)
-        fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
-        if trainer.config.data_device == "cuda":
-            fewer.append("--data_device cpu")
-        raise InputError(
-            f"Out of memory on {trainer.device.type} {where}, with {len(trainer.model)} Gaussians on {camera.width} x "
-            f"{camera.height} px; train with {' or '.join(fewer)}."
-        ) from error
+    """See :func:`memory_explained`."""
+    fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
+    if trainer.config.data_device == "cuda":
+        fewer.append("--data_device cpu")
+    sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
+    return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
 
 
 @contextmanager
