@@ -23,6 +23,10 @@ from warp_splat.launch import stage
 PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
 
 
+class GroupError(InputError):
+    """The processes cannot go on together: one has ended, or their models differ."""
+
+
 class Processes:
     """A process that trains alone: nothing is exchanged.
 
@@ -57,7 +61,7 @@ class Processes:
         return text
 
     def check_identical(self, tensors: Iterable[torch.Tensor], iteration: int) -> None:
-        """Compare the bytes of ``tensors`` over the processes. Raises InputError if they differ."""
+        """Compare the bytes of ``tensors`` over the processes. Raises GroupError if they differ."""
 
 
 ALONE = Processes()
@@ -67,7 +71,7 @@ class ProcessGroup(Processes):
     """One of several processes, all of which call the same methods in the same order.
 
     Raises:
-        InputError: from every method, if another process has ended or is silent for longer than PATIENCE.
+        GroupError: from every method, if another process has ended or is silent for longer than PATIENCE.
     """
 
     def __init__(self, rank: int, count: int, local_count: int):
@@ -106,7 +110,7 @@ class ProcessGroup(Processes):
         self._exchange(dist.all_gather, found, own)
         names = [bytes(other.tolist()).hex()[:8] for other in found]
         if len(set(names)) > 1:
-            raise InputError(
+            raise GroupError(
                 f"Process {self.rank}: expected the same model in all {self.count} processes after {iteration} "
                 f"iterations, found SHA-256 {', '.join(names)} (rank 0, 1, ...); give all the same scene, processors "
                 "or GPUs of one kind, and the same versions of torch and Warp."
@@ -119,10 +123,11 @@ class ProcessGroup(Processes):
             if is_out_of_memory(error):
                 raise
             self.lost = True
-            raise InputError(
-                f"Process {self.rank}: expected an answer from all {self.count} processes, but one has ended, or was "
-                f"silent for {PATIENCE.seconds // 60} minutes ({str(error).splitlines()[0]}); see which one failed "
-                "and why in the lines around this one."
+            silent = any(words in str(error).lower() for words in ("timed out", "timeout"))
+            what = f"was silent for {PATIENCE.seconds // 60} minutes" if silent else "has ended"
+            raise GroupError(
+                f"Process {self.rank}: expected an answer from all {self.count} processes, but one {what}; see which "
+                "one, and why, in its own message or in torchrun's report."
             ) from error
 
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from warp_splat import launch, report
 from warp_splat.config import TrainConfig, check_train
 from warp_splat.devices import peak_memory
-from warp_splat.distributed import Processes, join
+from warp_splat.distributed import GroupError, Processes, join
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views
 from warp_splat.formats import model_folder
@@ -56,7 +56,7 @@ def train(config: TrainConfig) -> int:
     """Train as ``config`` says; returns the process's exit code (130 if interrupted, with the model saved).
 
     Raises:
-        InputError: if an option, the scene or the output folder is not usable, or another process has ended.
+        InputError: if an option, the scene or the output folder is not usable.
     """
     problem = check_train(config)
     if problem:
@@ -108,6 +108,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         with _interruptible() as interrupted:
             try:
                 _loop(trainer, run, interrupted)
+            except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
+                tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
+                return 1
             finally:  # whatever happened, the model comes first
                 if leads or processes.lost:
                     print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")

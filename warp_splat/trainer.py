@@ -128,7 +128,7 @@ class Trainer:
         self.optimizer.adam.zero_grad(set_to_none=True)
 
     def check_identical(self, iteration: int) -> None:
-        """Raise InputError if the model is not the same, byte for byte, in all processes."""
+        """Raise GroupError if the model is not the same, byte for byte, in all processes."""
         self.processes.check_identical(self.model.parameters.values(), iteration)
 
     def _next_view(self) -> View:
