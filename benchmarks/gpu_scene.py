@@ -1,4 +1,4 @@
-"""For ``gpu.py``: a scene without files, of any number of Gaussians, a trainer on it, and a clock for either device."""
+"""A scene without files, of any number of Gaussians, trainers on it or another, and a clock for either device."""
 
 import math
 import statistics
@@ -49,21 +49,42 @@ def cameras(width: int, height: int, count: int) -> list[Camera]:
     return [camera.resized(width, height) for camera in found]
 
 
-def make_trainer(count: int, width: int, height: int, device: str) -> Trainer:
-    """A trainer of ``count`` Gaussians at the highest degree, which watches their gradients but does not densify."""
+def make_scene(width: int, height: int) -> Scene:
+    """VIEWS photographs of noise, from the orbit."""
     rng = np.random.default_rng(0)
     views = [
         View(f"{index}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8), camera)
         for index, camera in enumerate(cameras(width, height, VIEWS))
     ]
-    scene = Scene(views, [], np.eye(4, 3, dtype=np.float32), np.zeros((4, 3), np.uint8))
+    return Scene(views, [], np.eye(4, 3, dtype=np.float32), np.zeros((4, 3), np.uint8))
+
+
+def make_trainer(count: int, width: int, height: int, device: str) -> Trainer:
+    """:func:`trainer_on` the scene and ``count`` random Gaussians."""
+    return trainer_on(make_scene(width, height), make_gaussians(count, device), device)
+
+
+def trainer_on(scene: Scene, gaussians: GaussianModel, device: str, **options) -> Trainer:
+    """A trainer of ``gaussians`` at the highest degree, which watches their gradients but does not densify."""
     never = {"densify_from_iter": NEVER, "densify_until_iter": NEVER, "opacity_reset_interval": NEVER}
-    trainer = Trainer(scene, TrainConfig(device=device, data_device=device, sh_interval=1, **never))
+    trainer = Trainer(scene, TrainConfig(device=device, data_device=device, **{"sh_interval": 1, **never, **options}))
     nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
-    added = {name: tensor.detach() for name, tensor in make_gaussians(count, device).parameters.items()}
+    added = {name: tensor.detach() for name, tensor in gaussians.parameters.items()}
     trainer.optimizer.replace(nobody, added)
     trainer.densifier = Densifier(trainer.model, trainer.optimizer, trainer.config, scene.extent)
     return trainer
+
+
+def steps_of(trainer: Trainer) -> Callable[[], None]:
+    """What takes one step after another."""
+    iterations = iter(range(10, NEVER))
+
+    def step() -> None:
+        iteration = next(iterations)
+        trainer.differentiate(iteration)
+        trainer.update(iteration)
+
+    return step
 
 
 def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:

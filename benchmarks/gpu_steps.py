@@ -4,7 +4,7 @@ import statistics
 import time
 
 import torch
-from gpu_scene import cameras, make_gaussians, make_trainer, milliseconds, synchronize
+from gpu_scene import cameras, make_gaussians, make_trainer, milliseconds, steps_of, synchronize
 
 from warp_splat import launch
 from warp_splat.compare import adjoints
@@ -32,14 +32,7 @@ def measure_step(count: int, width: int, height: int, device: str, steps: int) -
     """
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
-    trainer = make_trainer(count, width, height, device)
-    iterations = iter(range(10, 10**6))
-
-    def step() -> None:
-        iteration = next(iterations)
-        trainer.differentiate(iteration)
-        trainer.update(iteration)
-
+    step = steps_of(make_trainer(count, width, height, device))
     for _ in range(5):
         step()
     whole = _whole_step(step, device, steps)

@@ -71,8 +71,11 @@ class GaussianModel:
             found["sh_rest"] = found["sh_rest"][:, : (degree + 1) ** 2 - 1]
         return list(found.values())
 
-    def activated(self) -> tuple[torch.Tensor, ...]:
-        """(means, quats, scales, opacities, sh_dc, sh_rest) as the renderer takes them."""
+    def activated(self, degree: int | None = None) -> tuple[torch.Tensor, ...]:
+        """(means, quats, scales, opacities, sh_dc, sh_rest) as the renderer takes them.
+
+        At ``degree`` 0, sh_rest is empty, so that none of the 45 numbers gets a gradient.
+        """
         raw = self.parameters
         return (
             raw["means"],
@@ -80,7 +83,7 @@ class GaussianModel:
             torch.exp(raw["scales"].clamp_max(88.0)),  # finite; the renderer leaves out what is too large
             torch.sigmoid(raw["opacities"]),
             raw["sh_dc"],
-            raw["sh_rest"],
+            raw["sh_rest"].detach()[:, :0] if degree == 0 else raw["sh_rest"],
         )
 
     def save(self, path: Path, comments: tuple[str, ...] = ()) -> None:

@@ -60,6 +60,9 @@ class Optimizer:
             for group in self.adam.param_groups:
                 self._sparse_step(group, radii)
         else:
+            rest = self.model.parameters["sh_rest"]
+            if rest.grad is None:  # degree 0: gradients of zero would change nothing but the count of the steps
+                self._state(rest)["step"] += 1
             self.adam.step()
         self.adam.zero_grad(set_to_none=True)
 
@@ -68,9 +71,7 @@ class Optimizer:
         parameter = group["params"][0]
         if parameter.grad is None or parameter.numel() == 0:
             return
-        state = self.adam.state[parameter]
-        if not state:
-            state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=torch.tensor(0.0))
+        state = self._state(parameter)
         tables = [tensor.detach().view(len(radii), -1) for tensor in (parameter, *(state[name] for name in MOMENTS))]
         grad = parameter.grad.reshape(len(radii), -1)
         launch(
@@ -80,6 +81,14 @@ class Optimizer:
             [view(table, wp.float32) for table in tables],
             device=radii.device,
         )
+
+    def _state(self, parameter: torch.Tensor) -> dict:
+        """Moments and number of steps, as torch's Adam keeps them."""
+        state = self.adam.state[parameter]
+        if not state:
+            step = torch.zeros((), device=parameter.device)
+            state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=step)
+        return state
 
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
         """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""

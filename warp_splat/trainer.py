@@ -153,7 +153,9 @@ class Trainer:
 
     def _render(self, camera: Camera, background: torch.Tensor):
         options = replace(self.options, sh_degree=self.degree)
-        return render(self.model.activated(), camera, background, options, self.config.adjoint)
+        with stage("project"):
+            gaussians = self.model.activated(self.degree)
+        return render(gaussians, camera, background, options, self.config.adjoint)
 
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""

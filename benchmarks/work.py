@@ -1,0 +1,142 @@
+"""How much there is to do in a training step: bytes and operations that no implementation can do without.
+
+Bytes: each array that a stage must read or write, once; what it keeps for itself in between (lists by tile while
+sorting, a row of gradients per tile instance, blurred planes) is not counted. Operations: on single numbers, a
+multiply-add, a comparison with its selection, a conversion as one each, a division as four (estimate, Newton step).
+
+Per pair of a Gaussian and a pixel that it is blended into, from ``kernels/blend.py`` and ``kernels/step.py``:
+
+    forward   offset 2, exponent 5, exponential 11 (bound, whole, fraction 2, polynomial 5, exponent bits 2), alpha 3,
+              transmittance 4, weight 2, color 3, where the pixel stops 1
+    adjoint   offset 2, exponent 5, exponential 11, alpha 4, odds 5, weight and transmittance 2, color . u 3,
+              dL/dalpha 2, its cut 2, what is behind 1, dL/dopacity 1, moments 8, color 3
+
+Pairs are counted exactly: alpha is at least ``alpha_min`` and the pixel has not stopped. Sixteen of them fill a
+vector; a driver that looks at whole blocks of pixels does more, as ``looked_at`` tells.
+"""
+
+from dataclasses import astuple, dataclass
+
+import torch
+import warp as wp
+
+from warp_splat.adjoints import list_inputs
+from warp_splat.binning import bin_tiles
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.kernels.blend import Splat2D, alpha_of, exponent, make_exp
+from warp_splat.kernels.blend_lanes import BLOCKS, offset_x, offset_y, reach
+from warp_splat.kernels.build import IN_LANES
+from warp_splat.kernels.lanes import LANES, total, vec16, where_less
+from warp_splat.lanes import blend_lanes
+from warp_splat.launch import launch, view
+from warp_splat.renderer import Dropped, Project, camera_view
+
+FORWARD, ADJOINT = 31, 49  # operations per pair
+PROJECT = 240  # per Gaussian drawn, two thirds of them for its shape; its adjoint: again, and twice that
+LOSS, ADJOINT_OF_LOSS = 159, 73  # per channel of a pixel: five planes blurred along rows and columns; three
+
+exp2_minus = make_exp(RasterOptions().exp_degree)
+
+
+@wp.kernel(module="unique", module_options=dict(IN_LANES))
+def count_pairs(
+    first: int,
+    tiles_x: int,
+    ranges: wp.array[wp.vec2i],  # [T]
+    instances: wp.array[wp.vec2i],  # [M]
+    splats: wp.array[Splat2D],  # [V]
+    alpha_min: float,
+    count: wp.array2d[vec16],  # [T, BLOCKS] instances walked before the pixel stopped
+    # out
+    pairs_out: wp.array2d[wp.int64],  # [T, 2] blended, and looked at in blocks
+):
+    tile = first + wp.tid()
+    start = ranges[tile][0]
+    x0 = float((tile % tiles_x) * 16) + 0.5
+    y0 = float((tile // tiles_x) * 16) + 0.5
+    longest = wp.max(count[tile, 0])
+    for block in range(1, BLOCKS):
+        longest = wp.max(longest, wp.max(count[tile, block]))
+    blended = wp.int64(0)
+    looked_at = wp.int64(0)
+    for k in range(start, start + int(longest)):
+        splat = splats[instances[k][0]]
+        box = reach(splat.mean, splat.extent, x0, y0)
+        hits = vec16(0.0)
+        for by in range(box[2], box[3] + 1):
+            for bx in range(box[0], box[1] + 1):
+                dx = offset_x(splat.mean, x0, bx)
+                dy = offset_y(splat.mean, y0, by)
+                fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+                alpha = alpha_of(fall * splat.opacity, alpha_min)
+                hit = where_less(vec16(0.0), alpha, vec16(1.0), vec16(0.0))
+                hits += where_less(vec16(float(k - start)), count[tile, 4 * by + bx], hit, vec16(0.0))
+                looked_at += wp.int64(LANES)
+        blended += wp.int64(total(hits))
+    pairs_out[tile, 0] = blended
+    pairs_out[tile, 1] = looked_at
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What a step has to do with; means over views, if of several."""
+
+    gaussians: float
+    coefficients: float  # of spherical harmonics, active, per channel
+    drawn: float  # Gaussians
+    pixels: float
+    instances: float  # Gaussians in tiles
+    pairs: float  # Gaussians in pixels, blended
+    looked_at: float  # Gaussians in pixels of blocks of 4 x 4
+
+
+def count(gaussians: tuple[torch.Tensor, ...], camera: Camera, options: RasterOptions) -> Counts:
+    """Of one view on the CPU; ``gaussians`` as :func:`warp_splat.renderer.render` takes them."""
+    with torch.no_grad():
+        cam = camera_view(camera, gaussians[5].shape[1], options)
+        bins = bin_tiles(*Project.apply(*gaussians, cam, Dropped()), camera, options)
+        _, _, _, (_, stopped, _) = blend_lanes(bins, camera, torch.zeros(3), options, False)
+        pairs = torch.empty(len(bins.ranges), 2, dtype=torch.int64)
+        inputs = [*list_inputs(bins, options), view(stopped, vec16)]
+        launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
+    blended, looked_at = pairs.sum(0).tolist()
+    pixels = camera.width * camera.height
+    coefficients = (cam.sh_degree + 1) ** 2
+    return Counts(len(gaussians[0]), coefficients, len(bins.order), pixels, len(bins.instances), blended, looked_at)
+
+
+def mean(counts: list[Counts]) -> Counts:
+    return Counts(*(sum(values) / len(counts) for values in zip(*map(astuple, counts), strict=True)))
+
+
+def work_of(counts: Counts) -> dict[str, tuple[float, float]]:
+    """Bytes and operations of each stage; ``host`` has nothing that must be done.
+
+    Per Gaussian of 44 bytes (mean 12, quaternion 16, scales 12, opacity 4) and 12 per SH coefficient; projected, of 48
+    (mean 8, conic 12, opacity 4, color 12, depth 4, extent 8) and a radius of 4.
+    """
+    n, drawn, pixels = counts.gaussians, counts.drawn, counts.pixels
+    sh = 12 * counts.coefficients
+    gradient2d = 40  # all of a projected Gaussian but its extent
+    return {
+        # shapes in; radii out; of those drawn, SH in and the rest out
+        "project": (n * (44 + 4) + drawn * (sh + 48), PROJECT * drawn),
+        # radii and projected Gaussians in; these in depth order, where each came from and where its instances end, and
+        # the instances (rank 4, slot 4) out
+        "bin": (n * 4 + drawn * (48 + 48 + 12) + counts.instances * 8, 0),
+        # instances and Gaussians in; image, alpha, and for the adjoint final T and count out
+        "blend": (counts.instances * 8 + drawn * 48 + pixels * 24, FORWARD * counts.pairs),
+        # image (float32) and photograph (uint8) in; for the adjoint, these and the gradient of the image
+        "loss": (pixels * 15, LOSS * 3 * pixels),
+        "adjoint of loss": (pixels * 27, ADJOINT_OF_LOSS * 3 * pixels),
+        # as the blend, with the gradient of the image in, and gradients of the projected Gaussians out
+        "adjoint of blend": (counts.instances * 8 + drawn * (48 + gradient2d) + pixels * 20, ADJOINT * counts.pairs),
+        # radii in; of those drawn, shapes, SH and gradients in; gradients of all out
+        "adjoint of project": (n * (4 + 44 + sh) + drawn * (44 + sh + gradient2d), 3 * PROJECT * drawn),
+        # radii in; of those drawn, the gradient of the mean in, its sum and the number of views in and out
+        "densify": (n * 4 + drawn * (8 + 16), 0),
+        # value, gradient and two moments in; all but the gradient out
+        "Adam": (n * (44 + sh) * 7, 12 * n * (11 + 3 * counts.coefficients)),
+        "host": (0, 0),
+    }
