@@ -48,6 +48,8 @@ def count_pairs(
     splats: wp.array[Splat2D],  # [V]
     alpha_min: float,
     count: wp.array2d[vec16],  # [T, BLOCKS] instances walked before the pixel stopped
+    width: float,
+    height: float,
     # out
     pairs_out: wp.array2d[wp.int64],  # [T, 2] blended, and looked at in blocks
 ):
@@ -71,7 +73,9 @@ def count_pairs(
                 fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
                 alpha = alpha_of(fall * splat.opacity, alpha_min)
                 hit = where_less(vec16(0.0), alpha, vec16(1.0), vec16(0.0))
-                hits += where_less(vec16(float(k - start)), count[tile, 4 * by + bx], hit, vec16(0.0))
+                hit = where_less(vec16(float(k - start)), count[tile, 4 * by + bx], hit, vec16(0.0))
+                hit = where_less(vec16(splat.mean[0]) - dx, vec16(width), hit, vec16(0.0))
+                hits += where_less(vec16(splat.mean[1]) - dy, vec16(height), hit, vec16(0.0))
                 looked_at += wp.int64(LANES)
         blended += wp.int64(total(hits))
     pairs_out[tile, 0] = blended
@@ -98,7 +102,7 @@ def count(gaussians: tuple[torch.Tensor, ...], camera: Camera, options: RasterOp
         bins = bin_tiles(*Project.apply(*gaussians, cam, Dropped()), camera, options)
         _, _, _, (_, stopped, _) = blend_lanes(bins, camera, torch.zeros(3), options, False)
         pairs = torch.empty(len(bins.ranges), 2, dtype=torch.int64)
-        inputs = [*list_inputs(bins, options), view(stopped, vec16)]
+        inputs = [*list_inputs(bins, options), view(stopped, vec16), camera.width, camera.height]
         launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
     blended, looked_at = pairs.sum(0).tolist()
     pixels = camera.width * camera.height

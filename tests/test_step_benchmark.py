@@ -1,0 +1,136 @@
+"""What ``benchmarks/step.py`` and ``savings.py`` count and compare is right."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warp_splat import RasterOptions, launch
+from warp_splat.config import ALPHA_MIN, T_MIN
+from warp_splat.renderer import Dropped, Project, camera_view
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import gpu_scene  # noqa: E402
+import limits  # noqa: E402
+import savings  # noqa: E402
+import step  # noqa: E402
+import work  # noqa: E402
+
+
+@pytest.fixture
+def two_threads():
+    before = launch.get_threads()
+    launch.set_threads(2)
+    yield
+    launch.set_threads(before)
+
+
+def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
+    gaussians = tuple(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated())
+    gaussians = (*gaussians[:2], 3.0 * gaussians[2], gaussians[3].clamp_min(0.5), *gaussians[4:])  # pixels stop
+    camera = gpu_scene.cameras(40, 30, 1)[0]
+    found = work.count(gaussians, camera, RasterOptions())
+    cam = camera_view(camera, 15, RasterOptions())
+    means, conics, opacities, _, depths, _, radii = Project.apply(*gaussians, cam, Dropped())
+    drawn = np.flatnonzero(radii.numpy() > 0)
+    order = drawn[np.argsort(depths.numpy()[drawn], kind="stable")]
+    y, x = np.mgrid[:30, :40] + 0.5
+    t, running, pairs, skipped = np.ones((30, 40)), np.ones((30, 40), bool), 0, 0
+    for i in order:
+        dx, dy = means[i, 0].item() - x, means[i, 1].item() - y
+        xx, xy, yy = conics[i].tolist()
+        alpha = np.minimum(opacities[i].item() * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy), 0.99)
+        seen = alpha >= ALPHA_MIN
+        running &= ~(seen & (t * (1 - alpha) < T_MIN))
+        t = np.where(seen & running, t * (1 - alpha), t)
+        pairs += np.count_nonzero(seen & running)
+        skipped += np.count_nonzero(seen & ~running)
+    assert skipped > 0.1 * pairs  # else the test would not see whether stopped pixels count
+    assert found.pairs == pytest.approx(pairs, rel=1e-4)  # a pair at the threshold may round to either side
+    assert found.pairs < found.looked_at < 16 * found.pairs
+    assert (found.gaussians, found.drawn, found.pixels, found.coefficients) == (3000, len(order), 1200, 16)
+
+
+def test_multiply_adds_are_done_as_they_are_counted(two_threads):
+    values = torch.zeros(3, limits.CHAINS, limits.LANES)
+    launch.launch(limits.multiply_add, 3, [2, 1.0], [launch.view(values, limits.vec16)])
+    assert (values == 2 * limits.UNROLLED).all()
+
+
+def test_floor_is_the_larger_of_its_two_parts():
+    limit = limits.Limits(bandwidth=100.0, rate=2.0)
+    assert limit.floor(300.0, 16.0) == 3.0 and limit.floor(100.0, 160.0) == 5.0
+    # 2 Gaussians of degree 0, one of which is drawn, on 10 pixels: by hand
+    counts = work.Counts(gaussians=2, coefficients=1, drawn=1, pixels=10, instances=3, pairs=7, looked_at=32)
+    found = work.work_of(counts)
+    assert found["project"] == (2 * 48 + 60, 240) and found["blend"] == (24 + 48 + 240, 7 * 31)
+    assert found["Adam"][0] == 2 * 14 * 4 * 7 and found["host"] == (0, 0)
+
+
+def test_table_of_a_small_step(two_threads):
+    trainer = step.synthetic(500, 64, 48)
+    before = {name: tensor.detach().clone() for name, tensor in trainer.model.parameters.items()}
+    times = step.time_steps(trainer, 1)
+    assert all(torch.equal(trainer.model.parameters[name], tensor) for name, tensor in before.items())
+    parts = {stage: seconds for stage, seconds in times[2].items() if stage != "whole step"}
+    assert sum(parts.values()) == pytest.approx(times[2]["whole step"]) and set(parts) == set(work.work_of(COUNTS))
+    rows, data = step.rows_of("small", times, COUNTS, dict.fromkeys((1, 2), limits.Limits(1e9, 1e9)))
+    assert [row[1] for row in rows] == [*parts, "whole step"] and rows[-1][2] == f"{1e3 * times[1]['whole step']:.2f}"
+    assert data["floors"][1]["whole step"] == pytest.approx(sum(data["floors"][1][stage] for stage in parts))
+
+
+COUNTS = work.Counts(500, 16, 400, 64 * 48, 900, 9000, 20000)
+
+
+def test_what_is_left_out_changes_nothing(two_threads):
+    """Of those that should not: image and gradients are compared, and the comparison can tell."""
+    trainer = step.synthetic(1500, 64, 48)
+    trainer.scene = replace(trainer.scene, train=trainer.scene.train[:1])
+    before = {name: tensor.detach().clone() for name, tensor in trainer.model.parameters.items()}
+    changes = {case.name: savings.difference(trainer, case) for case in savings.CASES}
+    same = {name for name, change in changes.items() if change == "same image, same gradients"}
+    assert len(same) >= 6, changes
+    assert "image" in changes["what lies behind saturated pixels"]
+    assert all(torch.equal(trainer.model.parameters[name], tensor) for name, tensor in before.items())
+    assert all(leaf.requires_grad for leaf in trainer.model.parameters.values())
+
+
+def test_inactive_degrees_get_no_gradient_and_the_same_bytes():
+    """Steps at degree 0 and then 3, against Adam fed with gradients of zero."""
+    scene, gaussians = gpu_scene.make_scene(48, 32), gpu_scene.make_gaussians(300, "cpu")
+    trainers = [gpu_scene.trainer_on(scene, gaussians, "cpu", sh_interval=4) for _ in range(2)]
+    for iteration in range(1, 14):
+        for trainer, fills in zip(trainers, (False, True), strict=True):
+            trainer.differentiate(iteration)
+            rest = trainer.model.parameters["sh_rest"]
+            assert (rest.grad is None) == (iteration < 4)
+            if fills and rest.grad is None:
+                rest.grad = torch.zeros_like(rest)
+            trainer.update(iteration)
+    for name, tensor in trainers[0].model.parameters.items():
+        assert torch.equal(tensor, trainers[1].model.parameters[name]), name
+    rest = trainers[0].model.parameters["sh_rest"]
+    assert trainers[0].optimizer.adam.state[rest]["step"] == 13
+
+
+def test_degree_rises_without_a_compilation(monkeypatch, capsys):
+    """``warm_up`` has compiled and loaded all that a higher degree needs: Warp says so when it loads a module."""
+    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
+    scene, gaussians = gpu_scene.make_scene(48, 32), gpu_scene.make_gaussians(300, "cpu")
+    trainer = gpu_scene.trainer_on(scene, gaussians, "cpu", sh_interval=2)
+    trainer.warm_up()
+    limits.multiply_add.module.unload()
+    wp.load_module(limits.multiply_add.module, device="cpu")
+    assert "Module" in capsys.readouterr().out  # what the test looks for is there
+    degrees = set()
+    for iteration in range(1, 9):
+        trainer.differentiate(iteration)
+        trainer.update(iteration)
+        degrees.add(trainer.degree)
+    assert degrees == {0, 1, 2, 3} and "Module" not in capsys.readouterr().out
