@@ -9,7 +9,7 @@ import sys
 from dataclasses import fields
 
 from warp_splat import __version__
-from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, CompareConfig, RenderConfig, TrainConfig
+from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, PRESETS, CompareConfig, RenderConfig, TrainConfig
 from warp_splat.errors import InputError
 
 COMMANDS = {
@@ -69,8 +69,9 @@ def parse(arguments: list[str]) -> TrainConfig | RenderConfig | CompareConfig:
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
-    if config_type is TrainConfig and "source_path" not in values:
-        values = {**EMBEDDED_DEFAULTS, **values}
+    if config_type is TrainConfig:
+        embedded = {} if "source_path" in values else EMBEDDED_DEFAULTS
+        values = {**embedded, **PRESETS[values.get("preset", "")], **values}
     return config_type(**values)
 
 

@@ -78,6 +78,7 @@ class TrainConfig:
     )
     seed: int = flag(0, "seed of everything random")
     quiet: bool = flag(False, "print only the summary")
+    preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
     profile: int = flag(0, "time the stages of the last N iterations, as a table and a plot")
 
     iterations: int = flag(
@@ -110,6 +111,8 @@ class TrainConfig:
         0.01, "share of the scene's extent above which a Gaussian splits instead of being cloned"
     )
     opacity_reset_interval: int = flag(3000, "steps between two resets of all opacities to 0.01")
+    coarse: int = flag(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
+    coarse_until_iter: int = flag(3000, "by this step the size has doubled, at equal intervals, to the full one")
     max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
     prune_screen_size: int = flag(
         0, "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does"
@@ -127,6 +130,23 @@ EMBEDDED_DEFAULTS: dict[str, Any] = {
     "densify_until_iter": 2000,
     "max_gaussians": 50_000,
     "sh_interval": 500,
+}
+
+#: What ``--preset`` changes; a flag that is given goes before.
+PRESETS: dict[str, dict[str, Any]] = {
+    "": {},
+    "fast": {
+        "iterations": 4000,
+        "position_lr_max_steps": 4000,
+        "coarse": 4,
+        "coarse_until_iter": 1600,
+        "densify_from_iter": 300,
+        "densify_until_iter": 2800,
+        "max_gaussians": 150_000,
+        "sh_interval": 1000,
+        "opacity_reset_interval": 100_000,
+        "optimizer_type": "sparse_adam",
+    },
 }
 
 
@@ -201,6 +221,7 @@ def check_train(config: TrainConfig) -> str | None:
         "densification_interval": 1,
         "opacity_reset_interval": 1,
         "sh_interval": 1,
+        "coarse_until_iter": 1,
     }
     for name, low in at_least.items():
         if getattr(config, name) < low:
