@@ -215,14 +215,14 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
     from warp_splat import gaussians  # noqa: PLC0415
     from warp_splat.errors import InputError  # noqa: PLC0415
 
-    save = gaussians.save_ply
+    save = gaussians.save_gaussians
 
     def full(path, *arrays, **options):
         if "point_cloud" in str(path):
             raise InputError(f"{path}: could not be written (no space left on device).")
         save(path, *arrays, **options)
 
-    monkeypatch.setattr(gaussians, "save_ply", full)
+    monkeypatch.setattr(gaussians, "save_gaussians", full)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert train(tmp_path / "model", "--iterations", "5") == 0
     (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
