@@ -43,6 +43,7 @@ COLOR_SPACE = "srgb_rec709_display"  # that of the photographs
 RENDER_MODE = "SplatRenderMode"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
 LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the colour
+GLB_BYTES = 2**32 - 1  # the length in the header of a .glb file has four bytes
 ARRAY_BUFFER = 34962
 
 
@@ -77,6 +78,8 @@ def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] =
     text = json.dumps(document, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)  # chunks are padded to four bytes; every attribute is
     chunks = CHUNK.pack(len(text), b"JSON") + text + CHUNK.pack(len(data), b"BIN\0") + data
+    if HEADER.size + len(chunks) > GLB_BYTES:
+        raise InputError(f"{path}: {len(chunks)} bytes are more than a .glb file can hold; choose a name in .gltf.")
     with atomic_write(path) as temporary:
         temporary.write_bytes(HEADER.pack(b"glTF", 2, HEADER.size + len(chunks)) + chunks)
 
@@ -93,7 +96,7 @@ def load_gltf(path: str | Path, report: Callable[[str], None] = print) -> SplatF
     """
     with reading(path, "a glTF 2.0 file of Gaussians (KHR_gaussian_splatting)"):
         document = Document(path)
-        required = document.list("extensionsRequired")
+        required = document.entries("extensionsRequired")
         unknown = [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]
         if unknown:
             raise Unexpected(f"one that needs the extension {unknown[0]!r:.80}; export it without")

@@ -22,6 +22,7 @@ from warp_splat.formats.reading import Unexpected
 HEADER = struct.Struct("<4sII")  # of a .glb file: magic, version, length
 CHUNK = struct.Struct("<I4s")  # length, type
 JSON_BYTES = 2**22  # a thousand times that of a file of Gaussians, and a hundred megabytes once parsed
+MOST_BUFFERS = 256  # files to look for; the Gaussians of a scene are in one or a few
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 EVEN = 1e-4  # by how much the axes of a node may differ in length, or lean
@@ -57,6 +58,8 @@ class Document:
             else:
                 text = source.read()
         self.json = _parse(text)
+        if len(self.entries("buffers")) > MOST_BUFFERS:
+            raise Unexpected(f"{len(self.entries('buffers'))} buffers, more than {MOST_BUFFERS}")
         self.buffers = [self._open(entry, chunk if index == 0 else None) for index, entry in enumerate(self._buffers())]
 
     @property
@@ -64,7 +67,7 @@ class Document:
         """Bytes of all buffers, those that are one file counted once."""
         return sum({buffer.path: buffer.length for buffer in self.buffers}.values())
 
-    def list(self, key: str) -> list:
+    def entries(self, key: str) -> list:
         """A list of the JSON, empty if it has none."""
         return _list(self.json, key)
 
@@ -107,13 +110,13 @@ class Document:
 
     def placed_meshes(self) -> list[tuple[dict, np.ndarray]]:
         """The meshes of the scene, each with the matrix [4, 4] from its coordinates to the world's."""
-        nodes = self.list("nodes")
+        nodes = self.entries("nodes")
         if "scenes" in self.json:
             roots = _list(self.entry("scenes", self.json.get("scene", 0)), "nodes")
         else:  # a library of meshes: all that nobody else places
             children = [child for node in nodes if isinstance(node, dict) for child in _list(node, "children")]
-            roots = set(range(len(nodes))) - {child for child in children if isinstance(child, int)}
-        open_nodes, seen, found = [(index, np.eye(4)) for index in roots], set(), []
+            roots = sorted(set(range(len(nodes))) - {child for child in children if isinstance(child, int)})
+        open_nodes, seen, found = [(index, np.eye(4)) for index in reversed(roots)], set(), []
         while open_nodes:
             index, parent = open_nodes.pop()
             node = self.entry("nodes", index)
@@ -130,7 +133,7 @@ class Document:
         return found
 
     def _buffers(self) -> list[dict]:
-        return [self.entry("buffers", index) for index in range(len(self.list("buffers")))]
+        return [self.entry("buffers", index) for index in range(len(self.entries("buffers")))]
 
     def _open(self, entry: dict, chunk: Buffer | None) -> Buffer:
         if "uri" not in entry:
@@ -191,7 +194,8 @@ def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         Unexpected: if it stretches or shears, which would need other Gaussians.
     """
     linear = matrix[:3, :3]
-    scale = float(np.linalg.norm(linear)) / math.sqrt(3)
+    with np.errstate(over="ignore"):
+        scale = float(np.linalg.norm(linear)) / math.sqrt(3)
     turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
     if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
         raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")

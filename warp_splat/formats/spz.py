@@ -98,7 +98,7 @@ def save_spz(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
     ]
     with atomic_write(path) as temporary, open(temporary, "wb") as raw:
         # no time and no name in the header: equal Gaussians give equal bytes
-        with gzip.GzipFile("", "wb", 9, raw, mtime=0) as target:
+        with gzip.GzipFile("", "wb", 6, raw, mtime=0) as target:
             target.write(b"".join(payload))
 
 
