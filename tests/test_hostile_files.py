@@ -1,4 +1,4 @@
-"""Files from strangers: whatever the bytes, a reader gives finite Gaussians or one sentence, soon and in little memory.
+"""Files from strangers: whatever the bytes, a reader gives finite Gaussians or one sentence, in little memory.
 
 Random bytes, cuts, and changes of valid files: of the bytes, of what is compressed, and of values in the JSON.
 The short run is part of every test run; the long one is marked slow.
@@ -8,8 +8,8 @@ import copy
 import gzip
 import json
 import struct
-import time
 import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
@@ -21,9 +21,8 @@ from test_exchange import spz2, spz4
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 
-QUICK, LONG = 150, 20_000  # examples for each reader
+QUICK, LONG = 150, 5_000  # examples for each reader
 MEMORY = 200 * 2**20  # bytes for a file of a few kilobytes: JSON of many lists and the smallest limits of SPZ fit in
-SECONDS = 10  # far more than any takes; a loop that does not end shows
 KINDS = ("ply", "text.ply", "splat", "2.spz", "3.spz", "4.spz", "glb", "gltf")
 NUMBERS = [0, -1, 1, 2**31, 2**32, 10**12, 2**63, 10**400, 0.5, -0.0, 1e308, True, None, "", [], {}, [[]], "..", 5126]
 
@@ -59,17 +58,17 @@ def survive(folder, kind, data):
     path = folder / f"hostile.{kind}"
     path.write_bytes(data)
     lines = []
-    start = time.monotonic()
     tracemalloc.start()
     try:
-        splats, antialiased = load_gaussians(path, report=lines.append)
+        with warnings.catch_warnings(action="error"):
+            splats, antialiased = load_gaussians(path, report=lines.append)
     except InputError as error:
         assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 600 + 2 * len(str(path))
         return False
     finally:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        assert peak < MEMORY + 100 * len(data) and time.monotonic() - start < SECONDS
+        assert peak < MEMORY + 100 * len(data)
     assert all(array.dtype == np.float32 and np.isfinite(array).all() for array in splats)
     assert isinstance(antialiased, bool) and len({len(array) for array in splats}) == 1
     assert all("\n" not in line for line in lines)
@@ -119,7 +118,7 @@ def changed_json(draw, document):
             holder = holder[key]
         match draw(st.sampled_from(["number", "number", "other", "remove"])):
             case "number":
-                holder[last] = draw(st.sampled_from(NUMBERS))
+                holder[last] = copy.deepcopy(draw(st.sampled_from(NUMBERS)))
             case "other":
                 value = document
                 for key in draw(st.sampled_from(paths)):

@@ -120,9 +120,9 @@ def turned(
     count, coefficients, _ = splats.sh.shape
     # rounded, so that a turn by half a circle only flips signs, and back again gives the same bytes
     basis = _turn_harmonics(turn, coefficients).round(12).astype(np.float32)
-    colors = splats.sh.transpose(0, 2, 1).reshape(count * 3, coefficients) @ basis.T
-    means = scale * (splats.means @ turn.T)
-    with np.errstate(over="ignore"):  # beyond float32: infinite, and left out by the reader
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, or no longer is, the reader leaves out
+        colors = splats.sh.transpose(0, 2, 1).reshape(count * 3, coefficients) @ basis.T
+        means = scale * (splats.means @ turn.T)
         return SplatArrays(
             means=(means if translation is None else means + translation).astype(np.float32),
             sh=colors.reshape(count, 3, coefficients).transpose(0, 2, 1),
