@@ -38,7 +38,7 @@ def main() -> None:
             driver.adjoint()
 
         both()
-        memory[mode] = peak_memory(both)
+        memory[mode] = peak_memory(both, torch.device("cpu"))
         first = drivers["manual"]
         differences = [(a - b).norm() / b.norm() for a, b in zip(driver.grads, first.grads, strict=True)]
         agreement[mode] = float(max(differences))

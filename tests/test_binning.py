@@ -134,8 +134,13 @@ def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
     assert binning._scan(counts) == 3 * 2**30  # a 32-bit scan would have wrapped
 
 
-def test_one_tile_with_too_many_is_refused(monkeypatch):
+@pytest.mark.parametrize("bin_on", [binning.bin_by_counting, binning.bin_by_sorting])
+def test_one_tile_with_too_many_is_refused(bin_on, monkeypatch):
     camera, projected = project()
-    monkeypatch.setattr(binning, "MAX_TILE", 3)
-    with pytest.raises(InputError, match="one tile"):
-        binning.bin_tiles(*projected, camera, RasterOptions())
+    longest = max(map(len, lists(binning.bin_tiles(*projected, camera, PLAIN))))
+    monkeypatch.setattr(binning, "MAX_TILE", longest)
+    bin_on(*projected, camera, PLAIN)
+    monkeypatch.setattr(binning, "MAX_TILE", longest - 1)
+    message = f"one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {longest - 1} that fit"
+    with pytest.raises(InputError, match=message):
+        bin_on(*projected, camera, PLAIN)

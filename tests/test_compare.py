@@ -9,9 +9,10 @@ import torch
 import warp as wp
 from scenes import SCENES
 
-from warp_splat import RasterOptions, cli
+from warp_splat import RasterOptions, cli, renderer
 from warp_splat.adjoints import list_inputs
 from warp_splat.binning import bin_tiles
+from warp_splat.blocks import adjoint_of_blocks, blend_blocks
 from warp_splat.compare import adjoints, knobs, oracle, report, source, truth, workloads
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels.blend_lanes import BLOCKS
@@ -21,6 +22,7 @@ from warp_splat.launch import launch, view
 from warp_splat.renderer import Blend, Dropped, Project, camera_view
 
 PLAIN = RasterOptions()
+WITHOUT_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is accepted where there is one")
 
 
 def workload(name="degree1"):
@@ -134,6 +136,27 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     assert len(list(tmp_path.glob("*.png"))) == 4
 
 
+def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
+    """Its kernels run in fibers, its memory is told by a stub; all else is what a card would see."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    monkeypatch.setattr(renderer, "blend_lanes", blend_blocks)
+    monkeypatch.setattr(renderer, "adjoint_of_lanes", adjoint_of_blocks)
+    monkeypatch.setattr(workloads, "LAYERED_SIZE", 16)
+    monkeypatch.setattr(workloads.Workload, "device", torch.device("cuda"))
+    for name, value in (("memory_allocated", 3), ("max_memory_allocated", 10), ("reset_peak_memory_stats", None)):
+        monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value)
+    monkeypatch.setattr(adjoints, "REPEATS", 2)
+    said = []
+    measured = adjoints.measure([workloads.layered(10)], ADJOINTS, said.append)
+    names = [item.variant for item in measured]
+    assert names == [*ADJOINTS, *(f"cap {cap}" for cap in adjoints.CAPS), "central differences"]
+    assert "Left out: generated, plain" in said[0]
+    for item in measured[:-1]:
+        assert item.worst[1] < 1e-5 and item.image_error < 1e-5, item.variant
+        assert item.memory == 7 and len(item.forward) == len(item.backward) == 2 and item.rules is None
+    assert report.adjoint_table(measured).count("\n") == 1 + len(measured)
+
+
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
     monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda device: 2**10)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
@@ -149,7 +172,9 @@ def test_stored_that_does_not_fit_is_a_row(monkeypatch):
         (["--modes", "newton"], "--modes: expected some of manual, stepwise, reversible, stored, got newton."),
         (["--modes"], "got none"),
         (["--scene", "nowhere"], "nowhere"),
-        (["--device", "cuda"], "--device cuda"),
+        pytest.param(["--device", "cuda"], "--device cuda", marks=WITHOUT_GPU),
+        (["--device", "cuda", "--volume"], "--device cuda: --stability and --volume compute on the CPU only"),
+        (["--device", "cuda", "--stability"], "--device cuda: --stability and --volume compute on the CPU only"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "warp_splat"
 LAYERS = [
     {"errors", "config"},
     {"kernels"},
-    {"camera", "devices", "launch", "formats", "scene.types"},
+    {"camera", "devices", "launch", "distributed", "formats", "scene.types"},
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
     {"trainer", "selftest", "report", "evaluate", "gradcheck", "differences"},

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from warp_splat import InputError, set_threads
-from warp_splat.launch import get_threads
-from warp_splat.losses import image_loss, loss_by_convolution
+from warp_splat.launch import get_threads, profile
+from warp_splat.losses import LossByConvolution, image_loss
 
 
 def oracle(x, y, share):
@@ -39,7 +39,7 @@ def test_value_and_gradient(size, share):
 def both(image, target, share=0.2):
     """Value and gradient by the kernels and by torch's convolutions, as on a GPU."""
     found = []
-    for loss_of in (image_loss, loss_by_convolution):
+    for loss_of in (image_loss, LossByConvolution.apply):
         leaf = image.clone().requires_grad_()
         loss = loss_of(leaf, target, share)
         loss.backward()
@@ -60,6 +60,15 @@ def test_convolutions_agree_with_the_kernels(kind, size, share):
     (loss, gradient), (found, found_gradient) = both(image, target, share)
     assert abs(found - loss) < 1e-6 * max(1.0, abs(loss))
     assert (found_gradient - gradient).norm() < 1e-5 * gradient.norm()
+
+
+@pytest.mark.parametrize("loss_of", [image_loss, LossByConvolution.apply])
+def test_loss_and_adjoint_are_stages(loss_of):
+    image = torch.rand(24, 35, 3).requires_grad_()
+    with profile() as stages:
+        loss_of(image, torch.rand(24, 35, 3), 0.2).backward()
+    assert set(stages) == {"loss", "adjoint of loss"} and min(stages.values()) > 0
+    assert not loss_of(image.detach(), torch.rand(24, 35, 3), 0.2).requires_grad
 
 
 def test_convolutions_find_equal_images_equal():

@@ -310,6 +310,21 @@ def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
     assert "--max_gaussians" in text.err and "-r" in text.err
 
 
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ((), torch.OutOfMemoryError("CUDA out of memory."), ("in stage 'bin'", " on 66 x 62 px;", "(-r)")),
+        (("--orbit",), RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), ("'bin'", " on 980 x 545 px;")),
+    ],
+)
+def test_memory_that_runs_out_while_rendering_is_explained(options, error, words, trained, monkeypatch, capsys):
+    fail_at(monkeypatch, "warp_splat.renderer.bin_tiles", 3, error)
+    message = fails(capsys, "render", "-m", str(trained), *options)
+    count = len(load_ply(ply_path(trained, 60)).means)
+    assert all(word in message for word in (*words, f"Out of memory on cpu in stage 'bin', with {count} Gaussians"))
+    assert "--max_gaussians" in message and "\n" not in message
+
+
 def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkeypatch, capsys):
     """NaN from the loss in one pixel of one step: the run goes on and says so at its end."""
     from warp_splat import trainer  # noqa: PLC0415

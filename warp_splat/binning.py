@@ -18,7 +18,7 @@ from warp_splat.launch import available_memory, empty, even_slices, get_threads,
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
-MAX_TILE = 2**24  # instances of one tile: the lanes count them in float32
+MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 
 
@@ -60,13 +60,13 @@ def bin_by_counting(
     row_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
     slot_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
-    support = [options.alpha_min, int(options.extent == "square")]
-    launch(tiles.pack, drawn, [order, *tensors, camera.height, *support], [splats, row_ends])
+    square = int(options.extent == "square")
+    launch(tiles.pack, drawn, [order, *tensors, camera.height, options.alpha_min, square], [splats, row_ends])
     rows = _scan(row_ends)
     _check_count(rows, camera, drawn, radii.device)
     spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
     size = [camera.width, camera.height, tiles_x]
-    launch(tiles.find_spans, drawn, [splats, row_ends, *size, *support], [spans, slot_ends])
+    launch(tiles.find_spans, drawn, [splats, row_ends, *size, square], [spans, slot_ends])
     count = _scan(slot_ends)
     _check_count(count, camera, drawn, radii.device)
     instances, ends = _sort_by_tile(spans, row_ends, slot_ends, count, tiles_x * tiles_y)
@@ -77,18 +77,25 @@ def bin_by_counting(
 def bin_by_sorting(
     means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
 ) -> Bins:
-    """:func:`bin_tiles` for a GPU: the host waits for the number of tile instances, and for nothing else."""
+    """:func:`bin_tiles` for a GPU: the host waits for the number of tile instances.
+
+    Where these are so many that one tile might hold too many, it waits for the longest list as well.
+    """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     device, total = radii.device, len(radii)
     keys = torch.where(radii > 0, depths.detach(), torch.inf)
     order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
-    support = [options.alpha_min, int(options.extent == "square")]
+    square = int(options.extent == "square")
     launch(
-        tiles.pack, total, [order, *tensors, camera.height, *support], [splats, view(counts, wp.int64)], device=device
+        tiles.pack,
+        total,
+        [order, *tensors, camera.height, options.alpha_min, square],
+        [splats, view(counts, wp.int64)],
+        device=device,
     )
-    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, *support]
+    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
 
     def list_tiles(slot_ends: torch.Tensor, *lists: torch.Tensor) -> None:
         outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]
@@ -106,6 +113,8 @@ def bin_by_sorting(
     instances = torch.stack([ranks[slots], slots.int()], 1)
     bounds = torch.searchsorted(listed, torch.arange(tiles_x * tiles_y + 1, dtype=narrow, device=device)).int()
     ranges = torch.stack([bounds[:-1], bounds[1:]], 1)
+    if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
+        _check_longest(int(bounds.diff().max()))
     invalid = torch.count_nonzero(radii < 0)
     return Bins(order, splats, wp.from_torch(slot_ends), instances, ranges, [], tiles_x, invalid)
 
@@ -126,12 +135,7 @@ def _sort_by_tile(
     to = lambda array: wp.array(array, dtype=int, copy=False, device="cpu")  # noqa: E731
     launch(tiles.count_tiles, bands, [to(rows), spans], [to(counts)], bounds=one_each)
     places = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
-    longest = int(counts.sum(0).max(initial=0))
-    if longest > MAX_TILE:
-        raise InputError(
-            f"rasterize: one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {MAX_TILE} that fit; "
-            "render fewer Gaussians."
-        )
+    _check_longest(int(counts.sum(0).max(initial=0)))
     cursor = np.ascontiguousarray((places - counts.T).T, dtype=np.int32)
     instances = torch.empty((count, 2), dtype=torch.int32)
     launch(
@@ -177,6 +181,14 @@ def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -
         raise InputError(
             f"{touch}, which takes {BYTES * count / 2**30:.1f} GiB, but only {available / 2**30:.1f} GiB are free; "
             "render a smaller image or fewer, smaller Gaussians."
+        )
+
+
+def _check_longest(count: int) -> None:
+    if count > MAX_TILE:
+        raise InputError(
+            f"rasterize: one tile of {TILE} x {TILE} pixels lists {count} Gaussians, more than the {MAX_TILE} that "
+            "fit; render fewer Gaussians."
         )
 
 

@@ -41,19 +41,13 @@ def adjoint_of_blocks(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """See :func:`warp_splat.lanes.adjoint_of_lanes`."""
     final, count, kept = saved
-    device, tile_count, new = background.device, len(bins.ranges), background.new_empty
-    slots = new(len(bins.instances), 10 if options.depth else 9)
-    up, adj_final, adj_background = new(tile_count, THREADS, 4), torch.empty_like(final), new(tile_count, 3)
-    dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
+    device, tile_count = background.device, len(bins.ranges)
+    slots = background.new_empty(len(bins.instances), 10 if options.depth else 9)
+    up, adj_final, adj_background, dropped, steps = spread_upstream(
+        bins, options, background, final, count, (adj_image, adj_alpha, adj_depth), slots
+    )
     lists, states = list_inputs(bins, options), [_float(final), view(count, wp.int32)]
     upstream = [view(up, wp.vec4), _float(adj_final)]
-    launch_blocks(
-        make_upstream_block(options.depth),
-        tile_count,
-        [*lists[:3], _float(background), *states, *map(_float, (adj_image, adj_alpha, adj_depth))],
-        [*upstream, _float(adj_background), view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],
-        device,
-    )
     if mode in ("manual", "stepwise"):
         inputs = [*lists, *states, view(steps, wp.int32), *upstream]
         launch_blocks(
@@ -65,6 +59,25 @@ def adjoint_of_blocks(
         adjoint = {"adj_inputs": [None] * len(inputs), "adj_outputs": upstream}
         launch_blocks(walk, tile_count, inputs, upstream, device, **adjoint)
     return slots, adj_background.sum(0), dropped
+
+
+def spread_upstream(
+    bins: Bins, options: RasterOptions, background, final, count, adj_pixels, slots
+) -> tuple[torch.Tensor, ...]:
+    """Upstream gradients by tile and thread, what is known of a tile at once, and zeros in ``slots`` never walked."""
+    tile_count, new = len(bins.ranges), background.new_empty
+    up, adj_final, adj_background = new(tile_count, THREADS, 4), torch.empty_like(final), new(tile_count, 3)
+    dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
+    inputs = [_float(background), _float(final), view(count, wp.int32), *map(_float, adj_pixels)]
+    outputs = [view(up, wp.vec4), *map(_float, (adj_final, adj_background))]
+    launch_blocks(
+        make_upstream_block(options.depth),
+        tile_count,
+        [*list_inputs(bins, options)[:3], *inputs],
+        [*outputs, view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],
+        background.device,
+    )
+    return up, adj_final, adj_background, dropped, steps
 
 
 def _float(tensor: torch.Tensor):

@@ -78,12 +78,17 @@ class TrainConfig:
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = flag("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
-    threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
+    threads: int = flag(
+        0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)"
+    )
     seed: int = flag(0, "seed of everything random")
     quiet: bool = flag(False, "print only the summary")
     profile: int = flag(0, "time the stages of the last N iterations, as a table and a plot")
 
-    iterations: int = flag(30_000, "training steps, one image each")
+    iterations: int = flag(
+        30_000,
+        "images to train on, one in each step; n in each under torchrun with n processes; schedules count images",
+    )
     sh_degree: int = flag(3, "highest degree of the view-dependent color", choices=(0, 1, 2, 3))
     optimizer_type: str = flag(
         "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from warp_splat.config import TrainConfig
+from warp_splat.distributed import ALONE, Processes
 from warp_splat.gaussians import GaussianModel
 from warp_splat.optimizer import Optimizer
 from warp_splat.renderer import RenderOutput
@@ -28,10 +29,18 @@ class Change:
 
 
 class Densifier:
-    """Statistics of the gradients of the 2D means, and what follows from them."""
+    """Statistics of the gradients of the 2D means, and what follows from them: the same in all ``processes``."""
 
-    def __init__(self, model: GaussianModel, optimizer: Optimizer, config: TrainConfig, extent: float):
+    def __init__(
+        self,
+        model: GaussianModel,
+        optimizer: Optimizer,
+        config: TrainConfig,
+        extent: float,
+        processes: Processes = ALONE,
+    ):
         self.model, self.optimizer, self.config, self.extent = model, optimizer, config, extent
+        self.processes = processes
         self.random = torch.Generator().manual_seed(config.seed)
         self._clear()
 
@@ -53,17 +62,20 @@ class Densifier:
 
     def update(self, iteration: int) -> Change | None:
         """Densify, prune and reset opacities if it is time; None if the set did not change."""
-        config, change = self.config, None
+        config, change, step = self.config, None, self.processes.count  # iterations in a step
         if iteration >= config.densify_until_iter:
             return None
-        if iteration > config.densify_from_iter and iteration % config.densification_interval == 0:
+        if iteration > config.densify_from_iter and iteration % config.densification_interval < step:
             change = self._densify(prune_large=iteration > config.opacity_reset_interval)
-        at_start = config.white_background and iteration == config.densify_from_iter
-        if iteration % config.opacity_reset_interval == 0 or at_start:
+        at_start = config.white_background and self.processes.reaches(iteration, [config.densify_from_iter])
+        if iteration % config.opacity_reset_interval < step or at_start:
             self.optimizer.reset_opacities(RESET_OPACITY)
         return change
 
     def _densify(self, prune_large: bool) -> Change:
+        self.processes.sum(self.gradient)
+        self.processes.sum(self.views)
+        self.processes.maximum(self.radius)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         chosen = self._choose()
         widest = torch.exp(raw["scales"]).amax(1)

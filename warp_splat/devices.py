@@ -1,6 +1,11 @@
-"""Which device a run uses, why a GPU cannot be used, and whether an error means that memory ran out."""
+"""Which device a run uses, why a GPU cannot be used, and what to say when memory runs out."""
 
 from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sized
+from contextlib import contextmanager
 
 import torch
 import warp as wp
@@ -57,8 +62,43 @@ def _dotted(version: tuple[int, int]) -> str:
     return f"{version[0]}.{version[1]}"
 
 
+@contextmanager
+def memory_explained(
+    device: torch.device, gaussians: Sized, sizes: Iterable[tuple[int, int]], advice: str
+) -> Iterator[None]:
+    """Turn an error that means that memory ran out into an InputError that says where, and what takes less.
+
+    Args:
+        device: where the work is done.
+        gaussians: those at work when the error comes are counted.
+        sizes: width and height of the images [px]; the largest is told.
+        advice: what to do instead, an imperative.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        where = getattr(error, "__notes__", ["between two stages"])[0]
+        width, height = max(sizes, key=math.prod)
+        raise InputError(
+            f"Out of memory on {device.type} {where}, with {len(gaussians)} Gaussians on {width} x {height} px; "
+            f"{advice}."
+        ) from error
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether ``error`` says that memory ran out: Python's, NumPy's, torch's on either device, or Warp's."""
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and any(words in str(error) for words in OUT_OF_MEMORY)
+
+
+def peak_memory() -> int | None:
+    """Largest resident size of the process so far, in MiB; None where the system does not tell."""
+    try:
+        import resource  # noqa: PLC0415 - not on Windows
+    except ImportError:
+        return None
+    unit = 1024 * 1024 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // unit

@@ -65,6 +65,13 @@ class GaussianModel:
             }
         )
 
+    def gradients(self, degree: int) -> list[torch.Tensor]:
+        """The gradients, without those of the SH coefficients above ``degree``, which are zero. Views, not copies."""
+        found = {name: leaf.grad for name, leaf in self.parameters.items() if leaf.grad is not None}
+        if "sh_rest" in found:
+            found["sh_rest"] = found["sh_rest"][:, : (degree + 1) ** 2 - 1]
+        return list(found.values())
+
     def activated(self) -> tuple[torch.Tensor, ...]:
         """(means, quats, scales, opacities, sh_dc, sh_rest) as the renderer takes them."""
         raw = self.parameters

@@ -13,9 +13,9 @@ from torch.nn import functional
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
 from warp_splat.kernels.lanes import LANES, vec16
-from warp_splat.launch import launch, stage, view
+from warp_splat.launch import even_slices, launch, stage, view
 
-ROWS_PER_SLICE = 16
+SMALLEST_SLICE = 16  # rows
 FAR_APART = 10.0  # in units of an image's usual range
 
 
@@ -35,7 +35,7 @@ def image_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 
             f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
         )
     if image.is_cuda:
-        return loss_by_convolution(image, target, lambda_dssim)
+        return LossByConvolution.apply(image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim)
 
 
@@ -79,6 +79,22 @@ def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
     return _blur(torch.ones(1, ssim.CHANNELS, height, width, device=device))[0, :1]
 
 
+class LossByConvolution(torch.autograd.Function):
+    """:func:`loss_by_convolution` with its adjoint as a stage of its own."""
+
+    @staticmethod
+    def forward(ctx, image, target, lambda_dssim):
+        with torch.set_grad_enabled(ctx.needs_input_grad[0]):
+            ctx.image = image.detach().requires_grad_(ctx.needs_input_grad[0])
+            ctx.loss = loss_by_convolution(ctx.image, target, lambda_dssim)
+        return ctx.loss.detach()
+
+    @staticmethod
+    def backward(ctx, adj_loss):
+        with stage("adjoint of loss"):
+            return *torch.autograd.grad(ctx.loss, ctx.image, adj_loss), None, None
+
+
 class ImageLoss(torch.autograd.Function):
     """See :func:`image_loss`."""
 
@@ -91,7 +107,7 @@ class ImageLoss(torch.autograd.Function):
             x, y = _pad(image, centers[0], groups), _pad(target, centers[1], groups)
             moments, slopes = torch.empty(height, 5, groups, LANES), torch.empty(height, 3, groups, LANES)
             sums = torch.empty(height, 2)
-            bounds = _row_slices(height)
+            bounds = even_slices(height, SMALLEST_SLICE)
             launch(ssim.blur_rows, height, [_taps(x), _taps(y)], [view(moments, vec16)], bounds=bounds)
             launch(
                 ssim.compare,
@@ -120,7 +136,7 @@ class ImageLoss(torch.autograd.Function):
             scale = adj_loss.item() / ctx.shape.numel()
             blurred = torch.empty(height, 3, groups + 2, LANES)
             adj = torch.empty(height, groups, LANES)
-            bounds = _row_slices(height)
+            bounds = even_slices(height, SMALLEST_SLICE)
             launch(ssim.adj_blur_columns, height, [view(slopes, vec16)], [view(blurred, vec16)], bounds=bounds)
             weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
             launch(
@@ -155,12 +171,11 @@ def _middle(image: torch.Tensor) -> float:
 def _pad(image: torch.Tensor, center: float, groups: int) -> torch.Tensor:
     """Rows of the image minus ``center`` as float32 in [H, P], a group of zeros at either end."""
     height, length = image.shape[0], image.shape[1] * image.shape[2]
-    padded = torch.zeros(height, (groups + 2) * LANES)
+    padded = torch.empty(height, (groups + 2) * LANES)
+    padded[:, :LANES] = padded[:, LANES + length :] = 0.0
     rows = padded[:, LANES : LANES + length]
-    rows.copy_(image.detach().reshape(height, length))
-    if image.dtype == torch.uint8:
-        rows /= 255.0
-    rows -= center
+    values = image.detach().reshape(height, length)
+    torch.sub(values / 255.0 if image.dtype == torch.uint8 else values, center, out=rows)
     return padded
 
 
@@ -180,7 +195,3 @@ def _taps(rows: torch.Tensor) -> wp.array:
     shape = (*rows.shape[:-1], rows.shape[-1] - LANES + 1)
     strides = tuple(4 * stride for stride in rows.stride())
     return wp.array(ptr=rows.data_ptr(), dtype=vec16, shape=shape, strides=strides, device="cpu", copy=False)
-
-
-def _row_slices(height: int) -> list[int]:
-    return [*range(0, height, ROWS_PER_SLICE), height]

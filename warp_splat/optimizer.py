@@ -12,6 +12,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import adam_rows
 from warp_splat.launch import launch, view
 
+BETAS = (0.9, 0.999)
 EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -23,9 +24,13 @@ class Optimizer:
         model: whose parameters are updated in place.
         config: rates and ``optimizer_type``.
         extent: size of the scene, world units; the means' rate is relative to it.
+        batch: images whose mean gradient makes a step. Rates are multiplied by its square root, epsilon is divided by
+            that, and the betas are raised to its power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting
+            Training"): if gradients of different images are independent, a step then moves the parameters as far,
+            and forgets as much, as ``batch`` steps of one image.
     """
 
-    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float):
+    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float, batch: int = 1):
         rates = {
             "means": config.position_lr_init * extent,
             "sh_dc": config.feature_lr,
@@ -34,9 +39,12 @@ class Optimizer:
             "scales": config.scaling_lr,
             "quats": config.rotation_lr,
         }
-        self.model, self.config, self.extent = model, config, extent
-        groups = [{"name": name, "params": [model.parameters[name]], "lr": rate} for name, rate in rates.items()]
-        self.adam = torch.optim.Adam(groups, lr=0.0, eps=EPS, fused=True)
+        self.model, self.config, self.extent, self.scale = model, config, extent, math.sqrt(batch)
+        groups = [
+            {"name": name, "params": [model.parameters[name]], "lr": rate * self.scale} for name, rate in rates.items()
+        ]
+        betas = (BETAS[0] ** batch, BETAS[1] ** batch)
+        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale, fused=True)
         self._groups = {group["name"]: group for group in self.adam.param_groups}
 
     def set_iteration(self, iteration: int) -> None:
@@ -44,7 +52,7 @@ class Optimizer:
         config = self.config
         share = min(iteration / config.position_lr_max_steps, 1.0)
         rate = math.exp((1 - share) * math.log(config.position_lr_init) + share * math.log(config.position_lr_final))
-        self._groups["means"]["lr"] = rate * self.extent
+        self._groups["means"]["lr"] = rate * self.extent * self.scale
 
     def step(self, radii: torch.Tensor) -> None:
         """Update from the gradients and clear them; ``radii`` [N] int32 tells what the image showed (0: not)."""

@@ -12,6 +12,7 @@ import torch
 from warp_splat import launch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions, RenderConfig
+from warp_splat.devices import memory_explained
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views, write_views
 from warp_splat.formats import model_folder
@@ -40,27 +41,48 @@ def render(config: RenderConfig) -> int:
     say = (lambda *_: None) if config.quiet else print
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     folder, iteration, gaussians, trained = _open(config)
-    model = GaussianModel.from_splats(gaussians.splats).to(device)
+    model = GaussianModel.from_splats(gaussians.splats)
     options = RasterOptions(
         antialiasing=bool(trained.get("antialiasing")),
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
-    picture = make_picture(model, bool(trained.get("white_background")), options)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
-    if config.orbit:
-        scene = _load(config, trained, say) if config.orbit_center == "focus" else None
-        _orbit(picture, scene, config.orbit_output)
-        return 0
-    scene = _load(config, trained, say)
+    scene = None if config.orbit and config.orbit_center == "origin" else _load(config, trained, say)
+    with _memory_explained(device, model, None if config.orbit else scene):
+        picture = make_picture(model.to(device), bool(trained.get("white_background")), options)
+        if config.orbit:
+            _orbit(picture, scene, config.orbit_output)
+        elif scene:
+            _write_splits(picture, scene, config, folder, iteration, len(model))
+    return 0
+
+
+def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene | None):
+    """See :func:`memory_explained`; without a scene, the images are those of an orbit."""
+    views = [*scene.train, *scene.test] if scene else []
+    sizes = [(view.camera.width, view.camera.height) for view in views] or [ORBIT_SIZE]
+    fewer = ["trained with fewer Gaussians (--max_gaussians)", *(["on smaller images (-r)"] if scene else [])]
+    elsewhere = ", or use --device cpu" if device.type == "cuda" else ""
+    return memory_explained(device, model, sizes, f"render a model {' or '.join(fewer)}{elsewhere}")
+
+
+def _write_splits(
+    picture: Callable[[Camera], np.ndarray],
+    scene: Scene,
+    config: RenderConfig,
+    folder: Path,
+    iteration: int,
+    count: int,
+) -> None:
+    """The views of both splits, and the metrics of those held out."""
     if scene.train and not config.skip_train:
         write_views(picture, scene.train, folder / "train" / f"ours_{iteration}")
         print(f"  train  {len(scene.train)} views in {folder / 'train' / f'ours_{iteration}'}")
     if scene.test and not config.skip_test:
-        extra = {"split": "test", "gaussians": len(model)}
+        extra = {"split": "test", "gaussians": count}
         means, _ = evaluate_views(picture, scene.test, folder, "test", iteration, extra)
         print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
         print(f"  PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f} in {folder / 'results.json'}")
-    return 0
 
 
 def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:

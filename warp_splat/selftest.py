@@ -11,7 +11,7 @@ near ball's first scale is that of sum (c1 - b) a1 dx^2 / v1^2 (f / z1)^2 s1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -31,9 +31,18 @@ TOLERANCE = 1e-4  # of the image, and relative of the gradient
 
 
 def settle_device(
-    device: torch.device, requested: str, adjoint: str = "manual", say: Callable[[str], object] = print
+    device: torch.device,
+    requested: str,
+    adjoints: Sequence[str] = ("manual",),
+    say: Callable[[str], object] = print,
 ) -> torch.device:
     """``device``, if it passes the self-test; a GPU that "auto" chose and that fails gives way to the CPU, with a word.
+
+    Args:
+        device: on which the work is to be done.
+        requested: "auto", "cpu" or "cuda", as the user had it.
+        adjoints: modes that will be used.
+        say: receives what there is to say.
 
     Raises:
         InputError: if a GPU was asked for by name and fails.
@@ -42,7 +51,8 @@ def settle_device(
         return device
     say("Testing the GPU; its kernels are compiled once on a machine ...")
     try:
-        check_device(device, adjoint)
+        for adjoint in adjoints:
+            check_device(device, adjoint)
     except InputError as error:
         if requested != "auto":
             raise

@@ -18,7 +18,8 @@ from tqdm import tqdm
 
 from warp_splat import launch, report
 from warp_splat.config import TrainConfig, check_train
-from warp_splat.devices import is_out_of_memory
+from warp_splat.devices import memory_explained, peak_memory
+from warp_splat.distributed import GroupError, Processes, join
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views
 from warp_splat.formats import model_folder
@@ -48,6 +49,7 @@ class Run:
     seconds: float = 0.0  # of training steps alone, without evaluations and pictures
     preview: float = 0.0  # when last drawn
     stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
+    dropped: dict[str, int] = field(default_factory=dict)  # see Quarantine
 
 
 def train(config: TrainConfig) -> int:
@@ -59,8 +61,17 @@ def train(config: TrainConfig) -> int:
     problem = check_train(config)
     if problem:
         raise InputError(problem)
+    with join(config.device) as processes:
+        return _train(config, processes)
+
+
+def _train(config: TrainConfig, processes: Processes) -> int:
+    leads = processes.rank == 0
+    config.quiet |= not leads
+    config.iterations += -config.iterations % processes.count  # whole steps
     say = (lambda *_: None) if config.quiet else tqdm.write
-    device = settle_device(launch.prepare(config.device, config.threads), config.device, config.adjoint, say)
+    threads = config.threads or max(1, launch.get_threads() // processes.local_count)
+    device = settle_device(launch.prepare(config.device, threads), config.device, [config.adjoint], say)
     config.device = device.type
     if config.data_device == "cuda" and device.type != "cuda":
         raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
@@ -79,14 +90,16 @@ def train(config: TrainConfig) -> int:
         eval=config.eval,
         report=say,
     )
-    run = Run(model_folder.prepare(config.model_path or model_folder.default_model_path()), started)
+    run = Run(Path(processes.first(config.model_path or str(model_folder.default_model_path()))), started)
+    together = f"{processes.count} processes with " * (processes.count > 1)
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
     say(
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
-        f"{len(scene.points)} points; {launch.get_threads()} threads; output in {run.folder}"
+        f"{len(scene.points)} points; {together}{launch.get_threads()} threads; output in {run.folder}"
     )
-    trainer = Trainer(scene, config)
-    _write_inputs(run.folder, config, scene)
+    trainer = Trainer(scene, config, processes)
+    if leads:
+        _write_inputs(model_folder.prepare(run.folder), config, scene)
     say("Preparing kernels (compiled once on a machine, about 15 s) ...")
     start = time.perf_counter()
     with _memory_explained(trainer):
@@ -95,9 +108,14 @@ def train(config: TrainConfig) -> int:
         with _interruptible() as interrupted:
             try:
                 _loop(trainer, run, interrupted)
+            except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
+                tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
+                return 1
             finally:  # whatever happened, the model comes first
-                print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")
-        _finish(trainer, run, say)
+                if leads or processes.lost:
+                    print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")
+        if leads:
+            _finish(trainer, run, say)
     return 130 if run.iteration < config.iterations else 0
 
 
@@ -119,23 +137,13 @@ def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
     save_points(folder / "input.ply", scene.points, scene.colors)
 
 
-@contextmanager
 def _memory_explained(trainer: Trainer):
-    """Turn an error that means that memory ran out into an InputError that says where, and what takes less."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        where = getattr(error, "__notes__", ["between two stages"])[0]
-        camera = max((view.camera for view in trainer.scene.train), key=lambda camera: camera.width * camera.height)
-        fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
-        if trainer.config.data_device == "cuda":
-            fewer.append("--data_device cpu")
-        raise InputError(
-            f"Out of memory on {trainer.device.type} {where}, with {len(trainer.model)} Gaussians on {camera.width} x "
-            f"{camera.height} px; train with {' or '.join(fewer)}."
-        ) from error
+    """See :func:`memory_explained`."""
+    fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
+    if trainer.config.data_device == "cuda":
+        fewer.append("--data_device cpu")
+    sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
+    return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
 
 
 @contextmanager
@@ -155,7 +163,7 @@ def _interruptible():
 
 
 def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
-    config = trainer.config
+    config, processes = trainer.config, trainer.processes
     checks = {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
     whole_checks = {*config.test_iterations, config.iterations}
     saves = set(config.save_iterations) - {config.iterations}
@@ -164,28 +172,30 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
     bar = tqdm(
         total=config.iterations, disable=config.quiet, unit="it", mininterval=pause, maxinterval=pause, miniters=0
     )
+    trainer.check_identical(0)
     with bar, launch.profile(config.profile > 0) as stages:
-        for iteration in range(1, config.iterations + 1):
-            if iteration == profiled + 1:
+        for iteration in range(processes.count, config.iterations + 1, processes.count):
+            if processes.reaches(iteration, [profiled + 1]):
                 stages.clear()
                 before_profile = run.seconds
             start = time.perf_counter()
             run.losses.append(trainer.differentiate(iteration))
             run.iteration = iteration
             run.seconds += time.perf_counter() - start
-            stop = bool(interrupted) or iteration == config.iterations
-            if iteration in checks | whole_checks or stop:
+            stop = processes.any(bool(interrupted)) or iteration == config.iterations
+            if stop or processes.reaches(iteration, checks | whole_checks):
                 with launch.profile(False):
-                    _check(trainer, run, bar, whole=iteration in whole_checks)
-            if iteration in saves and not stop:
+                    _check(trainer, run, bar, whole=processes.reaches(iteration, whole_checks))
+            if processes.reaches(iteration, saves) and not stop:
                 _save_or_warn(trainer, run)
-            bar.update()
+            bar.update(processes.count)
             if stop:
                 break
             start = time.perf_counter()
             trainer.update(iteration)
             run.seconds += time.perf_counter() - start
-    steps = run.iteration - profiled
+    run.dropped = trainer.quarantine.read(processes)
+    steps = -(-(run.iteration - profiled) // processes.count)
     if config.profile and steps > 0:
         times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
         step = 1e3 * (run.seconds - before_profile) / steps
@@ -194,18 +204,21 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
 
 def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
+    trainer.check_identical(run.iteration)
+    losses, run.losses = run.losses, []
+    if trainer.processes.rank > 0:
+        return
     split, views = trainer.scene.evaluated
     if not whole:
         views = views[:: -(-len(views) // PROGRESS_VIEWS)]
     record = {
         "iteration": run.iteration,
-        "loss": float(np.mean(torch.stack(run.losses).double().cpu().numpy())),
+        "loss": float(np.mean(torch.stack(losses).double().cpu().numpy())),
         "psnr": trainer.evaluate(views),
         "gaussians": len(trainer.model),
         "seconds": run.seconds,
     }
     run.history.append(record)
-    run.losses.clear()
     text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
     bar.set_postfix_str(text, refresh=False)
     if time.perf_counter() - run.preview > PREVIEW_SECONDS:
@@ -237,6 +250,8 @@ def _save(trainer: Trainer, run: Run) -> Path:
 
 def _save_or_warn(trainer: Trainer, run: Run) -> None:
     """Save on the way: training goes on if that fails."""
+    if trainer.processes.rank > 0:
+        return
     try:
         _save(trainer, run)
     except (InputError, OSError) as error:
@@ -253,8 +268,9 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
         "gaussians": len(trainer.model),
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
-        "peak_memory_mb": _peak_memory(),
-        "dropped": trainer.quarantine.read(),
+        "processes": trainer.processes.count,
+        "peak_memory_mb": peak_memory(),
+        "dropped": run.dropped,
     }
     means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)
     sheet, plot = run.folder / "contact_sheet.png", run.folder / "training.png"
@@ -277,7 +293,7 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
     )
     for name, where in lines:
         print(f"  {name:9s} {where}")
-    dropped = trainer.quarantine.read()
+    dropped = run.dropped
     if dropped["prunings"]:
         print(f"  warning   {dropped['prunings']} prunings would have removed every Gaussian and were refused")
     if dropped["pixels"] or dropped["gradients"] or dropped["gaussians"]:
@@ -285,13 +301,3 @@ def _finish(trainer: Trainer, run: Run, say) -> None:
             f"  kept from spreading: {dropped['pixels']} pixels and {dropped['gradients']} Gaussians with gradients, "
             f"and {dropped['gaussians']} Gaussians with parameters, that were not finite"
         )
-
-
-def _peak_memory() -> int | None:
-    """Largest resident size of the process so far, in MiB; None where the system does not tell."""
-    try:
-        import resource  # noqa: PLC0415 - not on Windows
-    except ImportError:
-        return None
-    unit = 1024 * 1024 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // unit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,8 @@ from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions, TrainConfig
 from warp_splat.densify import Densifier
 from warp_splat.devices import choose_device
+from warp_splat.distributed import ALONE, Processes
+from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.launch import stage
 from warp_splat.losses import image_loss
@@ -30,9 +32,12 @@ class Quarantine:
     gaussians: int | torch.Tensor = 0  # left out of an image because a parameter was not finite (once per image)
     prunings: int = 0  # refused, because they would have emptied the scene
 
-    def read(self) -> dict[str, int]:
-        """The counts by name."""
-        return {name: int(count) for name, count in asdict(self).items()}
+    def read(self, processes: Processes = ALONE) -> dict[str, int]:
+        """The counts by name, over all processes."""
+        counts = torch.tensor([int(self.pixels), int(self.gradients), int(self.gaussians)])
+        processes.sum(counts)  # but a refused pruning is the same one everywhere
+        names = (item.name for item in fields(self))
+        return dict(zip(names, [*counts.tolist(), self.prunings], strict=True))
 
 
 class Trainer:
@@ -41,17 +46,24 @@ class Trainer:
     Args:
         scene: views and points.
         config: options.
+        processes: those that train together; each takes a view of its own in every step.
 
     Raises:
-        InputError: if the device cannot be used.
+        InputError: if the device cannot be used, or there are more processes than training views.
     """
 
-    def __init__(self, scene: Scene, config: TrainConfig):
+    def __init__(self, scene: Scene, config: TrainConfig, processes: Processes = ALONE):
+        if processes.count > len(scene.train):
+            raise InputError(
+                f"--nproc-per-node: expected at most one process for each of {len(scene.train)} training views, got "
+                f"{processes.count}; start fewer."
+            )
         self.scene, self.config, self.device = scene, config, choose_device(config.device)
+        self.processes = processes
         extent = scene.extent
         self.model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree).to(self.device)
-        self.optimizer = Optimizer(self.model, config, extent)
-        self.densifier = Densifier(self.model, self.optimizer, config, extent)
+        self.optimizer = Optimizer(self.model, config, extent, processes.count)
+        self.densifier = Densifier(self.model, self.optimizer, config, extent, processes)
         self.quarantine = Quarantine()
         self.options = RasterOptions(antialiasing=config.antialiasing, projection=config.projection)
         self.background = torch.full((3,), float(config.white_background), device=self.device)
@@ -63,7 +75,9 @@ class Trainer:
         self._radii = torch.zeros(0, dtype=torch.int32, device=self.device)  # of the view that was differentiated last
 
     def differentiate(self, iteration: int) -> torch.Tensor:
-        """Gradients of the loss of one view; returns the loss, a scalar. Iterations count from 1.
+        """Gradients of the loss of one view; returns the loss, a scalar. Means over the processes, if there are more.
+
+        Iterations count images from 1; with n processes a step is n of them, and ``iteration`` the last one's.
 
         The reference evaluates and saves between this and :meth:`update`: a set that was densified a moment ago is
         unsettled and renders several dB worse.
@@ -74,7 +88,8 @@ class Trainer:
         view = self._next_view()
         background = self.background
         if config.random_background:
-            background = torch.rand(3, generator=self._background_random).to(self.device)
+            drawn = torch.rand(self.processes.count, 3, generator=self._background_random)
+            background = drawn[self.processes.rank].to(self.device)
         out = self._render(view.camera, background)
         out.means2d.retain_grad()
         # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
@@ -86,14 +101,19 @@ class Trainer:
         self.quarantine.pixels += out.dropped.pixel_count
         self.quarantine.gradients += out.dropped.gaussian_count
         self.quarantine.gaussians += out.invalid_count
-        self._radii = out.radii
-        return loss.detach()
+        self._radii, loss = out.radii, loss.detach()
+        if config.optimizer_type == "sparse_adam":
+            self.processes.maximum(self._radii)
+        self.processes.average([*self.model.gradients(self.degree), loss])
+        return loss
 
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
         with stage("densify"):
             changed = self.densifier.update(iteration)
-        self.quarantine.prunings += changed is not None and changed.refused
+        if changed is not None:
+            self.check_identical(iteration)
+            self.quarantine.prunings += changed.refused
         with stage("Adam"):
             if changed is None or changed.refused:
                 self.optimizer.step(self._radii)
@@ -105,11 +125,20 @@ class Trainer:
         image_loss(out.image, torch.zeros_like(out.image), self.config.lambda_dssim).backward()
         self.optimizer.adam.zero_grad(set_to_none=True)
 
+    def check_identical(self, iteration: int) -> None:
+        """Raise GroupError if the model is not the same, byte for byte, in all processes."""
+        self.processes.check_identical(self.model.parameters.values(), iteration)
+
     def _next_view(self) -> View:
-        """Views in random order, each once before any comes again."""
-        if not self._deck:
-            self._deck = list(self.scene.train)
-        return self._deck.pop(self._views_random.randrange(len(self._deck)))
+        """Views in random order, each once before any comes again; all processes deal, each takes its own."""
+        dealt: list[View] = []
+        while len(dealt) < self.processes.count:
+            if not self._deck:
+                self._deck = list(self.scene.train)
+            index = self._views_random.randrange(len(self._deck))
+            if self._deck[index] not in dealt:  # a new deck holds those of this step again
+                dealt.append(self._deck.pop(index))
+        return dealt[self.processes.rank]
 
     def _photograph(self, view: View) -> torch.Tensor:
         """The photograph of ``view`` on the device; for a GPU, it waits there or in page-locked memory of the host."""

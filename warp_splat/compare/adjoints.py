@@ -25,6 +25,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.renderer import render
 
+ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
 REPEATS = 5
 BUDGET = 12.0  # s for the repeats of a workload; slow ones get fewer
 DIFFERENCES = 12  # parameters at which central differences are computed
@@ -70,20 +71,22 @@ class Measurement:
         return max(found, key=lambda item: item[1]) if found else ("-", float("nan"))
 
 
-def variants_of(modes: Sequence[str]) -> list[Variant]:
-    """The modes asked for and what only the comparison has."""
-    found = [Variant(mode, mode) for mode in dict.fromkeys(("manual", *modes))]
-    found += [Variant("generated", "generated"), Variant("plain", "plain")]
+def variants_of(modes: Sequence[str], device: torch.device) -> list[Variant]:
+    """The modes asked for and what only the comparison has, as far as ``device`` has it."""
+    of_the_cpu = ON_CPU if device.type == "cpu" else ()
+    found = [Variant(mode, mode) for mode in dict.fromkeys(("manual", *modes, *of_the_cpu))]
     return found + [Variant(f"cap {cap}", "manual", {"max_steps": cap}) for cap in CAPS]
 
 
 def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[str], None]) -> list[Measurement]:
     """Every variant on every workload, and central differences."""
     results = []
+    if any(workload.device.type != "cpu" for workload in workloads):
+        say(f"Left out: {', '.join(ON_CPU)} and the count of lines, which the CPU's kernels alone have.")
     for workload in workloads:
         start = time.perf_counter()
         truth = compute_truth(workload)
-        found = {variant: first_run(workload, truth, variant) for variant in variants_of(modes)}
+        found = {variant: first_run(workload, truth, variant) for variant in variants_of(modes, workload.device)}
         time_all(workload, found)
         results += [*found.values(), central_differences(workload, truth)]
         say(f"{workload.name}: measured in {time.perf_counter() - start:.0f} s")
@@ -93,7 +96,8 @@ def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[
 def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement:
     """Error and memory; compiles and warms up the kernels."""
     result = Measurement(workload.name, variant.name, len(workload.gaussians[0]))
-    result.rules, result.plumbing = derivative_lines(variant.adjoint)
+    if workload.device.type == "cpu":
+        result.rules, result.plumbing = derivative_lines(variant.adjoint)
     options = variant.options(workload)
     try:
         image, gradients = gradients_of(workload, truth, variant.adjoint, options)
@@ -104,7 +108,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     result.errors = errors_of(gradients, truth)
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
-    result.memory = peak_memory(lambda: _differentiate(workload, variant))
+    result.memory = peak_memory(lambda: _differentiate(workload, variant), workload.device)
     return result
 
 
@@ -133,8 +137,13 @@ def _differentiate(workload: Workload, variant: Variant) -> None:
     out.image.backward(torch.ones_like(out.image))
 
 
-def peak_memory(run: Callable[[], None]) -> int:
-    """Largest sum of bytes that torch allocated and had not yet freed during ``run``."""
+def peak_memory(run: Callable[[], object], device: torch.device) -> int:
+    """Largest sum of bytes on ``device`` that torch allocated and had not yet freed during ``run``."""
+    if device.type == "cuda":
+        before = torch.cuda.memory_allocated(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        run()
+        return torch.cuda.max_memory_allocated(device) - before
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as profile:
         run()
     events = profile.profiler.kineto_results.events()
@@ -173,7 +182,7 @@ def _loss(workload: Workload, truth: Truth, opacities: torch.Tensor) -> float:
     with torch.no_grad():
         image = render(gaussians, workload.camera, workload.background, workload.options).image
     rows, columns = workload.pixels.T
-    return float((image[rows, columns].double() * truth.weights).sum())
+    return float((image[rows, columns].double().cpu() * truth.weights).sum())
 
 
 def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:

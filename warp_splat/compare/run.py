@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+import torch
+
 from warp_splat import launch
 from warp_splat.compare import adjoints, knobs, report, stability, training, volume_report
 from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
@@ -15,6 +17,7 @@ from warp_splat.formats.atomic import atomic_write, write_csv, write_json
 from warp_splat.gradcheck import check_gradients
 from warp_splat.report import machine
 from warp_splat.scene.types import Scene
+from warp_splat.selftest import settle_device
 
 DIRECTIONS = 4  # per parameter
 
@@ -32,9 +35,12 @@ def compare(config: CompareConfig) -> int:
         raise InputError("--stability, --volume: expected one of them, got both; run the command twice.")
     if (config.stability or config.volume) and (config.scene or config.full):
         raise InputError("--scene, --full: these belong to the comparison without --stability and --volume.")
-    if config.device == "cuda":
-        raise InputError("--device cuda: the comparison measures the CPU's kernels only; use --device cpu.")
-    launch.prepare("cpu", config.threads)
+    wanted = config.device
+    if config.stability or config.volume:
+        if wanted == "cuda":
+            raise InputError("--device cuda: --stability and --volume compute on the CPU only; use --device cpu.")
+        wanted = "cpu"
+    device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
     out, log = Path(config.out), []
     with atomic_write(out / ".writable") as path:  # to fail before all measuring, not after
         path.touch()
@@ -52,9 +58,10 @@ def compare(config: CompareConfig) -> int:
     else:
         name, code = "compare", 0
         scenes = named_scenes(config.scene, print)
-        _compare_pixel_loops(config, scenes, out, say)
-        training.run(out, config.modes, scenes, config.full, say)
-    say(f"\nMeasured on {machine()}, {launch.get_threads()} threads.")
+        _compare_pixel_loops(config, scenes, device, out, say)
+        training.run(out, config.modes, scenes, config.full, say, device.type)
+    card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
+    say(f"\nMeasured on {card}{machine()}, {launch.get_threads()} threads.")
     with atomic_write(out / f"{name}.txt") as path:
         path.write_text("\n".join(log) + "\n", encoding="utf-8")
     print(f"Tables and plots: {out}")
@@ -62,11 +69,11 @@ def compare(config: CompareConfig) -> int:
 
 
 def _compare_pixel_loops(
-    config: CompareConfig, scenes: dict[str, Scene], out: Path, say: Callable[[str], None]
+    config: CompareConfig, scenes: dict[str, Scene], device: torch.device, out: Path, say: Callable[[str], None]
 ) -> None:
     """Adjoints on every workload; knobs on the layered scene and those trained longest."""
     print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
-    workloads = all_workloads(scenes, say)
+    workloads = all_workloads(scenes, device, say)
     measured = adjoints.measure(workloads, config.modes, say)
     say(f"\n{report.adjoint_table(measured)}\n")
     _write(out, "adjoints", measured)

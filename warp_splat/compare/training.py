@@ -80,7 +80,12 @@ class Run:
 
 
 def run(
-    out: Path, modes: Sequence[str], scenes: Mapping[str, Scene], full: bool = False, say: Callable[[str], None] = print
+    out: Path,
+    modes: Sequence[str],
+    scenes: Mapping[str, Scene],
+    full: bool = False,
+    say: Callable[[str], None] = print,
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Train all variants: about three minutes on two cores for four modes, an hour with ``full``.
 
@@ -90,6 +95,7 @@ def run(
         scenes: by name, with views held out.
         full: train by the embedded scene's whole schedule instead of the short one.
         say: receives a line for each run when those of its seed are done, and the tables.
+        device: to train on.
 
     Returns:
         ``schedule``, ``runs``, ``summary`` (by variant) and ``equality`` (by scene), as written to training.json.
@@ -97,7 +103,8 @@ def run(
     Raises:
         InputError: if a file cannot be written.
     """
-    out, schedule, names = Path(out), EMBEDDED_DEFAULTS if full else SHORT, list(dict.fromkeys(("manual", *modes)))
+    out, names = Path(out), list(dict.fromkeys(("manual", *modes)))
+    schedule = {**(EMBEDDED_DEFAULTS if full else SHORT), "device": device}
     variants: dict[str, dict[str, Any]] = {name: {"adjoint": name} for name in names}
     variants |= {f"cap {cap}": {"max_steps": cap} for cap in CAPS} | {"ellipsoid": {"projection": "ellipsoid"}}
     results: dict[str, Any] = {"schedule": schedule, "runs": [], "summary": [], "equality": {}}
@@ -154,7 +161,7 @@ def train_all(scene: Scene, name: str, variants: Mapping, seeded: Sequence[str],
 
 def make_trainer(scene: Scene, schedule: Mapping, seed: int, max_steps: int | None = None, **options) -> Trainer:
     """A trainer that has done nothing yet; ``max_steps`` caps the loop in training and in rendering."""
-    trainer = Trainer(scene, TrainConfig(**schedule, device="cpu", seed=seed, **options))
+    trainer = Trainer(scene, TrainConfig(**{"device": "cpu", **schedule}, seed=seed, **options))
     trainer.options = replace(trainer.options, max_steps=max_steps)
     return trainer
 
@@ -198,8 +205,8 @@ def _judge(trainer: Trainer, result: Run) -> None:
 def _list_lengths(trainer: Trainer, view: View) -> np.ndarray:
     """Entries in the list of each tile of a view."""
     gaussians = trainer.model.activated()
-    cam = camera_view(view.camera, gaussians[5].shape[1], trainer.options)
-    return np.diff(bin_tiles(*Project.apply(*gaussians, cam, Dropped()), view.camera, trainer.options).ranges.numpy())
+    projected = Project.apply(*gaussians, camera_view(view.camera, gaussians[5].shape[1], trainer.options), Dropped())
+    return np.diff(bin_tiles(*projected, view.camera, trainer.options).ranges.cpu().numpy())
 
 
 def _views(scene: Scene) -> list[View]:

@@ -17,7 +17,7 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "background", "mean
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What the oracle says at the workload's pixels."""
+    """What the oracle says at the workload's pixels; on the host, whatever computes what is compared with it."""
 
     image: torch.Tensor  # [P, 3]
     weights: torch.Tensor  # [P, 3] upstream gradient: random, 0 at pixels that hang on a rounding
@@ -38,8 +38,8 @@ class Error:
 def compute_truth(workload: Workload) -> Truth:
     """Float64 image and gradients at the workload's pixels."""
     options = workload.options
-    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double() for tensor in workload.gaussians)
-    leaves = [means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), workload.background.double()]
+    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double().cpu() for tensor in workload.gaussians)
+    leaves = [means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), workload.background.double().cpu()]
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
     keys = ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")
     chosen = {key: getattr(options, key) for key in keys}
@@ -55,17 +55,20 @@ def compute_truth(workload: Workload) -> Truth:
 def gradients_of(
     workload: Workload, truth: Truth, adjoint: str, options: RasterOptions
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The renderer's image [P, 3] at the workload's pixels, and its gradients for the truth's upstream gradient."""
+    """The renderer's image [P, 3] at the workload's pixels, and its gradients for the truth's upstream gradient.
+
+    All on the host.
+    """
     leaves = [tensor.clone().requires_grad_() for tensor in workload.gaussians]
     background = workload.background.clone().requires_grad_()
     out = render(tuple(leaves), workload.camera, background, options, adjoint)
     out.means2d.retain_grad()
     rows, columns = workload.pixels.T
     seen = out.image[rows, columns]
-    (seen * truth.weights).sum().backward()
+    (seen * truth.weights.to(seen.device)).sum().backward()
     sh = torch.cat([leaves[4].grad, leaves[5].grad], 1)
     gradients = [*(leaf.grad for leaf in leaves[:4]), sh, background.grad, out.means2d.grad]
-    return seen.detach(), dict(zip(PARAMETERS, gradients, strict=True))
+    return seen.detach().cpu(), {name: grad.cpu() for name, grad in zip(PARAMETERS, gradients, strict=True)}
 
 
 def errors_of(found: dict[str, torch.Tensor], truth: Truth) -> dict[str, Error]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,17 @@ class Workload:
     camera: Camera
     background: torch.Tensor  # [3]
     options: RasterOptions
-    pixels: torch.Tensor  # [P, 2] (row, column), int64
+    pixels: torch.Tensor  # [P, 2] (row, column), int64; always on the host
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is rendered."""
+        return self.background.device
+
+    def to(self, device: torch.device) -> Workload:
+        """The same on ``device``."""
+        gaussians = tuple(tensor.to(device) for tensor in self.gaussians)
+        return replace(self, gaussians=gaussians, background=self.background.to(device))
 
 
 def layered(candidates: int) -> Workload:
@@ -57,9 +67,9 @@ def layered(candidates: int) -> Workload:
     )
 
 
-def in_training(name: str, scene: Scene, say: Callable[[str], None]) -> list[Workload]:
+def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[str], None]) -> list[Workload]:
     """The first held-out view of a scene after each of :data:`STAGES` of the short schedule."""
-    trainer = Trainer(scene, TrainConfig(**SHORT, device="cpu"))
+    trainer = Trainer(scene, TrainConfig(**SHORT, device=device.type))
     camera = scene.evaluated[1][0].camera
     found = []
     for iteration in range(max(STAGES) + 1):
@@ -90,11 +100,11 @@ def named_scenes(scene: str, say: Callable[[str], None]) -> dict[str, Scene]:
     return found
 
 
-def all_workloads(scenes: dict[str, Scene], say: Callable[[str], None]) -> list[Workload]:
-    """The layered scenes, and the others in training."""
-    found = [layered(candidates) for candidates in CANDIDATES]
+def all_workloads(scenes: dict[str, Scene], device: torch.device, say: Callable[[str], None]) -> list[Workload]:
+    """The layered scenes, and the others in training, on ``device``."""
+    found = [layered(candidates).to(device) for candidates in CANDIDATES]
     for name, scene in scenes.items():
-        found += in_training(name, scene, say)
+        found += in_training(name, scene, device, say)
     return found
 
 

@@ -121,8 +121,9 @@ def project(
     quat = quats[i]
     scale = scales[i]
     opacity = opacities[i]
-    finite = wp.isfinite(mean) and wp.isfinite(quat) and wp.isfinite(scale) and wp.isfinite(opacity)
-    if not finite or quat == wp.vec4(0.0):
+    zero = wp.vec3(0.0)  # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
+    zero_if_finite = wp.dot(mean, zero) + wp.dot(quat, wp.vec4(0.0)) + wp.dot(scale, zero) + opacity * 0.0
+    if not zero_if_finite == 0.0 or quat == wp.vec4(0.0):
         radii_out[i] = INVALID
         return
     offset = (mean - camera.center) - camera.center_low
@@ -164,7 +165,7 @@ def project(
     det = sharp + BLUR * (xx + yy) + BLUR * BLUR
     if camera.antialiasing != 0:  # before any test of the opacity
         opacity = opacity * wp.sqrt(wp.max(sharp / det, COMPENSATION_MIN))
-    if not wp.isfinite(det):  # too large for float32 numbers, about 4e9 px
+    if not det * 0.0 == 0.0:  # too large for float32 numbers, about 4e9 px
         radii_out[i] = INVALID
         return
     if not opacity >= camera.alpha_min:
@@ -174,7 +175,7 @@ def project(
     if not (covers_pixel(mean2d[0], extent[0], camera.size[0]) and covers_pixel(mean2d[1], extent[1], camera.size[1])):
         return
     color = evaluate_sh(camera.sh_degree, wp.normalize(offset), sh_dc, sh_rest, i) + wp.vec3(0.5)
-    if not wp.isfinite(color):
+    if not wp.dot(color, zero) == 0.0:
         radii_out[i] = INVALID
         return
     means2d_out[i] = mean2d

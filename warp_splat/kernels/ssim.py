@@ -46,6 +46,16 @@ def inside(values: vec16, start: int, length: int):
     return where_less(IOTA, vec16(float(length - start)), values, vec16(0.0))
 
 
+@wp.func
+def column_weights(row: int, height: int):
+    """The window's weights for a column through ``row``, 0 for those outside the image."""
+    weights = WEIGHTS
+    for tap in range(WINDOW):
+        if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
+            weights[tap] = 0.0
+    return weights
+
+
 @wp.kernel
 def blur_rows(
     first: int,  # row of this slice
@@ -99,16 +109,17 @@ def compare(
     one = vec16(1.0)
     p = centers[0]
     q = centers[1]
+    weights = column_weights(row, height)
     above = float(0.0)  # share of the window above or below the image
     for tap in range(WINDOW):
-        if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
-            above += WEIGHTS[tap]
+        above += WEIGHTS[tap] - weights[tap]
     for group in range(moments.shape[2]):
         mx = vec16(0.0)
         my = vec16(0.0)
         xx = vec16(0.0)
         yy = vec16(0.0)
         xy = vec16(0.0)
+        # unrolled as in adj_blur_columns, five planes are slower: 7.5 ms against 5.2
         for other in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
             w = WEIGHTS[other - row + RADIUS]
             mx = mx + moments[other, 0, group] * w
@@ -156,11 +167,20 @@ def adj_blur_columns(
     for which in range(3):
         slopes_out[row, which, 0] = vec16(0.0)
         slopes_out[row, which, groups + 1] = vec16(0.0)
-        for group in range(groups):
-            blurred = vec16(0.0)
-            for other in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
-                blurred = blurred + slopes[other, which, group] * WEIGHTS[other - row + RADIUS]
-            slopes_out[row, which, group + 1] = blurred
+    weights = column_weights(row, height)
+    for group in range(groups):
+        dmu = vec16(0.0)
+        dxx = vec16(0.0)
+        dxy = vec16(0.0)
+        for tap in range(WINDOW):
+            w = weights[tap]
+            other = wp.clamp(row + tap - RADIUS, 0, height - 1)
+            dmu = dmu + slopes[other, 0, group] * w
+            dxx = dxx + slopes[other, 1, group] * w
+            dxy = dxy + slopes[other, 2, group] * w
+        slopes_out[row, 0, group + 1] = dmu
+        slopes_out[row, 1, group + 1] = dxx
+        slopes_out[row, 2, group + 1] = dxy
 
 
 @wp.kernel

@@ -191,15 +191,19 @@ def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
             for by in range(box[2], box[3] + 1):
                 for bx in range(box[0], box[1] + 1):
                     block = 4 * by + bx
-                    x = splat.mean[0] - x0 - float(4 * bx)
-                    y = splat.mean[1] - y0 - float(4 * by)
+                    x = splat.mean[0] - x0
+                    y = splat.mean[1] - y0
+                    column = vec16(float(4 * bx))
+                    row = vec16(float(4 * by))
                     if wp.static(mode == "generated"):
-                        z = exponent(vec16(x) - LANE_X, vec16(y) - LANE_Y, splat.root[0], splat.root[1], splat.root[2])
+                        dx = vec16(x) - LANE_X - column
+                        dy = vec16(y) - LANE_Y - row
+                        z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
                         raw = exp2_minus(z) * splat.opacity
                         alpha = alpha_of(where_less(here, count[tile, block], raw, vec16(-1.0)), alpha_min)
                     else:
-                        dx = spread(m, 0, x) - LANE_X
-                        dy = spread(m, 1, y) - LANE_Y
+                        dx = spread(m, 0, x) - LANE_X - column
+                        dy = spread(m, 1, y) - LANE_Y - row
                         xx = spread(m, 2, splat.root[0])
                         xy = spread(m, 3, splat.root[1])
                         z = exponent(dx, dy, xx, xy, spread(m, 4, splat.root[2]))

@@ -90,13 +90,13 @@ class Outline:
 
 
 @wp.func
-def outline_of(splat: Splat2D, height: int, alpha_min: float):
+def outline_of(splat: Splat2D, height: int):
     outline = Outline()
     rows = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
     outline.top = rows[0] // TILE
     outline.bottom = rows[1] // TILE
     outline.slope = -splat.root[1] / splat.root[0]
-    outline.half = wp.sqrt(0.5 * LOG2_E * reach_of(splat.opacity, alpha_min)) / splat.root[0]
+    outline.half = splat.root[2] * splat.extent[1] / splat.root[0]  # sqrt(reach log2(e) / 2) / root; square: unused
     outline.turn = outline.slope * splat.extent[1] * splat.extent[1] / splat.extent[0]
     return outline
 
@@ -129,7 +129,6 @@ def find_spans(
     width: int,
     height: int,
     tiles_x: int,
-    alpha_min: float,
     square: int,
     # out
     spans_out: wp.array[wp.vec2i],  # [R] per row of tiles: first tile, number of tiles
@@ -137,7 +136,7 @@ def find_spans(
 ):
     rank = first + wp.tid()
     splat = splats[rank]
-    outline = outline_of(splat, height, alpha_min)
+    outline = outline_of(splat, height)
     end = int(row_ends[rank])
     begin = int(0)
     if rank > 0:
@@ -159,7 +158,6 @@ def list_tiles(
     width: int,
     height: int,
     tiles_x: int,
-    alpha_min: float,
     square: int,
     slot_ends: wp.array[wp.int64],  # [N] inclusive scan of what the first run counted; [0] in that run
     # out
@@ -175,7 +173,7 @@ def list_tiles(
     found = int(0)
     if radii[order[rank]] > 0:
         splat = splats[rank]
-        outline = outline_of(splat, height, alpha_min)
+        outline = outline_of(splat, height)
         for row in range(outline.top, outline.bottom + 1):
             span = cut(splat, outline, row, width, square)
             if writes:

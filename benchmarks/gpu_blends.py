@@ -1,0 +1,169 @@
+"""For ``gpu.py``: the two blends alone, their share of what the card can do, and slots against atomics.
+
+Slots: each tile instance has a row of its own, ``tiles.gather`` sums a Gaussian's rows in order. Atomics: the same
+kernel adds into the Gaussian's row at once; no rows per instance, no second kernel, another sum in every run.
+"""
+
+import torch
+import warp as wp
+from gpu_scene import cameras, make_gaussians, milliseconds
+
+from warp_splat.adjoints import list_inputs
+from warp_splat.binning import bin_tiles, views2d
+from warp_splat.blocks import THREADS, blend_blocks, spread_upstream
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.kernels import tiles
+from warp_splat.kernels.adjoint_block import make_reverse_block
+from warp_splat.launch import launch, launch_blocks, view
+from warp_splat.renderer import Dropped, Project, camera_view
+
+#: Floating-point operations for one Gaussian at one pixel (operators of kernels/blend.py and kernels/step.py).
+#: Forward: offset 2, exponent 7, exponential 14, alpha 3, transmittance and weight 6, color 6, stop 1.
+#: Adjoint: lit 7, offset 2, exponent 7, exponential 14, alpha 4, odds 2, transmittance 2, dL/dalpha 9, moments 5,
+#: channels 4, and an addition for each of the ten sums over the block.
+FORWARD, ADJOINT = 39, 66
+SPLAT, INSTANCE, ROW = 48, 8, 36  # bytes
+ROUNDS, UNROLLED, CHAINS = 1024, 16, 4  # of multiply-adds; on sm_90 the compiler makes 64 FFMA of a round
+
+SHARE_HEADERS = ("kernel", "ms", "GB", "% of the card's copy", "G operations", "% of its multiply-adds")
+ATOMIC_HEADERS = (
+    *("size", "Gaussians", "instances", "rows", "upstream ms", "adjoint ms", "gather ms", "sum ms"),
+    "two runs alike",
+)
+
+
+@wp.kernel(enable_backward=False)
+def multiply_add(first: int, rounds: int, factor: float, values_out: wp.array[wp.vec4]):
+    i = first + wp.tid()
+    x = values_out[i]
+    a = x[0]
+    b = x[1]
+    c = x[2]
+    d = x[3]
+    for _round in range(rounds):
+        for _k in range(UNROLLED):
+            a = a * factor + 1.0
+            b = b * factor + 1.0
+            c = c * factor + 1.0
+            d = d * factor + 1.0
+    values_out[i] = wp.vec4(a, b, c, d)
+
+
+@wp.func
+def add(rows: wp.array2d[float], row: int, column: int, value: float):
+    wp.atomic_add(rows, row, column, value)
+
+
+class Blends:
+    """The launches of a forward pass and its ``manual`` adjoint by the kernels of a GPU, one by one."""
+
+    def __init__(self, gaussians: tuple[torch.Tensor, ...], camera: Camera):
+        self.camera, self.options = camera, RasterOptions()
+        self.background = torch.zeros(3, device=gaussians[0].device)
+        with torch.no_grad():
+            cam = camera_view(camera, gaussians[5].shape[1], self.options)
+            self.projected = Project.apply(*gaussians, cam, Dropped())
+            self.bins = bin_tiles(*self.projected, camera, self.options)
+        self.count, new = len(gaussians[0]), self.background.new_empty
+        self.slots = new(len(self.bins.instances), 9)
+        self.forward()
+        pixels = (torch.ones_like(self.image), torch.zeros_like(self.image[..., 0]), new(0, 0))
+        self.adj_pixels = pixels
+        self.upstream(self.slots)
+        ranks = self.bins.instances[:, 0]
+        # in place of the instance's slot, the Gaussian: with `add`, the kernel that is the product's writes there
+        self.by_gaussian = torch.stack([ranks, wp.to_torch(self.bins.order)[ranks.long()]], 1)
+        self.rows = new(self.count, 9)
+
+    def forward(self) -> None:
+        self.image, _, _, saved = blend_blocks(self.bins, self.camera, self.background, self.options, False)
+        self.final, self.stopped, _ = saved
+
+    def upstream(self, slots: torch.Tensor) -> None:
+        states = (self.background, self.final, self.stopped)
+        found = spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
+        self.up, self.adj_final, _, _, self.steps = found
+
+    def reverse(self, instances: torch.Tensor, rows: torch.Tensor, *write: wp.Function) -> None:
+        lists = list_inputs(self.bins, self.options)
+        lists[2] = view(instances, wp.vec2i)
+        states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
+        inputs = [*lists, *states, view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
+        kernel = make_reverse_block("manual", False, self.options.exp_degree, *write)
+        launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
+
+    def into_slots(self) -> None:
+        self.reverse(self.bins.instances, self.slots)
+
+    def gather(self) -> list[torch.Tensor]:
+        grads = [self.slots.new_zeros(self.count, width).squeeze(1) for width in (2, 3, 1, 3, 1)]
+        inputs = [self.bins.order, self.bins.slot_ends, view(self.slots, wp.float32)]
+        launch(tiles.gather, len(self.bins.order), inputs, views2d(grads), device=self.slots.device)
+        return grads[:4]
+
+    def by_atomics(self) -> torch.Tensor:
+        self.rows.zero_()
+        self.reverse(self.by_gaussian, self.rows, add)
+        return self.rows
+
+
+def card_rates(device: str, count: int) -> tuple[float, float]:
+    """Bytes that torch's copy of 16 times ``count`` reads and writes, and operations of multiply-adds, per second."""
+    source = torch.ones(count, 4, device=device)
+    target = torch.empty_like(source)
+    copying = milliseconds(lambda: target.copy_(source), device, 10)
+    threads, rounds = min(count, 2**20), ROUNDS if device == "cuda" else 1
+    values = [view(source, wp.vec4)]
+    adding = milliseconds(lambda: launch(multiply_add, threads, [rounds, 0.5], values, device=device), device, 10)
+    return 32e3 * count / copying, 2e3 * CHAINS * UNROLLED * rounds * threads / adding
+
+
+def measure_blends(
+    count: int, width: int, height: int, device: str, repeats: int
+) -> tuple[list[list], list[list], float]:
+    """Rows of shares and of slots against atomics, and by how much these two differ, relative."""
+    with torch.no_grad():
+        blends = Blends(make_gaussians(count, device).activated(), cameras(width, height, 1)[0])
+    bandwidth, arithmetic = card_rates(device, 2**24 if device == "cuda" else 2**16)
+    runs = {
+        "forward": blends.forward,
+        "upstream": lambda: blends.upstream(blends.slots),
+        "upstream without slots": lambda: blends.upstream(blends.slots[:, :0]),
+        "adjoint into slots": blends.into_slots,
+        "gather": blends.gather,
+        "adjoint by atomics": blends.by_atomics,
+    }
+    times = {name: milliseconds(run, device, repeats) for name, run in runs.items()}
+    walked, pixels, instances = int(blends.steps.sum()), len(blends.steps) * THREADS, len(blends.slots)
+    work = {
+        "forward": (walked * (SPLAT + INSTANCE) + 24 * pixels, FORWARD * walked * THREADS),
+        "adjoint into slots": (walked * (SPLAT + INSTANCE + ROW) + 28 * pixels, ADJOINT * walked * THREADS),
+        "gather": (instances * ROW + blends.count * (ROW + 12), 9 * instances),
+    }
+    shares = [
+        [name, f"{times[name]:.3f}", f"{size / 1e9:.3f}", f"{100e3 * size / times[name] / bandwidth:.1f}",
+         f"{operations / 1e9:.2f}", f"{100e3 * operations / times[name] / arithmetic:.1f}"]
+        for name, (size, operations) in work.items()
+    ]  # fmt: skip
+    shares += [["copy", "", f"{bandwidth / 1e9:.0f} per s", "100", "", ""]]
+    shares += [["multiply-add", "", "", "", f"{arithmetic / 1e9:.0f} per s", "100"]]
+    return shares, *_against_atomics(blends, times, f"{width} x {height}")
+
+
+def _against_atomics(blends: Blends, times: dict[str, float], size: str) -> tuple[list[list], float]:
+    """A row for each way, and by how much they differ."""
+    first = blends.by_atomics().clone()
+    repeated = torch.equal(first, blends.by_atomics())
+    blends.into_slots()
+    summed = torch.cat([grad.reshape(blends.count, -1) for grad in blends.gather()], 1)
+    error = float((first - summed).norm() / summed.norm())
+    ways = {"slots": ("upstream", "adjoint into slots", "gather"),
+            "atomics": ("upstream without slots", "adjoint by atomics")}  # fmt: skip
+    rows = []
+    for way, names in ways.items():
+        parts = [times[name] for name in names]
+        cells = [f"{part:.3f}" for part in (*parts, *[0.0] * (3 - len(parts)), sum(parts))]
+        same = way == "slots" or repeated
+        rows.append([size, blends.count, len(blends.slots), way, *cells, "yes" if same else "no"])
+    return rows, error

@@ -1,0 +1,91 @@
+"""For ``gpu.py``: a scene without files, of any number of Gaussians, a trainer on it, and a clock for either device."""
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.config import TrainConfig
+from warp_splat.densify import Densifier
+from warp_splat.gaussians import GaussianModel
+from warp_splat.render import ORBIT_RADIUS, ORBIT_SIZE, orbit_cameras
+from warp_splat.scene.types import Scene, View
+from warp_splat.trainer import Trainer
+
+RADIUS = 4.0  # world units, of the ball that the Gaussians fill; the orbit lies outside
+VIEWS = 8
+NEVER = 10**9
+
+
+def make_gaussians(count: int, device: str) -> GaussianModel:
+    """Random Gaussians of SH degree 3 in a ball, the smaller the more there are, as in training.
+
+    At 100,000 their standard deviation is 2 px seen from the orbit; the scale falls with the cube root of the count.
+    """
+    generator = torch.Generator(device).manual_seed(0)
+    normal = lambda *shape: torch.randn(*shape, generator=generator, device=device)  # noqa: E731
+    uniform = torch.rand(count, 1, generator=generator, device=device)
+    pixel = ORBIT_RADIUS / cameras(ORBIT_SIZE[0], ORBIT_SIZE[1], 1)[0].fx * (100_000 / count) ** (1 / 3)
+    return GaussianModel(
+        {
+            "means": RADIUS * uniform ** (1 / 3) * torch.nn.functional.normalize(normal(count, 3), dim=1),
+            "sh_dc": normal(count, 1, 3),
+            "sh_rest": 0.1 * normal(count, 15, 3),
+            "opacities": 2.0 * normal(count),
+            "scales": 0.3 + 0.8 * normal(count, 3) + math.log(pixel),
+            "quats": normal(count, 4),
+        }
+    )
+
+
+def cameras(width: int, height: int, count: int) -> list[Camera]:
+    """On the orbit of ``warp-splat render``, for images of another size."""
+    start = np.array([0.0, 0.0, -ORBIT_RADIUS])
+    found = orbit_cameras(np.zeros(3), np.array([0.0, -1.0, 0.0]), start, count)
+    return [camera.resized(width, height) for camera in found]
+
+
+def make_trainer(count: int, width: int, height: int, device: str) -> Trainer:
+    """A trainer of ``count`` Gaussians at the highest degree, which watches their gradients but does not densify."""
+    rng = np.random.default_rng(0)
+    views = [
+        View(f"{index}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8), camera)
+        for index, camera in enumerate(cameras(width, height, VIEWS))
+    ]
+    scene = Scene(views, [], np.eye(4, 3, dtype=np.float32), np.zeros((4, 3), np.uint8))
+    never = {"densify_from_iter": NEVER, "densify_until_iter": NEVER, "opacity_reset_interval": NEVER}
+    trainer = Trainer(scene, TrainConfig(device=device, data_device=device, sh_interval=1, **never))
+    nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
+    added = {name: tensor.detach() for name, tensor in make_gaussians(count, device).parameters.items()}
+    trainer.optimizer.replace(nobody, added)
+    trainer.densifier = Densifier(trainer.model, trainer.optimizer, trainer.config, scene.extent)
+    return trainer
+
+
+def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:
+    """Median after a warm-up, by CUDA events (by the clock on a CPU)."""
+    times = []
+    for repeat in range(-2, repeats):
+        if device == "cuda":
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            start.record()
+            run()
+            end.record()
+            torch.cuda.synchronize()
+            elapsed = start.elapsed_time(end)
+        else:
+            begun = time.perf_counter()
+            run()
+            elapsed = 1e3 * (time.perf_counter() - begun)
+        if repeat >= 0:
+            times.append(elapsed)
+    return statistics.median(times)
+
+
+def synchronize(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()

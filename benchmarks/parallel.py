@@ -1,0 +1,90 @@
+"""Train the embedded scene with one and with two processes: quality against time, for as many images or as many steps.
+
+One process has one or two threads, two processes have one thread each. `two, as many steps` stretches the schedule, so
+that everything happens at the same step as with one process, after twice as many images.
+
+    python benchmarks/parallel.py --models output/parallel [--iterations 3000] [--out docs/benchmarks]
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from common import machine, write_table
+
+from warp_splat.config import EMBEDDED_DEFAULTS, TrainConfig
+
+ROOT = Path(__file__).parents[1]
+#: name: processes, threads of each, factor of the schedule
+RUNS = {
+    "1 process, 2 threads": (1, 2, 1),
+    "1 process, 1 thread": (1, 1, 1),
+    "2 processes, as many images": (2, 1, 1),
+    "2 processes, as many steps": (2, 1, 2),
+}
+SCHEDULE = (
+    "iterations",
+    "position_lr_max_steps",
+    "sh_interval",
+    "densify_from_iter",
+    "densify_until_iter",
+    "densification_interval",
+    "opacity_reset_interval",
+)
+
+
+def flags_of(iterations: int) -> list[str]:
+    """The embedded scene's flags, the schedule stretched or compressed to ``iterations``."""
+    defaults = TrainConfig(**EMBEDDED_DEFAULTS)
+    share = iterations / defaults.iterations
+    schedule = [(f"--{name}", str(round(getattr(defaults, name) * share))) for name in SCHEDULE]
+    return [word for pair in schedule for word in pair] + ["--max_gaussians", str(defaults.max_gaussians), "--eval"]
+
+
+def run(model: Path, processes: int, threads: int, iterations: int) -> tuple:
+    """Train; a row of the table."""
+    start = [sys.executable, "-m"]
+    if processes > 1:
+        start += ["torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "-m"]
+    flags = [*flags_of(iterations), "--threads", str(threads), "--device", "cpu"]
+    subprocess.run(
+        [*start, "warp_splat", "train", "-s", ROOT / "assets" / "still_life", "-m", model, *flags], check=True, cwd=ROOT
+    )
+    (entry,) = json.loads((model / "results.json").read_text()).values()
+    seconds = json.loads((model / "history.json").read_text())[-1]["seconds"]
+    return (
+        iterations,
+        iterations // processes,
+        f"{entry['PSNR']:.2f}",
+        f"{entry['SSIM']:.4f}",
+        f"{seconds:.0f}",
+        f"{iterations / seconds:.1f}",
+        f"{1e3 * seconds * processes / iterations:.0f}",
+        entry["gaussians"],
+        f"{entry['seconds']:.0f}",
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--models", type=Path, required=True, help="folder for the models, which holds none yet")
+    parser.add_argument("--iterations", type=int, default=3000, help="images in all but the last run, an even number")
+    parser.add_argument("--out", type=Path, help="folder for parallel.md and parallel.json")
+    arguments = parser.parse_args()
+    rows = []
+    for number, (name, (processes, threads, factor)) in enumerate(RUNS.items()):
+        model = arguments.models.resolve() / str(number)
+        rows.append((name, *run(model, processes, threads, factor * arguments.iterations)))
+    headers = ("run", "images", "steps", "PSNR dB", "SSIM", "s of steps", "images/s", "ms/step", "Gaussians", "wall s")
+    note = (
+        "Embedded scene, held-out views (every 8th); seconds of steps without evaluations and pictures; one run each."
+    )
+    write_table(
+        "parallel", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()}
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""What ``benchmarks/gpu.py`` measures is right, as far as a machine without a GPU can tell: its kernels in fibers."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import warp as wp
+
+from warp_splat import RasterOptions
+from warp_splat.config import ADJOINTS
+from warp_splat.errors import InputError
+from warp_splat.renderer import Blend, Dropped
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import gpu  # noqa: E402
+import gpu_blends  # noqa: E402
+import gpu_scene  # noqa: E402
+
+
+@pytest.fixture
+def fibers(monkeypatch):
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+
+
+def test_atomics_and_slots_give_the_gradients_of_the_product(fibers):
+    """Against autograd through the CPU's driver, which shares no kernel with them."""
+    gaussians = tuple(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated())
+    camera = gpu_scene.cameras(60, 40, 1)[0]
+    blends = gpu_blends.Blends(gaussians, camera)
+    blends.into_slots()
+    found = {"slots": blends.gather(), "atomics": blends.by_atomics().split([2, 3, 1, 3], 1)}
+    leaves = [tensor.detach().requires_grad_() for tensor in blends.projected[:5]]
+    image, *_ = Blend.apply(*leaves, torch.zeros(3), blends.bins, camera, RasterOptions(), "manual", Dropped())
+    expected = torch.autograd.grad(image.sum(), leaves[:4])
+    assert (blends.image - image).abs().max() < 1e-6 and len(blends.slots) > 1500
+    for way, gradients in found.items():
+        for gradient, exact in zip(gradients, expected, strict=True):
+            assert (gradient.reshape(exact.shape) - exact).norm() < 1e-5 * exact.norm(), way
+
+
+def test_operations_of_the_card_are_counted_as_they_are_done():
+    values = torch.zeros(3, 4)
+    arguments = [gpu_blends.view(values, wp.vec4)]
+    gpu_blends.launch(gpu_blends.multiply_add, 3, [2, 1.0], arguments)
+    assert (values == 2 * gpu_blends.UNROLLED).all() and values.shape[1] == gpu_blends.CHAINS
+
+
+def test_trainer_of_the_benchmark_trains():
+    trainer = gpu_scene.make_trainer(500, 64, 48, "cpu")
+    before = {name: tensor.detach().clone() for name, tensor in trainer.model.parameters.items()}
+    for iteration in range(10, 13):
+        trainer.differentiate(iteration)
+        trainer.update(iteration)
+    assert len(trainer.model) == 500 and trainer.degree == 3 and int(trainer.densifier.views.max()) == 3
+    assert all((trainer.model.parameters[name] != tensor).any() for name, tensor in before.items())
+
+
+def test_rows_survive_what_comes_after_them(tmp_path, capsys):
+    results = gpu.Results(tmp_path, "cpu", seconds=60)
+
+    def fail(error):
+        raise error
+
+    results.attempt("orbit", lambda: results.add("Orbit", [("9 x 9", 5, "none", "7.0")]), needs=1)
+    results.attempt("much", lambda: fail(torch.OutOfMemoryError("CUDA out of memory.\nmore")), needs=1)
+    results.attempt("stored", lambda: fail(InputError("too large.")), needs=1)
+    results.attempt("long", lambda: fail(AssertionError("was run")), needs=61)
+    with pytest.raises(RuntimeError, match="illegal address"):
+        results.attempt("wrong", lambda: fail(RuntimeError("illegal address")), needs=1)
+    tables = json.loads((tmp_path / "gpu.json").read_text())["tables"]
+    assert tables["Orbit"] == [{"size": "9 x 9", "Gaussians": 5, "loop cap": "none", "frames per second": "7.0"}]
+    why = {row["what"]: row["why"] for row in tables["Left out"]}
+    assert why == {"much": "CUDA out of memory.", "stored": "too large.", "long": "no time left"}
+    assert "| 9 x 9 |" in (tmp_path / "gpu.md").read_text()
+
+
+@pytest.mark.parametrize("wrong", [None, "image", "sh"])
+def test_a_device_that_errs_is_found(wrong):
+    case = (300, 40, 30)
+    expected = gpu.expectation(None, case)
+    if wrong:
+        expected[wrong] = expected[wrong] * 1.001
+    results = gpu.Results(None, "cpu", seconds=60)
+    gpu.check(results, "cpu", case, expected)
+    assert len(results.tables["Checks"]) == 4 * (1 + len(gpu.NAMES))
+    assert results.wrong == [f"{mode}: {wrong} against the CPU" for mode in ADJOINTS if wrong]
+    assert sum(found.startswith("WRONG") for _, found in results.tables["Checks"]) == len(results.wrong)
+
+
+@pytest.mark.slow
+def test_dry_run(tmp_path):
+    command = [sys.executable, ROOT / "benchmarks/gpu.py", "--device", "cpu", "--out", tmp_path]
+    subprocess.run(command, check=True, capture_output=True)
+    tables = json.loads((tmp_path / "gpu.json").read_text())["tables"]
+    assert set(tables) == set(gpu.HEADERS) - {"Left out", "Kernels of a step"}
+    assert {row["size"] for row in tables["Training step"]} == {"64 x 64", "98 x 54", "192 x 108"}
