@@ -55,10 +55,15 @@ class RasterOptions:
 
 def flag(default: Any, help: str, *names: str, choices: tuple | None = None, many: type | None = None) -> Any:
     """A dataclass field that is also a command-line flag: its default, its help, further names."""
-    metadata = {"help": help, "names": names, "choices": choices, "many": many}
+    metadata = {"help": help, "names": names, "choices": choices, "many": many, "positional": False}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=metadata)
     return field(default=default, metadata=metadata)
+
+
+def argument(help: str) -> Any:
+    """A dataclass field that is also an argument of the command line without a flag: known by its place."""
+    return field(default="", metadata={"help": help, "positional": True})
 
 
 @dataclass
@@ -154,8 +159,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 class RenderConfig:
     """Rendering options; the reference's render.py where it has them."""
 
-    model_path: str = flag("", "folder of a trained model", "-m")
-    source_path: str = flag("", "scene folder, if it has moved since training", "-s")
+    model_path: str = flag("", "folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)", "-m")
+    source_path: str = flag("", "scene folder, if it has moved since training; a file of Gaussians needs one", "-s")
     iteration: int = flag(-1, "which saved model; -1: the last")
     skip_train: bool = flag(False, "no images of the training views")
     skip_test: bool = flag(False, "no images of the test views")
@@ -169,6 +174,14 @@ class RenderConfig:
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
     quiet: bool = flag(False, "print only the summary")
+
+
+@dataclass
+class ConvertConfig:
+    """Two files of Gaussians: .ply, .splat, .spz, .glb or .gltf."""
+
+    source: str = argument("the file to read")
+    target: str = argument("the file to write; its ending says in which format")
 
 
 @dataclass
