@@ -137,7 +137,8 @@ EMBEDDED_DEFAULTS: dict[str, Any] = {
     "sh_interval": 500,
 }
 
-#: What ``--preset`` changes; a flag that is given goes before.
+#: What ``--preset`` changes; a flag that is given goes before. Tried: sparse_adam, whose step takes twice as long as
+#: torch's fused one where most Gaussians are in view.
 PRESETS: dict[str, dict[str, Any]] = {
     "": {},
     "fast": {
@@ -150,7 +151,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "max_gaussians": 150_000,
         "sh_interval": 1500,
         "opacity_reset_interval": 100_000,
-        "optimizer_type": "sparse_adam",
     },
 }
 
