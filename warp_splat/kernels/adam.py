@@ -26,7 +26,7 @@ def make_adam(columns: int, pieces: int) -> wp.Kernel:
         return r
 
     @wp.kernel(module="unique", module_options=dict(OPTIONS))
-    def adam(
+    def adam_rows(
         first: int,
         radii: wp.array[int],  # [N] px; Gaussians with 0 keep their value and moments
         grads: wp.array[row_type],  # [N pieces]
@@ -48,4 +48,4 @@ def make_adam(columns: int, pieces: int) -> wp.Kernel:
             second_moments_out[row] = v
             values_out[row] = values_out[row] - rate * wp.cw_div(m, root(v) + row_type(eps))
 
-    return adam
+    return adam_rows
