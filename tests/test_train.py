@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from warp_splat.cli import main
+from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.png import load_png
@@ -89,6 +90,21 @@ def test_render_repeats_the_pictures_of_training(trained, capsys):
     assert main(["render", "-m", str(trained), "--iteration", "40", "--skip_train", "--quiet"]) == 0
     assert json.loads((trained / "results.json").read_text())["ours_60"]["seconds"] > 0  # what training said stays
     assert set(json.loads((trained / "results.json").read_text())) == {"ours_40", "ours_60"}
+
+
+def test_render_of_converted_files(trained, tmp_path, capsys):
+    """Held-out views of files in other formats against those of the PLY file: a file needs no model folder."""
+    pictures = {}
+    for ending, decibels in ((".ply", 90), (".glb", 75), (".spz", 45)):
+        file = tmp_path / f"a{ending}"
+        assert main(["convert", str(ply_path(trained, 60)), str(file)]) == 0
+        assert main(["render", "-m", str(file), "-s", str(SCENE), "--skip_train", "--quiet"]) == 0
+        folder = tmp_path / f"a{ending}.renders"
+        assert json.loads((folder / "results.json").read_text())["ours_0"]["split"] == "test"
+        pictures[ending] = [load_png(path) for path in sorted((folder / "test" / "ours_0" / "renders").iterdir())]
+        assert len(pictures[ending]) == 7
+        for ours, reference in zip(pictures[ending], pictures[".ply"], strict=True):
+            assert reference.std() > 5 and psnr(ours, reference) > decibels
 
 
 def test_orbit(trained, tmp_path, capsys):
@@ -215,17 +231,18 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
     from warp_splat import gaussians  # noqa: PLC0415
     from warp_splat.errors import InputError  # noqa: PLC0415
 
-    save = gaussians.save_ply
+    save = gaussians.save_gaussians
 
     def full(path, *arrays, **options):
         if "point_cloud" in str(path):
             raise InputError(f"{path}: could not be written (no space left on device).")
         save(path, *arrays, **options)
 
-    monkeypatch.setattr(gaussians, "save_ply", full)
+    monkeypatch.setattr(gaussians, "save_gaussians", full)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    assert train(tmp_path / "model", "--iterations", "5") == 0
+    assert train(tmp_path / "model", "--iterations", "5", "--antialiasing") == 0
     (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
+    assert load_gaussians(saved).antialiased
     assert str(saved) in capsys.readouterr().err and len(load_ply(saved).means) == 4500
 
 

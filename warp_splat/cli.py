@@ -9,12 +9,21 @@ import sys
 from dataclasses import fields
 
 from warp_splat import __version__
-from warp_splat.config import EMBEDDED_DEFAULTS, FOREIGN_FLAGS, CompareConfig, RenderConfig, TrainConfig
+from warp_splat.config import (
+    EMBEDDED_DEFAULTS,
+    FOREIGN_FLAGS,
+    PRESETS,
+    CompareConfig,
+    ConvertConfig,
+    RenderConfig,
+    TrainConfig,
+)
 from warp_splat.errors import InputError
 
 COMMANDS = {
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
+    "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
     "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
 }
 
@@ -24,6 +33,9 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
     defaults = config_type()
     for item in fields(config_type):
         default = getattr(defaults, item.name)
+        if item.metadata["positional"]:
+            parser.add_argument(item.name, metavar=item.name.upper(), help=item.metadata["help"])
+            continue
         note = "" if default in ("", [], False) else f" (default: {default})"
         options: dict = {"default": argparse.SUPPRESS, "help": item.metadata["help"].replace("%", "%%") + note}
         if isinstance(default, bool):
@@ -51,7 +63,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parse(arguments: list[str]) -> TrainConfig | RenderConfig | CompareConfig:
+def parse(arguments: list[str]) -> TrainConfig | RenderConfig | ConvertConfig | CompareConfig:
     """The configuration that the arguments ask for.
 
     Raises:
@@ -69,8 +81,9 @@ def parse(arguments: list[str]) -> TrainConfig | RenderConfig | CompareConfig:
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
-    if config_type is TrainConfig and "source_path" not in values:
-        values = {**EMBEDDED_DEFAULTS, **values}
+    if config_type is TrainConfig:
+        embedded = {} if "source_path" in values else EMBEDDED_DEFAULTS
+        values = {**embedded, **PRESETS[values.get("preset", "")], **values}
     return config_type(**values)
 
 
@@ -86,6 +99,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         if isinstance(config, TrainConfig):
             from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
+        elif isinstance(config, ConvertConfig):
+            from warp_splat.convert import convert as run  # noqa: PLC0415
         elif isinstance(config, CompareConfig):
             from warp_splat.compare.run import compare as run  # noqa: PLC0415
         else:

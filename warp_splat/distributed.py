@@ -23,6 +23,11 @@ from warp_splat.launch import stage
 PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
 
 
+#: What the last exchange took. A thread of gloo lets go of it a moment later; if it were the last to do so while Python
+#: shuts down, the process would abort.
+_exchanged: tuple = ()
+
+
 class GroupError(InputError):
     """The processes cannot go on together: one has ended, or their models differ."""
 
@@ -117,8 +122,10 @@ class ProcessGroup(Processes):
             )
 
     def _exchange(self, collective: Callable, *arguments) -> None:
+        global _exchanged
         try:
             collective(*arguments)
+            _exchanged = arguments
         except RuntimeError as error:
             if is_out_of_memory(error):
                 raise

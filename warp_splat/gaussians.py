@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from warp_splat.formats.ply import SplatArrays, load_ply, save_ply
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.harmonics import C0
 
 INITIAL_OPACITY = 0.1
@@ -86,17 +87,21 @@ class GaussianModel:
             raw["sh_rest"].detach()[:, :0] if degree == 0 else raw["sh_rest"],
         )
 
-    def save(self, path: Path, comments: tuple[str, ...] = ()) -> None:
-        """Write a PLY file in the reference's layout."""
+    def save(self, path: Path, antialiased: bool = False) -> None:
+        """Write a file of Gaussians: a PLY file in the reference's layout, or what else the name asks for."""
         raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
         sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
         arrays = (tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
-        save_ply(path, *arrays, comments=comments)
+        save_gaussians(path, SplatFile(SplatArrays(*arrays), antialiased))
 
     @classmethod
     def load(cls, path: Path) -> GaussianModel:
-        """Read a PLY file. Raises InputError if it is missing or not a file of Gaussians."""
-        splats: SplatArrays = load_ply(path)
+        """Read a file of Gaussians. Raises InputError if it is missing or not one."""
+        return cls.from_splats(load_gaussians(path).splats)
+
+    @classmethod
+    def from_splats(cls, splats: SplatArrays) -> GaussianModel:
+        """Start from Gaussians of a file."""
         means, sh, opacities, scales, quats = (torch.from_numpy(np.ascontiguousarray(array)) for array in splats)
         parameters = {"means": means, "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
         return cls({**parameters, "opacities": opacities, "scales": scales, "quats": quats})

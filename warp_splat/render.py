@@ -16,7 +16,9 @@ from warp_splat.devices import memory_explained
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views, write_views
 from warp_splat.formats import model_folder
+from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.png import save_png, save_video
+from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.renderer import render as render_gaussians
 from warp_splat.scene import load_scene
@@ -38,17 +40,13 @@ def render(config: RenderConfig) -> int:
     """
     say = (lambda *_: None) if config.quiet else print
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
-    if not config.model_path:
-        raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
-    folder = Path(config.model_path)
-    iteration = model_folder.find_iteration(folder, config.iteration)
-    model = GaussianModel.load(model_folder.ply_path(folder, iteration))
-    trained = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() or not config.orbit else {}
+    folder, iteration, gaussians, trained = _open(config)
+    model = GaussianModel.from_splats(gaussians.splats)
     options = RasterOptions(
         antialiasing=bool(trained.get("antialiasing")),
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
-    say(f"{len(model)} Gaussians from iteration {iteration} of {folder}")
+    say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     scene = None if config.orbit and config.orbit_center == "origin" else _load(config, trained, say)
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = make_picture(model.to(device), bool(trained.get("white_background")), options)
@@ -85,6 +83,24 @@ def _write_splits(
         means, _ = evaluate_views(picture, scene.test, folder, "test", iteration, extra)
         print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
         print(f"  PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f} in {folder / 'results.json'}")
+
+
+def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
+    """The folder for the images, the iteration, the Gaussians and the options of the training.
+
+    A file of Gaussians has no folder and no training: its images go beside it, every 8th view is held out.
+    """
+    if not config.model_path:
+        raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
+    path = Path(config.model_path)
+    if path.is_dir() or path.suffix.lower() not in FORMATS:
+        iteration = model_folder.find_iteration(path, config.iteration)
+        trained = model_folder.read_cfg_args(path) if (path / "cfg_args").exists() or not config.orbit else {}
+        return path, iteration, load_gaussians(model_folder.ply_path(path, iteration)), trained
+    if not config.source_path and not (config.orbit and config.orbit_center == "origin"):
+        raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
+    gaussians = load_gaussians(path)
+    return Path(f"{path}.renders"), 0, gaussians, {"eval": True, "antialiasing": gaussians.antialiased}
 
 
 def _load(config: RenderConfig, trained: dict, say) -> Scene:

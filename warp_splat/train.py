@@ -237,12 +237,13 @@ def _warn(error: Exception) -> None:
 def _save(trainer: Trainer, run: Run) -> Path:
     """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
     path = model_folder.ply_path(run.folder, run.iteration)
+    antialiased = trainer.config.antialiasing
     try:
-        trainer.model.save(path)
+        trainer.model.save(path, antialiased)
     except InputError as error:
         _warn(error)
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
-        trainer.model.save(path)
+        trainer.model.save(path, antialiased)
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     return path
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
+from torch.nn import functional
 
 from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions, TrainConfig
@@ -71,7 +72,8 @@ class Trainer:
         self._views_random = random.Random(config.seed)
         self._background_random = torch.Generator().manual_seed(config.seed)
         self._deck: list[View] = []
-        self._photographs: dict[View, torch.Tensor] = {}  # those that were used, [H, W, 3] uint8
+        self._shrink = 1  # of the images in this step
+        self._photographs: dict[View, torch.Tensor] = {}  # those that were used, [H, W, 3] uint8, at that size
         self._radii = torch.zeros(0, dtype=torch.int32, device=self.device)  # of the view that was differentiated last
 
     def differentiate(self, iteration: int) -> torch.Tensor:
@@ -86,18 +88,19 @@ class Trainer:
         self.optimizer.set_iteration(iteration)
         self.degree = min(iteration // config.sh_interval, config.sh_degree)
         view = self._next_view()
+        camera, photograph = self._at_size(view, iteration)
         background = self.background
         if config.random_background:
             drawn = torch.rand(self.processes.count, 3, generator=self._background_random)
             background = drawn[self.processes.rank].to(self.device)
-        out = self._render(view.camera, background)
+        out = self._render(camera, background)
         out.means2d.retain_grad()
         # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
-        loss = image_loss(out.image.clamp(0.0, 1.0), self._photograph(view), config.lambda_dssim)
+        loss = image_loss(out.image.clamp(0.0, 1.0), photograph, config.lambda_dssim)
         loss.backward()
         if iteration < config.densify_until_iter:
             with stage("densify"):
-                self.densifier.observe(out, view.camera.width, view.camera.height)
+                self.densifier.observe(out, camera.width, camera.height)
         self.quarantine.pixels += out.dropped.pixel_count
         self.quarantine.gradients += out.dropped.gaussian_count
         self.quarantine.gaussians += out.invalid_count
@@ -140,12 +143,28 @@ class Trainer:
                 dealt.append(self._deck.pop(index))
         return dealt[self.processes.rank]
 
-    def _photograph(self, view: View) -> torch.Tensor:
+    def _at_size(self, view: View, iteration: int) -> tuple[Camera, torch.Tensor]:
+        """Camera and photograph of ``view`` at this iteration's size: coarse to fine, if so configured."""
+        config = self.config
+        doublings = (config.coarse.bit_length() - 1) * iteration // config.coarse_until_iter
+        shrink = max(config.coarse >> doublings, 1)
+        if shrink != self._shrink:
+            self._shrink = shrink
+            self._photographs.clear()
+        width, height = (max(size // shrink, 1) for size in (view.camera.width, view.camera.height))
+        camera = view.camera if shrink == 1 else view.camera.resized(width, height)
+        return camera, self._photograph(view, height, width)
+
+    def _photograph(self, view: View, height: int, width: int) -> torch.Tensor:
         """The photograph of ``view`` on the device; for a GPU, it waits there or in page-locked memory of the host."""
         kept = self._photographs.get(view)
         if kept is None:
             with stage("photographs"):
                 kept = torch.from_numpy(view.image).to(self.config.data_device)
+                if kept.shape[:2] != (height, width):
+                    planes = kept.permute(2, 0, 1)[None].float()
+                    means = functional.interpolate(planes, (height, width), mode="area")
+                    kept = means[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
                 if kept.device.type != self.device.type:
                     kept = kept.pin_memory()
             self._photographs[view] = kept

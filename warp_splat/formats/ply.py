@@ -19,6 +19,8 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.splats import SplatArrays, check_shapes, finite_rows
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # zeros; only there because readers of the reference's files may expect them
@@ -28,6 +30,9 @@ ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLOR = ("red", "green", "blue")
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
 
+EXPECTED = "a PLY file with an element 'vertex'"
+ANTIALIASED = "SplatRenderMode: mip"  # the comment that Brush and splat-transform write and read
+ANTIALIASED_READ = {ANTIALIASED, "antialiased 1"}  # the second is Postshot's
 HEADER_BYTES = 64 * 1024  # forty times the longest header of the reference: no damaged file is searched to its end
 COUNT_DIGITS = 15  # more rows than any disk holds, and sums of such counts stay below 2**63
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -36,16 +41,6 @@ TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "
 TYPES |= {"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
 LIST = "list"  # in place of a NumPy type
 TYPES_WRITTEN = {"f4": "float", "u1": "uchar"}
-
-
-class SplatArrays(NamedTuple):
-    """Gaussians as stored, float32: before sigmoid, exp and normalisation."""
-
-    means: np.ndarray  # [N, 3] world units
-    sh: np.ndarray  # [N, K, 3] spherical harmonics, K = 1, 4, 9 or 16
-    opacities: np.ndarray  # [N] logits
-    scales: np.ndarray  # [N, 3] natural logarithms of world units
-    quats: np.ndarray  # [N, 4] w x y z, not necessarily of unit length
 
 
 def save_ply(
@@ -73,7 +68,7 @@ def save_ply(
             written.
     """
     splats = SplatArrays(*(np.asarray(array, np.float32) for array in (means, sh, opacities, scales, quats)))
-    _check_shapes(splats)
+    check_shapes(splats)
     count, coefficients, _ = splats.sh.shape
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
     columns = (
@@ -142,12 +137,17 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatAr
         )
     with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
         table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
-    finite = np.isfinite(table).all(axis=1)
-    if not finite.all():
-        report(
-            f"{path}: left out {np.count_nonzero(~finite)} of {len(table)} Gaussians with values that are not finite."
-        )
-    return _split_columns(table[finite], rest_count // 3)
+    return finite_rows(_split_columns(table, rest_count // 3), path, report)
+
+
+def is_antialiased(path: str | Path) -> bool:
+    """Whether a comment says that the Gaussians are to be rendered with the opacities of Mip-Splatting.
+
+    Raises:
+        InputError: if the file is missing or not a PLY file of Gaussians.
+    """
+    with reading(path, EXPECTED), open(path, "rb") as file:
+        return not ANTIALIASED_READ.isdisjoint(_read_header(file)[2])
 
 
 def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:
@@ -167,17 +167,6 @@ def _rest_names(count: int) -> list[str]:
     return [f"f_rest_{index}" for index in range(count)]
 
 
-def _check_shapes(splats: SplatArrays) -> None:
-    count = len(splats.means)
-    shapes = {"means": (count, 3), "opacities": (count,), "scales": (count, 3), "quats": (count, 4)}
-    for name, shape in shapes.items():
-        found = getattr(splats, name).shape
-        if found != shape:
-            raise InputError(f"{name}: expected shape {shape}, got {found}.")
-    if splats.sh.shape not in [(count, 1 + rest // 3, 3) for rest in REST_COUNTS]:
-        raise InputError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
-
-
 def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
     if not all(comment.isascii() and comment.isprintable() for comment in comments):
         raise InputError(f"{path}: expected comments of one line of ASCII each, got {list(comments)}.")
@@ -188,10 +177,6 @@ def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(header).encode("ascii"))
         file.write(rows.data)
-
-
-class _HeaderError(Exception):
-    """What is wrong with a header, as a part of the sentence for the user."""
 
 
 class _Element(NamedTuple):
@@ -208,33 +193,21 @@ class _Element(NamedTuple):
 
 def _read_vertices(path: str | Path) -> np.ndarray:
     """The rows of the element ``vertex``, one field for each property."""
-    try:
-        with open(path, "rb") as file:
-            return _read_rows(file, *_read_header(file))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check the path and the iteration.") from error
-    except OSError as error:
-        raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
-    except MemoryError as error:
-        raise InputError(f"{path}: could not be read ({error}); it needs more memory than there is.") from error
-    except _HeaderError as error:
-        raise InputError(f"{path}: expected a PLY file with an element 'vertex', found {error}.") from error
-    except (ValueError, OverflowError) as error:
-        raise InputError(
-            f"{path}: the file is damaged or cut short ({error!s:.200}); copy or save it again."
-        ) from error
+    with reading(path, EXPECTED), open(path, "rb") as file:
+        return _read_rows(file, *_read_header(file)[:2])
 
 
-def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
-    """Read up to the first row: the byte order, "" for a text, and the elements up to ``vertex``."""
+def _read_header(file: BinaryIO) -> tuple[str, list[_Element], list[str]]:
+    """Read up to the first row: the byte order, "" for a text, the elements up to ``vertex``, and the comments."""
     byte_order = None
     elements: list[_Element] = []
+    comments: list[str] = []
     if _header_line(file) != "ply":
-        raise _HeaderError("another first line than 'ply'")
+        raise Unexpected("another first line than 'ply'")
     while (line := _header_line(file)) != "end_header":
         match line.split():
-            case ["comment" | "obj_info", *_]:
-                pass
+            case ["comment" | "obj_info", *words]:
+                comments.append(" ".join(words))
             case ["format", name, "1.0"] if name in BYTE_ORDERS:
                 byte_order = BYTE_ORDERS[name]
             case ["element", name, count] if count.isdecimal() and len(count) <= COUNT_DIGITS:
@@ -244,20 +217,20 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
             case ["property", "list", _, _, name] if elements and name not in elements[-1].properties:
                 elements[-1].properties[name] = LIST
             case _:
-                raise _HeaderError(f"the header line {line[:80]!r}")
+                raise Unexpected(f"the header line {line[:80]!r}")
     names = [element.name for element in elements]
     if byte_order is None or "vertex" not in names:
-        raise _HeaderError("no line 'format'" if byte_order is None else "none")
+        raise Unexpected("no line 'format'" if byte_order is None else "none")
     elements = elements[: names.index("vertex") + 1]
     if any(LIST in element.properties.values() for element in elements):
-        raise _HeaderError("a list property in it or before it; export one number for each property")
-    return byte_order, elements
+        raise Unexpected("a list property in it or before it; export one number for each property")
+    return byte_order, elements, comments
 
 
 def _header_line(file: BinaryIO) -> str:
     line = file.readline(HEADER_BYTES - file.tell())
     if not line.endswith(b"\n"):
-        raise _HeaderError(f"no line 'end_header' within the first {HEADER_BYTES} bytes")
+        raise Unexpected(f"no line 'end_header' within the first {HEADER_BYTES} bytes")
     return line.decode("latin-1").strip()  # any byte is a character; comments may hold them
 
 

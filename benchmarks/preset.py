@@ -1,0 +1,85 @@
+"""`--preset fast` against the default schedule: PSNR on held-out views over seconds of training, in a table and a plot.
+
+Trains the embedded scene and, with -s, a scene of photographs at full size (the default for 7,000 iterations); a run
+whose results are there already is not repeated. The models of benchmarks/training.py serve: `full` is one of them.
+
+    python benchmarks/preset.py --models output/fox [-s path/to/fox] [--out docs/benchmarks]
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from common import machine, write_table
+
+from warp_splat.report import BLUE, ORANGE, new_figure, plain_axes, save_figure
+
+ROOT = Path(__file__).parents[1]
+EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}
+PHOTOGRAPHS = {
+    "full": ["-r", "1", "--eval", "--iterations", "7000"],
+    "full, fast": ["-r", "1", "--eval", "--preset", "fast"],
+}
+EARLY = 60  # s
+
+
+def run(model: Path, flags: list[str]) -> tuple[dict, list[dict]]:
+    """Train, if that has not been done; the results of the last iteration and the history."""
+    if not (model / "results.json").is_file():
+        command = [sys.executable, "-m", "warp_splat", "train", "-m", model, *flags]
+        subprocess.run(command, check=True, cwd=ROOT)
+    results = json.loads((model / "results.json").read_text())
+    last = max(results, key=lambda name: int(name.removeprefix("ours_")))
+    return results[last], json.loads((model / "history.json").read_text())
+
+
+def row_of(name: str, results: dict, history: list[dict]) -> tuple:
+    """Quality early and in the end, and what it took."""
+    early = [record["psnr"] for record in history if record["seconds"] <= EARLY]
+    return (
+        name,
+        results["iterations"],
+        f"{max(early):.2f}" if early else "",
+        f"{results['PSNR']:.2f}",
+        f"{results['SSIM']:.4f}",
+        f"{history[-1]['seconds']:.0f}",
+        f"{results['seconds']:.0f}",
+        results["gaussians"],
+    )
+
+
+def plot(path: Path, found: dict[str, list[dict]]) -> None:
+    """PSNR over seconds, a panel per scene."""
+    scenes = list(dict.fromkeys(name.split(",")[0] for name in found))
+    figure = new_figure(5 * len(scenes), 3.2, "constrained")
+    for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+        for name, color, label in ((scene, BLUE, "default"), (f"{scene}, fast", ORANGE, "--preset fast")):
+            seconds, quality = zip(*((record["seconds"], record["psnr"]) for record in found[name]), strict=True)
+            axes.plot(seconds, quality, color=color, marker="o", markersize=3, label=label)
+        plain_axes(axes, f"{scene}: PSNR [dB] over seconds of training")
+        axes.legend(frameon=False, fontsize=9, loc="lower right")
+    save_figure(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--models", type=Path, required=True, help="folder for the models")
+    parser.add_argument("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
+    parser.add_argument("--out", type=Path, help="folder for preset.md, preset.json and preset.png")
+    arguments = parser.parse_args()
+    runs = dict(EMBEDDED)
+    if arguments.scene:
+        runs |= {name: ["-s", arguments.scene.resolve(), *flags] for name, flags in PHOTOGRAPHS.items()}
+    found = {name: run((arguments.models / name.replace(", ", "_")).resolve(), flags) for name, flags in runs.items()}
+    headers = ("run", "iterations", f"PSNR dB by {EARLY} s", "PSNR dB", "SSIM", "s of steps", "wall s", "Gaussians")
+    rows = [row_of(name, *results) for name, results in found.items()]
+    note = "Held-out views; a few of them in the column of the first minute."
+    write_table("preset", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()})
+    if arguments.out:
+        plot(arguments.out / "preset.png", {name: history for name, (_, history) in found.items()})
+
+
+if __name__ == "__main__":
+    main()

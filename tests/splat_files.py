@@ -1,0 +1,77 @@
+"""Gaussians to write into files, and a reader of glTF that shares nothing with the package."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.formats.splats import SplatArrays, SplatFile
+
+ENDINGS = (".ply", ".splat", ".spz", ".glb", ".gltf")
+
+
+def some_splats(count=50, coefficients=16, seed=0):
+    """Gaussians as a training leaves them, within the range of every format."""
+    rng = np.random.default_rng(seed)
+    return SplatArrays(
+        means=rng.normal(scale=3.0, size=(count, 3)).astype(np.float32),
+        sh=rng.uniform(-0.9, 0.9, (count, coefficients, 3)).astype(np.float32),
+        opacities=rng.normal(scale=2.0, size=count).astype(np.float32),
+        scales=rng.uniform(-6.0, 1.0, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+    )
+
+
+def some_file(count=50, coefficients=16, seed=0, antialiased=False):
+    return SplatFile(some_splats(count, coefficients, seed), antialiased)
+
+
+def covariances(splats):
+    """[N, 3, 3] float64, with the rotation matrix as in the documentation of glTF."""
+    w, x, y, z = (splats.quats.astype(np.float64) / np.linalg.norm(splats.quats, axis=1, keepdims=True)).T
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    factors = rotation * np.exp(splats.scales.astype(np.float64))[:, None]
+    return factors @ factors.transpose(0, 2, 1)
+
+
+def glb_parts(path):
+    """The JSON and the binary chunk of a .glb file, or of a .gltf file and its buffer."""
+    data = Path(path).read_bytes()
+    if not data.startswith(b"glTF"):
+        document = json.loads(data)
+        return document, (Path(path).parent / document["buffers"][0]["uri"]).read_bytes()
+    magic, version, length, json_length, json_kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, json_kind) == (b"glTF", 2, len(data), b"JSON") and json_length % 4 == 0
+    binary_length, binary_kind = struct.unpack_from("<I4s", data, 20 + json_length)
+    assert binary_kind == b"BIN\0" and 28 + json_length + binary_length == length
+    return json.loads(data[20 : 20 + json_length]), data[28 + json_length :]
+
+
+def glb_bytes(document, binary):
+    """A .glb file."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def glb_attributes(path):
+    """The attributes of the first primitive, by name."""
+    document, binary = glb_parts(path)
+    found = {}
+    for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        dtype = {5121: np.uint8, 5126: np.dtype("<f4")}[accessor["componentType"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        values = np.frombuffer(binary, dtype, accessor["count"] * width, start)
+        found[name] = values.reshape(-1, width) if width > 1 else values
+    return found

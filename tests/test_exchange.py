@@ -1,0 +1,422 @@
+"""Formats of Gaussians: bytes against what their documents say, axes, round trips, what is lost, and renders."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+import torch
+import zstandard
+from scenes import C0, make_camera
+from scipy.spatial.transform import Rotation
+from splat_files import ENDINGS, covariances, glb_attributes, glb_bytes, glb_parts, some_file, some_splats
+
+from warp_splat.cli import main
+from warp_splat.compare.oracle import sh_basis
+from warp_splat.config import RasterOptions
+from warp_splat.convert import losses
+from warp_splat.errors import InputError
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.ply import is_antialiased
+from warp_splat.formats.splats import SplatFile, frame, turned
+from warp_splat.gaussians import GaussianModel
+from warp_splat.metrics import psnr
+from warp_splat.render import make_picture
+
+NAME = "KHR_gaussian_splatting"
+MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward
+
+
+def silent(line):
+    raise AssertionError(f"unexpected: {line}")
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-np.asarray(x, np.float64)))
+
+
+def seen_colors(splats, directions):
+    """What a viewer sees along ``directions`` [N, 3], float64."""
+    degree = int(np.sqrt(splats.sh.shape[1])) - 1
+    basis = sh_basis(torch.from_numpy(directions), degree).numpy()
+    return np.einsum("nk,nkc->nc", basis[:, : splats.sh.shape[1]], splats.sh.astype(np.float64))
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+@pytest.mark.parametrize("kind", ["half turn", "any turn", "mirror"])
+def test_turned_gaussians_look_the_same_from_the_turned_place(kind, coefficients):
+    turns = {"half turn": np.diag([1.0, -1, -1]), "mirror": np.diag([1.0, -1, 1])}
+    turn = turns.get(kind, Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix())
+    shift, scale = np.array([1.0, -2.0, 3.0]), 2.5
+    before = some_splats(20, coefficients)
+    after = turned(before, turn, shift, scale)
+    np.testing.assert_allclose(after.means, scale * before.means @ turn.T + shift, rtol=1e-5, atol=1e-5)
+    wanted = scale**2 * turn @ covariances(before) @ turn.T
+    np.testing.assert_allclose(covariances(after), wanted, rtol=1e-4, atol=1e-5 * wanted.max())
+    directions = np.random.default_rng(1).normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        seen_colors(after, directions @ turn.T), seen_colors(before, directions), atol=1e-5, rtol=0
+    )
+
+
+@pytest.mark.parametrize("axes", MIRRORS)
+def test_half_turns_and_back_give_the_same_bytes(axes):
+    before = some_splats()
+    there = turned(before, frame(axes).T)
+    np.testing.assert_array_equal(there.means, before.means * np.float32(MIRRORS[axes]))
+    after = turned(there, frame(axes))
+    for name in ("means", "sh", "opacities", "scales"):
+        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
+    np.testing.assert_array_equal(np.abs(before.quats), np.abs(after.quats))
+
+
+def test_splat_bytes_are_the_documented_layout(tmp_path):
+    splats = some_splats(7)
+    save_gaussians(tmp_path / "a.splat", SplatFile(splats), report=lambda line: None)
+    data = (tmp_path / "a.splat").read_bytes()
+    assert len(data) == 7 * 32
+    for row in range(7):
+        values = struct.unpack_from("<6f8B", data, 32 * row)
+        np.testing.assert_array_equal(values[:3], splats.means[row])
+        np.testing.assert_allclose(values[3:6], np.exp(splats.scales[row]), rtol=1e-6)
+        np.testing.assert_allclose(values[6:9], 255 * np.clip(0.5 + C0 * splats.sh[row, 0], 0, 1), atol=0.51)
+        assert abs(values[9] - 255 * sigmoid(splats.opacities[row])) < 0.51
+        quat = splats.quats[row] / np.linalg.norm(splats.quats[row])
+        np.testing.assert_allclose(values[10:], 128 * quat + 128, atol=1.01)
+
+
+def spz_rows(data, version, count, degree):
+    """Decode as the format's description says, one number after the other: axes right, up, back."""
+    per_row = {"means": 9, "alpha": 1, "color": 3, "scale": 3, "quat": 3 if version == 2 else 4, "sh": 45}
+    per_row["sh"] = 3 * ((degree + 1) ** 2 - 1)
+    place, parts = 0, {}
+    for name, size in per_row.items():
+        parts[name] = [data[place + row * size :][:size] for row in range(count)]
+        place += count * size
+    assert place == len(data)
+    for row in range(count):
+        fixed = [int.from_bytes(parts["means"][row][3 * i :][:3], "little", signed=True) for i in range(3)]
+        yield fixed, parts["alpha"][row][0], *(list(parts[name][row]) for name in ("color", "scale", "quat", "sh"))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spz_bytes_are_the_documented_layout(tmp_path, degree):
+    splats = some_splats(9, (degree + 1) ** 2)
+    save_gaussians(tmp_path / "a.spz", SplatFile(splats, True), report=silent)
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert struct.unpack("<4sIIBBBB", data[:16]) == (b"NGSP", 3, 9, degree, 12, 1, 0)
+    wanted = turned(splats, np.diag([1.0, -1.0, -1.0]))
+    for row, (fixed, alpha, color, scale, quat, sh) in enumerate(spz_rows(data[16:], 3, 9, degree)):
+        np.testing.assert_allclose(fixed, 4096 * wanted.means[row], atol=0.51)
+        assert abs(alpha - 255 * sigmoid(splats.opacities[row])) < 0.51
+        np.testing.assert_allclose(color, 255 * (0.15 * splats.sh[row, 0] + 0.5), atol=0.51)
+        np.testing.assert_allclose(scale, 16 * (splats.scales[row] + 10), atol=0.51)
+        np.testing.assert_allclose(sh, (128 * wanted.sh[row, 1:] + 128).ravel(), atol=0.51)
+        bits = f"{int.from_bytes(bytes(quat), 'little'):032b}"
+        largest, rest = int(bits[:2], 2), [bits[2:12], bits[12:22], bits[22:]]
+        found = [(-1) ** int(text[0]) * int(text[1:], 2) / 511 / np.sqrt(2) for text in rest]
+        found.insert(largest, np.sqrt(1 - np.square(found).sum()))
+        unit = (wanted.quats[row] / np.linalg.norm(wanted.quats[row]))[[1, 2, 3, 0]]
+        np.testing.assert_allclose(np.array(found), unit * np.sign(unit[largest]), atol=0.003)
+
+
+def spz2(path, quats=(255, 128, 128)):
+    """One Gaussian of version 2, degree 0, at (1, 2, 3) in axes right, up, back."""
+    fixed = b"".join((value * 256).to_bytes(3, "little", signed=True) for value in (1, 2, 3))
+    body = (
+        struct.pack("<4sIIBBBB", b"NGSP", 2, 1, 0, 8, 0, 0) + fixed + bytes([128, 0, 128, 255, 160, 160, 176, *quats])
+    )
+    path.write_bytes(gzip.compress(body))
+
+
+def test_spz_version_2(tmp_path):
+    spz2(tmp_path / "a.spz")
+    splats, antialiased = load_gaussians(tmp_path / "a.spz", report=silent)
+    np.testing.assert_array_equal(splats.means, [[1, -2, -3]])
+    np.testing.assert_array_equal(splats.scales, [[0, 0, 1]])
+    np.testing.assert_allclose(splats.sh[0, 0], [-0.5 / 0.15, 0.002 / 0.15, 0.5 / 0.15], atol=0.001)
+    assert not antialiased and abs(sigmoid(splats.opacities[0]) - 128 / 255) < 1e-6
+    np.testing.assert_allclose(covariances(splats)[0], np.diag([1, 1, np.e**2]), atol=0.2)  # half a turn about x
+
+
+def spz4(path, axes_number=None):
+    """The file rewritten as version 4, if wanted with an extension that names its axes."""
+    data = gzip.decompress(path.read_bytes())
+    _, _, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", data[:16])
+    streams, place = [], 16
+    for size in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
+        streams += [data[place : place + count * size]] if size else []
+        place += count * size
+    records = struct.pack("<II5s", 0x12340001, 5, b"other")
+    records += struct.pack("<III", 0xADBE0003, 4, axes_number) if axes_number is not None else b""
+    packed = [zstandard.compress(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags | 2, len(streams), 32 + len(records))
+    path.write_bytes(header + records + table + b"".join(packed))
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_spz_version_4_holds_the_same(tmp_path, degree):
+    save_gaussians(tmp_path / "a.spz", some_file(30, (degree + 1) ** 2, antialiased=True), report=silent)
+    before = load_gaussians(tmp_path / "a.spz", report=silent)
+    spz4(tmp_path / "a.spz")
+    after = load_gaussians(tmp_path / "a.spz", report=silent)
+    assert after.antialiased
+    for old, new in zip(before.splats, after.splats, strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+@pytest.mark.parametrize(("number", "signs"), [(0, [1, -1, -1]), (6, [1, 1, 1]), (7, [-1, -1, 1]), (3, [-1, -1, -1])])
+def test_spz_axes_by_extension(tmp_path, number, signs):
+    """6 is RDF, ours; 7 is LUF; 3 is LUB, a mirror."""
+    save_gaussians(tmp_path / "a.spz", some_file(30), report=silent)
+    stored = turned(load_gaussians(tmp_path / "a.spz").splats, np.diag([1.0, -1, -1]))
+    spz4(tmp_path / "a.spz", number)
+    found = load_gaussians(tmp_path / "a.spz", report=silent).splats
+    np.testing.assert_array_equal(found.means, stored.means * np.float32(signs))
+    mirror = np.diag(np.float64(signs))
+    np.testing.assert_allclose(covariances(found), mirror @ covariances(stored) @ mirror, rtol=1e-3, atol=1e-5)
+    directions = np.random.default_rng(1).normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(seen_colors(found, directions @ mirror), seen_colors(stored, directions), atol=1e-5)
+
+
+@pytest.mark.parametrize(("number", "sentence"), [(9, "LFD"), (17, "number 17"), (2**32 - 1, "number 4294967295")])
+def test_spz_axes_that_nobody_agrees_on(tmp_path, number, sentence):
+    save_gaussians(tmp_path / "a.spz", some_file(3), report=silent)
+    spz4(tmp_path / "a.spz", number)
+    with pytest.raises(InputError, match=f"axes {sentence}"):
+        load_gaussians(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize(("widest", "bits"), [(2000.0, 12), (3000.0, 11), (1e6, 3), (1e9, 0)])
+def test_spz_takes_as_many_fractional_bits_as_fit(tmp_path, widest, bits):
+    file = some_file(3)
+    file.splats.means[0, 1] = widest
+    notes = []
+    save_gaussians(tmp_path / "a.spz", file, report=notes.append)
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[13] == bits
+    found = load_gaussians(tmp_path / "a.spz").splats.means
+    assert (np.abs(found - file.splats.means)[1:] <= 0.5001 / 2**bits).all()
+    assert notes == ([] if widest < 2**23 else ["position of 1 of 3 Gaussians moved into -8.389e+06..8.389e+06"])
+
+
+@pytest.mark.parametrize("ending", [".glb", ".gltf"])
+def test_gltf_holds_what_the_extension_says(tmp_path, ending):
+    file = some_file(20, antialiased=True)
+    save_gaussians(tmp_path / f"a{ending}", file, report=silent)
+    document, _ = glb_parts(tmp_path / f"a{ending}")
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0 and document["extensionsUsed"] == [NAME] and "extensionsRequired" not in document
+    extension = primitive["extensions"][NAME]
+    assert (extension["kernel"], extension["colorSpace"]) == ("ellipse", "srgb_rec709_display")
+    wanted, found = turned(file.splats, np.diag([-1.0, -1.0, 1.0])), glb_attributes(tmp_path / f"a{ending}")
+    assert len(found) == 5 + 16
+    np.testing.assert_array_equal(found["POSITION"], wanted.means)
+    bounds = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(
+        np.float32([bounds["min"], bounds["max"]]), [wanted.means.min(0), wanted.means.max(0)]
+    )
+    np.testing.assert_allclose(found[f"{NAME}:SCALE"], np.exp(wanted.scales), rtol=1e-6)
+    np.testing.assert_allclose(found[f"{NAME}:OPACITY"], sigmoid(wanted.opacities), rtol=1e-5)
+    unit = wanted.quats / np.linalg.norm(wanted.quats, axis=1, keepdims=True)
+    np.testing.assert_allclose(found[f"{NAME}:ROTATION"], unit[:, [1, 2, 3, 0]], atol=1e-6)
+    for degree in range(4):
+        for order in range(2 * degree + 1):
+            name = f"{NAME}:SH_DEGREE_{degree}_COEF_{order}"
+            np.testing.assert_array_equal(found[name], wanted.sh[:, degree * degree + order])
+    assert (found["COLOR_0"][:, 3] == np.rint(255 * sigmoid(wanted.opacities))).all()
+
+
+def place(tmp_path, nodes, **more):
+    """A file whose mesh stands where ``nodes`` say."""
+    file = some_file(10)
+    save_gaussians(tmp_path / "a.glb", file, report=silent)
+    document, binary = glb_parts(tmp_path / "a.glb")
+    (tmp_path / "b.glb").write_bytes(glb_bytes({**document, "nodes": nodes, **more}, binary))
+    return file.splats
+
+
+def test_gltf_nodes_move_turn_and_scale(tmp_path):
+    turn = Rotation.from_rotvec([0.3, 1.0, -0.4])
+    child = {"mesh": 0, "rotation": turn.as_quat().tolist(), "scale": [2, 2, 2]}
+    matrix = np.eye(4)
+    matrix[:3, 3] = 1, 2, 3
+    before = place(tmp_path, [{"children": [1], "matrix": matrix.T.ravel().tolist()}, child])
+    after = load_gaussians(tmp_path / "b.glb", report=silent).splats
+    flip = np.diag([-1.0, -1.0, 1.0])  # from our axes to those of glTF and back
+    wanted = turned(before, flip @ turn.as_matrix() @ flip, flip @ [1, 2, 3], 2.0)
+    np.testing.assert_allclose(after.means, wanted.means, atol=1e-5)
+    np.testing.assert_allclose(after.sh, wanted.sh, atol=1e-5)
+    np.testing.assert_allclose(covariances(after), covariances(wanted), rtol=1e-3, atol=1e-5)
+
+
+def test_gltf_pieces_are_joined(tmp_path):
+    before = place(tmp_path, [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}], scenes=[{"nodes": [0, 1]}])
+    with pytest.raises(InputError, match="more Gaussians than its data has room for"):
+        place(tmp_path, [{"mesh": 0}] * 30, scenes=[{"nodes": list(range(30))}])
+        load_gaussians(tmp_path / "b.glb")
+    place(tmp_path, [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}], scenes=[{"nodes": [0, 1]}])
+    after = load_gaussians(tmp_path / "b.glb", report=silent).splats
+    np.testing.assert_array_equal(after.means, np.concatenate([before.means, before.means - [5, 0, 0]]).astype("f4"))
+
+
+def test_gltf_quantized_attributes(tmp_path):
+    """Bytes and shorts, normalized, strided, as the extension allows; scales below 0 are an old draft's logarithms."""
+    rows = np.zeros(2, [("p", "<i2", 3), ("pad", "<i2"), ("q", "i1", 4), ("s", "<u2", 3), ("o", "u1"), ("x", "u1")])
+    rows["p"], rows["q"], rows["s"], rows["o"] = [[1, 2, -3], [4, 5, 6]], [[0, 0, 0, 127]] * 2, 1, [51, 255]
+    data = rows.tobytes() + np.float32([[1, 2, 3], [4, 5, 6]]).tobytes()
+    kinds = {"POSITION": (0, 5122, "VEC3", False), f"{NAME}:ROTATION": (8, 5120, "VEC4", True)}
+    kinds |= {f"{NAME}:SCALE": (12, 5123, "VEC3", False), f"{NAME}:OPACITY": (18, 5121, "SCALAR", True)}
+    accessors = [
+        {"bufferView": 0, "byteOffset": o, "componentType": c, "type": t, "normalized": n, "count": 2}
+        for o, c, t, n in kinds.values()
+    ]
+    accessors.append({"bufferView": 1, "componentType": 5126, "type": "VEC3", "count": 2})
+    attributes = {name: index for index, name in enumerate([*kinds, f"{NAME}:SH_DEGREE_0_COEF_0"])}
+    document = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": [NAME, "KHR_mesh_quantization"],
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {"primitives": [{"mode": 0, "attributes": attributes, "extensions": {NAME: {"kernel": "ellipse"}}}]}
+        ],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteLength": rows.nbytes, "byteStride": rows.itemsize},
+            {"buffer": 0, "byteOffset": rows.nbytes, "byteLength": 24},
+        ],
+        "buffers": [{"byteLength": len(data)}],
+    }
+    (tmp_path / "a.glb").write_bytes(glb_bytes(document, data))
+    splats = load_gaussians(tmp_path / "a.glb", report=silent).splats
+    np.testing.assert_array_equal(splats.means, [[-1, -2, -3], [-4, -5, 6]])
+    np.testing.assert_array_equal(splats.scales, 0)
+    np.testing.assert_array_equal(splats.sh[:, 0], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(sigmoid(splats.opacities), [0.2, 1.0], atol=1e-6)
+    np.testing.assert_allclose(covariances(splats), [np.eye(3)] * 2, atol=1e-6)
+    accessors[2]["componentType"] = 5122
+    (tmp_path / "a.glb").write_bytes(glb_bytes(document, data.replace(b"\1\0\1\0\1\0", b"\xff\xff\0\0\1\0")))
+    lines = []
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "a.glb", lines.append).splats.scales, [[-1, 0, 1]] * 2)
+    assert len(lines) == 1 and "logarithms" in lines[0]
+
+
+@pytest.mark.parametrize("coefficients", [1, 16])
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_round_trip_returns_the_scene(tmp_path, ending, coefficients):
+    before = some_file(200, coefficients)
+    save_gaussians(tmp_path / f"a{ending}", before, report=lambda line: None)
+    after = load_gaussians(tmp_path / f"a{ending}", report=silent)
+    bound = {".splat": (0, 1e-5, 0.002), ".spz": (1.3e-4, 0.032, 0.002)}.get(ending, (0, 1e-5, 1e-6))
+    np.testing.assert_allclose(after.splats.means, before.splats.means, atol=bound[0], rtol=0)
+    np.testing.assert_allclose(after.splats.scales, before.splats.scales, atol=bound[1], rtol=0)
+    assert np.abs(sigmoid(after.splats.opacities) - sigmoid(before.splats.opacities)).max() < bound[2]
+    if ending != ".splat":
+        for part, step in ((np.s_[:, :1], 1 / 255 / 0.15), (np.s_[:, 1:], 1 / 128)):
+            atol = 0.501 * step if ending == ".spz" else 0
+            np.testing.assert_allclose(after.splats.sh[part], before.splats.sh[part], atol=atol, rtol=0)
+    again = tmp_path / f"b{ending}"
+    save_gaussians(again, after, report=silent)
+    assert "colour" not in str(losses(after, load_gaussians(again)))  # a second time costs nothing
+
+
+@pytest.mark.parametrize("ending", [".ply", ".spz", ".glb", ".gltf"])
+def test_antialiasing_is_kept(tmp_path, ending):
+    for antialiased in (False, True):
+        save_gaussians(tmp_path / f"a{ending}", some_file(antialiased=antialiased), report=silent)
+        assert load_gaussians(tmp_path / f"a{ending}", report=silent).antialiased is antialiased
+
+
+def test_antialiasing_by_the_comments_of_others(tmp_path):
+    save_gaussians(tmp_path / "a.ply", some_file(3, antialiased=True))
+    data = (tmp_path / "a.ply").read_bytes()
+    for comment, wanted in (("SplatRenderMode: default", False), ("antialiased 1", True), ("antialiased 0", False)):
+        (tmp_path / "b.ply").write_bytes(data.replace(b"SplatRenderMode: mip", comment.encode()))
+        assert is_antialiased(tmp_path / "b.ply") is wanted
+
+
+def test_convert_says_what_is_lost(tmp_path, capsys):
+    file = some_file(40, antialiased=True)
+    file.splats.sh[3, 0, 1], file.splats.scales[5, 2], file.splats.sh[7, 4, 0] = 5.0, -20.0, 3.0
+    save_gaussians(tmp_path / "a.ply", file)
+    said = {}
+    for ending in ENDINGS[1:]:
+        assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / f"b{ending}")]) == 0
+        first, said[ending] = capsys.readouterr().out.splitlines()
+        assert first == f"{tmp_path / f'b{ending}'}: 40 Gaussians, SH degree {0 if ending == '.splat' else 3}"
+    assert said[".glb"] == said[".gltf"] == "  nothing lost but rounding of float32"
+    for part in ("SH degree 3 became 0", "the mark that", "opacity up to 0.00", "colour of 1 of 40", "rotation up to"):
+        assert part in said[".splat"]
+    for part in (
+        "position up to 0.00012",
+        "log scale of 1 of 40",
+        "harmonics of 1 of 40",
+        "colour coefficient of 1 of",
+    ):
+        assert part in said[".spz"]
+    for ending in ENDINGS[1:]:
+        assert main(["convert", str(tmp_path / f"b{ending}"), str(tmp_path / "c.ply")]) == 0
+        assert "nothing lost" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "sentence"),
+    [
+        ("a.ply", "b.obj", "expected a name that ends in .ply, .splat, .spz, .glb, .gltf, found '.obj'"),
+        ("a.ply", "b", "found 'no ending'"),
+        ("none.spz", "b.ply", "none.spz: no such file"),
+        ("a.spz", "b.ply", "a.spz: expected an SPZ file of version 2, 3 or 4, found a file that begins with b'ply"),
+        ("empty.ply", "b.splat", "there are no Gaussians"),
+        ("empty.ply", "b.glb", "there are no Gaussians"),
+    ],
+)
+def test_convert_refuses_in_one_sentence(tmp_path, capsys, source, target, sentence):
+    save_gaussians(tmp_path / "a.ply", some_file(3))
+    save_gaussians(tmp_path / "empty.ply", some_file(0))
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.ply").read_bytes())
+    before = sorted(tmp_path.iterdir())
+    assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert sentence in line and sorted(tmp_path.iterdir()) == before
+
+
+def test_glb_has_a_largest_size(tmp_path, monkeypatch):
+    monkeypatch.setattr("warp_splat.formats.gltf.GLB_BYTES", 10_000)
+    with pytest.raises(InputError, match=r"a\.glb: \d+ bytes are more than a \.glb file can hold"):
+        save_gaussians(tmp_path / "a.glb", some_file())
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_older_gltf_keeps_its_data(tmp_path):
+    """The .bin file of another scene has another name, so a crash between two writes breaks nothing."""
+    save_gaussians(tmp_path / "a.gltf", some_file(seed=1))
+    older = (tmp_path / "a.gltf").read_text()
+    save_gaussians(tmp_path / "a.gltf", some_file(seed=2))
+    (tmp_path / "a.gltf").write_text(older)
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "a.gltf").splats.means, some_splats(seed=1).means)
+
+
+@pytest.mark.parametrize(("ending", "decibels"), [(".ply", 90), (".glb", 80), (".spz", 38), (".splat", 30)])
+def test_renders_of_the_converted_file(tmp_path, ending, decibels):
+    """Against renders of the original, from a camera in general position; .splat without its missing harmonics."""
+    file = some_file(300, 1 if ending == ".splat" else 16, seed=3)
+    camera = make_camera(96, 80, seed=5)
+    seen = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], (300, 3))
+    in_front = seen @ camera.rotation + camera.center
+    splats = file.splats._replace(
+        means=in_front.astype(np.float32), scales=file.splats.scales / 2 - 2, sh=file.splats.sh / 3
+    )
+    save_gaussians(tmp_path / f"a{ending}", SplatFile(splats), report=silent)
+    images = []
+    for one in (splats, load_gaussians(tmp_path / f"a{ending}").splats):
+        images.append(make_picture(GaussianModel.from_splats(one), False, RasterOptions())(camera))
+    assert images[0].std() > 20 and psnr(images[1], images[0]) > decibels
+
+
+def test_render_takes_a_file(tmp_path, capsys):
+    save_gaussians(tmp_path / "a.spz", some_file(100))
+    assert main(["render", "-m", str(tmp_path / "a.spz"), "--device", "cpu"]) == 1
+    assert "name the scene with -s, or use --orbit" in capsys.readouterr().err

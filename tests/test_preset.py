@@ -1,0 +1,69 @@
+"""The preset, and training from coarse images to fine ones."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_splat.cli import parse
+from warp_splat.config import EMBEDDED_DEFAULTS, PRESETS, TrainConfig
+from warp_splat.scene import View, load_scene
+from warp_splat.trainer import Trainer
+
+SCENE = Path(__file__).parents[1] / "assets" / "still_life"
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene(SCENE, resolution=4, report=str)
+
+
+def test_flags_go_before_the_preset_and_the_preset_before_defaults():
+    assert parse(["train", "-s", "x"]) == TrainConfig(source_path="x")
+    assert parse(["train", "-s", "x", "--preset", "fast"]) == TrainConfig(
+        source_path="x", **{"preset": "fast", **PRESETS["fast"]}
+    )
+    assert parse(["train", "-s", "x", "--preset", "fast", "--coarse", "2"]).coarse == 2
+    embedded = parse(["train", "--preset", "fast", "--sh_interval", "7"])
+    assert embedded.sh_interval == 7 and embedded.eval
+    assert embedded.coarse == PRESETS["fast"]["coarse"]
+
+
+def test_presets_are_made_of_documented_flags():
+    documented = {item.name for item in fields(TrainConfig) if item.metadata["help"]}
+    for values in (EMBEDDED_DEFAULTS, *PRESETS.values()):
+        assert set(values) <= documented
+
+
+def test_images_grow_to_their_full_size(scene):
+    trainer = Trainer(scene, TrainConfig(device="cpu", coarse=4, coarse_until_iter=10))
+    view = scene.train[0]
+    shrinks = []
+    for iteration in range(1, 12):
+        camera, photograph = trainer._at_size(view, iteration)
+        assert photograph.shape == (camera.height, camera.width, 3)
+        assert (camera.fx / camera.width, camera.cy / camera.height) == pytest.approx(
+            (view.camera.fx / view.camera.width, view.camera.cy / view.camera.height)
+        )
+        shrinks.append(view.camera.width // camera.width)
+    assert shrinks == [4] * 4 + [2] * 5 + [1] * 2
+    assert camera is view.camera and np.array_equal(photograph.numpy(), view.image)
+
+
+def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):
+    image = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
+    camera = scene.train[0].camera.resized(48, 40)
+    _, photograph = Trainer(scene, TrainConfig(device="cpu", coarse=4))._at_size(View("a", camera, image, camera), 1)
+    means = image.reshape(10, 4, 12, 4, 3).mean((1, 3))
+    assert np.abs(photograph.numpy() - means).max() <= 0.5 + 1e-3
+
+
+def test_a_coarse_step_trains_on_a_coarse_image(scene):
+    trainer = Trainer(scene, TrainConfig(device="cpu", coarse=4, coarse_until_iter=100))
+    trainer.differentiate(1)
+    assert trainer._photographs and all(
+        photograph.shape[0] == view.image.shape[0] // 4 for view, photograph in trainer._photographs.items()
+    )
+    trainer.differentiate(60)
+    assert all(photograph.shape[0] == view.image.shape[0] // 2 for view, photograph in trainer._photographs.items())

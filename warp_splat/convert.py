@@ -1,0 +1,64 @@
+"""From one format of Gaussians to another, and what that cost, measured by reading the new file again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warp_splat.config import ConvertConfig
+from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
+from warp_splat.formats.splats import COEFFICIENTS, LOG_SCALES, SH_C0, SplatArrays, SplatFile, sigmoid, unit_quats
+
+ROUNDING = 1e-6  # smaller changes, as a share of the largest value, are those of float32
+
+
+def convert(config: ConvertConfig) -> int:
+    """Convert as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
+    """
+    format_of(config.target)  # before anything is read
+    before = load_gaussians(config.source)
+    notes: list[str] = []
+    save_gaussians(config.target, before, notes.append)
+    after = load_gaussians(config.target)
+    degree = COEFFICIENTS.index(after.splats.sh.shape[1])
+    print(f"{config.target}: {len(after.splats.means)} Gaussians, SH degree {degree}")
+    notes = losses(before, after) + notes
+    print(f"  lost: {'; '.join(notes)}" if notes else "  nothing lost but rounding of float32")
+    return 0
+
+
+def losses(before: SplatFile, after: SplatFile) -> list[str]:
+    """What differs, in phrases with numbers: the largest change of any Gaussian and the root mean square."""
+    notes = []
+    old, new = before.splats, after.splats
+    degrees = [COEFFICIENTS.index(splats.sh.shape[1]) for splats in (old, new)]
+    if degrees[0] != degrees[1]:
+        notes.append(f"SH degree {degrees[0]} became {degrees[1]}")
+    if before.antialiased != after.antialiased:
+        notes.append("the mark that the Gaussians are antialiased")
+    if len(old.means) != len(new.means):
+        return [*notes, f"{len(old.means) - len(new.means)} of {len(old.means)} Gaussians"]
+    for name, unit, largest, change in _changes(old, new):
+        if change.size and change.max() > ROUNDING * largest:
+            notes.append(f"{name} up to {change.max():.2g}{unit} (RMS {np.sqrt(np.mean(change**2)):.2g})")
+    return notes
+
+
+def _changes(old: SplatArrays, new: SplatArrays) -> list[tuple[str, str, float, np.ndarray]]:
+    """By quantity: its name, its unit, its largest size, and by how much each number changed."""
+    shared = min(old.sh.shape[1], new.sh.shape[1])
+    largest = lambda array: float(np.abs(array).max(initial=0))  # noqa: E731
+    scales = [np.exp(np.clip(splats.scales.astype(np.float64), *LOG_SCALES)) for splats in (old, new)]
+    quats, others = unit_quats(old.quats).astype(np.float64), unit_quats(new.quats).astype(np.float64)
+    others = np.where((quats * others).sum(axis=1, keepdims=True) < 0, -others, others)
+    halves = np.linalg.norm(quats - others, axis=1), np.linalg.norm(quats + others, axis=1)
+    return [
+        ("position", "", largest(old.means), np.abs(old.means - new.means)),
+        ("scale", "", largest(scales[0]), np.abs(scales[0] - scales[1])),
+        ("opacity", "", 1.0, np.abs(sigmoid(old.opacities) - sigmoid(new.opacities))),
+        ("colour", "", 1.0, SH_C0 * np.abs(old.sh[:, 0] - new.sh[:, 0])),
+        ("harmonics", "", 1.0, np.abs(old.sh[:, 1:shared] - new.sh[:, 1:shared])),
+        ("rotation", " degrees", 360.0, np.degrees(4 * np.arctan2(*halves))),
+    ]

@@ -1,0 +1,79 @@
+"""Files of Gaussians by the endings of their names: the one place that knows all formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from warp_splat.errors import InputError
+from warp_splat.formats.gltf import load_gltf, save_gltf
+from warp_splat.formats.ply import ANTIALIASED, is_antialiased, load_ply, save_ply
+from warp_splat.formats.splat32 import load_splat, save_splat
+from warp_splat.formats.splats import SplatFile
+from warp_splat.formats.spz import load_spz, save_spz
+
+Report = Callable[[str], None]
+
+
+class Format(NamedTuple):
+    """How a kind of file is read and written."""
+
+    load: Callable[[str | Path, Report], SplatFile]
+    save: Callable[[str | Path, SplatFile, Report], None]
+
+
+def _load_ply(path: str | Path, report: Report) -> SplatFile:
+    return SplatFile(load_ply(path, report), is_antialiased(path))
+
+
+def _save_ply(path: str | Path, file: SplatFile, report: Report) -> None:
+    save_ply(path, *file.splats, comments=(ANTIALIASED,) if file.antialiased else ())
+
+
+FORMATS = {
+    ".ply": Format(_load_ply, _save_ply),
+    ".splat": Format(load_splat, save_splat),
+    ".spz": Format(load_spz, save_spz),
+    ".glb": Format(load_gltf, save_gltf),
+    ".gltf": Format(load_gltf, save_gltf),
+}
+
+
+def format_of(path: str | Path) -> Format:
+    """How a file of this name is read and written.
+
+    Raises:
+        InputError: if its ending is not one of FORMATS.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(f"{path}: expected a name that ends in {', '.join(FORMATS)}, found {suffix or 'no ending'!r}.")
+    return FORMATS[suffix]
+
+
+def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:
+    """Read Gaussians in the frame of their training, whatever the format.
+
+    Args:
+        path: a file of one of FORMATS.
+        report: called with a line for each thing that the user should know: values left out, ...
+
+    Raises:
+        InputError: if the file is missing, damaged, or of another format than its name says.
+    """
+    return format_of(path).load(path, report)
+
+
+def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) -> None:
+    """Write Gaussians in the format that the name asks for.
+
+    Args:
+        path: the file to write.
+        file: the Gaussians, finite.
+        report: called with a part of a sentence for each kind of value that the format cannot hold.
+
+    Raises:
+        InputError: if the ending is unknown or the file cannot be written.
+    """
+    format_of(path).save(path, file, report)

@@ -1,0 +1,232 @@
+"""Gaussians as glTF 2.0 files with the extension KHR_gaussian_splatting, ratified by the Khronos Group in 2026.
+
+A mesh primitive of POINTS whose attributes are POSITION, ROTATION (x y z w), SCALE (standard deviations), OPACITY
+(0..1) and SH_DEGREE_l_COEF_n, one VEC3 for each coefficient. Axes of glTF: left, up, forward. COLOR_0 is what viewers
+without the extension show. The extension has no word for Mip-Splatting: "extras" keeps the PLY file's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat import __version__
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
+from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.splats import (
+    COEFFICIENTS,
+    LOG_SCALES,
+    SH_C0,
+    SplatArrays,
+    SplatFile,
+    check_shapes,
+    clipped,
+    finite_rows,
+    frame,
+    log_scales,
+    logit,
+    sigmoid,
+    turned,
+    unit_quats,
+)
+
+NAME = "KHR_gaussian_splatting"
+AXES = "LUF"
+UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may require
+COLOR_SPACE = "srgb_rec709_display"  # that of the photographs
+RENDER_MODE = "SplatRenderMode"
+MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
+LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the colour
+GLB_BYTES = 2**32 - 1  # the length in the header of a .glb file has four bytes
+ARRAY_BUFFER = 34962
+
+
+def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+    """Write Gaussians as a .glb file, or as a .gltf file with a .bin file beside it.
+
+    The name of the .bin file holds a checksum, so that an older .gltf file keeps its own until it is replaced.
+
+    Args:
+        path: the file to write.
+        file: the Gaussians.
+        report: called with a part of a sentence for each kind of value that the format cannot hold.
+
+    Raises:
+        InputError: if a shape disagrees with the others; if a file cannot be written.
+    """
+    check_shapes(file.splats)
+    path = Path(path)
+    if not len(file.splats.means):
+        raise InputError(f"{path}: there are no Gaussians, and a glTF file cannot say so; choose another format.")
+    attributes = _attributes(turned(file.splats, frame(AXES).T), report)
+    data = b"".join(array.tobytes() for array in attributes.values())
+    document = _describe(attributes, file.antialiased)
+    if path.suffix.lower() == ".gltf":
+        buffer = path.with_name(f"{path.stem}.{hashlib.sha256(data).hexdigest()[:8]}.bin")
+        with atomic_write(buffer) as temporary:
+            temporary.write_bytes(data)
+        document["buffers"][0]["uri"] = buffer.name
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
+        return
+    text = json.dumps(document, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)  # chunks are padded to four bytes; every attribute is
+    chunks = CHUNK.pack(len(text), b"JSON") + text + CHUNK.pack(len(data), b"BIN\0") + data
+    if HEADER.size + len(chunks) > GLB_BYTES:
+        raise InputError(f"{path}: {len(chunks)} bytes are more than a .glb file can hold; choose a name in .gltf.")
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(HEADER.pack(b"glTF", 2, HEADER.size + len(chunks)) + chunks)
+
+
+def load_gltf(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+    """Read all Gaussians of a .glb or .gltf file's scene, as its nodes place them.
+
+    Args:
+        path: the file.
+        report: called with a line for what differs from the extension's text, and if Gaussians were left out.
+
+    Raises:
+        InputError: if the file is missing, damaged, holds no Gaussians, or wants what is not supported.
+    """
+    with reading(path, "a glTF 2.0 file of Gaussians (KHR_gaussian_splatting)"):
+        document = Document(path)
+        required = document.entries("extensionsRequired")
+        unknown = [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]
+        if unknown:
+            raise Unexpected(f"one that needs the extension {unknown[0]!r:.80}; export it without")
+        placed = [(piece, world) for mesh, world in document.placed_meshes() for piece in _splat_primitives(mesh)]
+        if not 0 < len(placed) <= MOST_PIECES:
+            raise Unexpected(f"{len(placed)} meshes of them in its scene, at most {MOST_PIECES} are read")
+        notes: list[str] = []
+        parts, room = [], document.data_bytes // LEAST_BYTES
+        for piece, world in placed:
+            splats = _read_primitive(document, piece, notes.append)
+            room -= len(splats.means)
+            if room < 0:
+                raise Unexpected("more Gaussians than its data has room for, some placed many times")
+            turn, translation, scale = decompose(world)
+            parts.append(turned(splats, frame(AXES) @ turn, frame(AXES) @ translation, scale))
+    for note in dict.fromkeys(notes):
+        report(f"{path}: {note}.")
+    antialiased = all(_render_mode(piece) == "mip" for piece, _ in placed)
+    return SplatFile(finite_rows(_joined(parts), path, report), antialiased)
+
+
+def _attributes(splats: SplatArrays, report: Callable[[str], None]) -> dict[str, np.ndarray]:
+    means, sh, opacities, scales, quats = splats
+    opacity = sigmoid(opacities)
+    shown = np.clip(SH_C0 * sh[:, 0] + 0.5, 0, 1)
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # COLOR_0 is linear, IEC 61966
+    attributes = {
+        "POSITION": means,
+        "COLOR_0": np.rint(255 * np.concatenate([linear, opacity[:, None]], axis=1)).astype(np.uint8),
+        f"{NAME}:ROTATION": unit_quats(quats)[:, [1, 2, 3, 0]],
+        f"{NAME}:SCALE": np.exp(clipped("log scale", scales, *LOG_SCALES, report)),
+        f"{NAME}:OPACITY": opacity,
+    }
+    attributes |= {name: sh[:, index] for index, name in enumerate(_harmonic_names(sh.shape[1]))}
+    return {
+        name: array if array.dtype == np.uint8 else np.ascontiguousarray(array, "<f4")
+        for name, array in attributes.items()
+    }
+
+
+def _harmonic_names(coefficients: int) -> list[str]:
+    degrees = range(COEFFICIENTS.index(coefficients) + 1)
+    return [f"{NAME}:SH_DEGREE_{degree}_COEF_{order}" for degree in degrees for order in range(2 * degree + 1)]
+
+
+def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
+    """The JSON of a file whose buffer holds the attributes one after the other."""
+    views, accessors, offset = [], [], 0
+    for index, (name, array) in enumerate(attributes.items()):
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": ARRAY_BUFFER})
+        offset += array.nbytes
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        component = {"normalized": True, "componentType": 5121} if array.dtype == np.uint8 else {"componentType": 5126}
+        accessors.append({"bufferView": index, "count": len(array), "type": kind, **component})
+        if name == "POSITION":
+            accessors[-1] |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+    extension: dict = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
+    if antialiased:
+        extension["extras"] = {RENDER_MODE: "mip"}
+    primitive = {
+        "mode": 0,
+        "attributes": {name: index for index, name in enumerate(attributes)},
+        "extensions": {NAME: extension},
+    }
+    return {
+        "asset": {"version": "2.0", "generator": f"warp_splat {__version__}"},
+        "extensionsUsed": [NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+
+
+def _splat_primitives(mesh: dict) -> list[dict]:
+    primitives = mesh.get("primitives")
+    if not isinstance(primitives, list):
+        raise Unexpected("a mesh without primitives")
+    return [
+        primitive
+        for primitive in primitives
+        if isinstance(primitive, dict)
+        and isinstance(primitive.get("extensions"), dict)
+        and NAME in primitive["extensions"]
+    ]
+
+
+def _read_primitive(document: Document, primitive: dict, report: Callable[[str], None]) -> SplatArrays:
+    extension, attributes = primitive["extensions"][NAME], primitive.get("attributes")
+    if not isinstance(extension, dict) or not isinstance(attributes, dict):
+        raise Unexpected("a primitive without attributes")
+    kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE)
+    if kernel != "ellipse" or extension.get("extensions"):
+        raise Unexpected(f"Gaussians of kernel {kernel!r:.40} or in a compressed form; export them without extensions")
+    if space != COLOR_SPACE:
+        report(f"the colours are in {space!r:.40} and are kept as they are; expected {COLOR_SPACE!r}")
+    coefficients = sum(name.startswith(f"{NAME}:SH_DEGREE_") for name in attributes)
+    if coefficients not in COEFFICIENTS:
+        raise Unexpected(f"a primitive with {coefficients} coefficients of SH, not 1, 4, 9 or 16")
+    kinds = {"POSITION": "VEC3", f"{NAME}:ROTATION": "VEC4", f"{NAME}:SCALE": "VEC3", f"{NAME}:OPACITY": "SCALAR"}
+    kinds |= dict.fromkeys(_harmonic_names(coefficients), "VEC3")
+    missing = [name for name in kinds if name not in attributes]
+    if missing:
+        raise Unexpected(f"a primitive that lacks {', '.join(missing)}")
+    means, rotations, scales, opacities, *sh = (
+        document.accessor(attributes[name], kind) for name, kind in kinds.items()
+    )
+    if len({len(array) for array in (means, rotations, scales, opacities, *sh)}) > 1:
+        raise Unexpected("attributes of different lengths")
+    if (scales < 0).any():
+        report("scales below 0, taken as logarithms, as in drafts of the extension")
+    return SplatArrays(
+        means=means,
+        sh=np.stack(sh, axis=1),
+        opacities=logit(clipped("opacity", opacities, 0.0, 1.0, report)),
+        scales=scales if (scales < 0).any() else log_scales(scales),
+        quats=rotations[:, [3, 0, 1, 2]],
+    )
+
+
+def _render_mode(primitive: dict) -> object:
+    extras = primitive["extensions"][NAME].get("extras")
+    return extras.get(RENDER_MODE) if isinstance(extras, dict) else None
+
+
+def _joined(parts: list[SplatArrays]) -> SplatArrays:
+    """One set of Gaussians; those of a lower SH degree get zeros."""
+    most = max(part.sh.shape[1] for part in parts)
+    padded = [part._replace(sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))) for part in parts]
+    return SplatArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))

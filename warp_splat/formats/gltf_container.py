@@ -1,0 +1,251 @@
+"""What a glTF 2.0 file is made of, as far as points need it: JSON, buffers, accessors, the tree of nodes.
+
+Written for files of strangers: every number is checked before it is used, nothing is allocated that the file does not
+hold, and no other file is opened than buffers in the folder of the .gltf file or below.
+
+Own code, plain JSON and NumPy: the libraries for glTF build objects from the JSON without checking it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+
+from warp_splat.formats.reading import Unexpected
+
+HEADER = struct.Struct("<4sII")  # of a .glb file: magic, version, length
+CHUNK = struct.Struct("<I4s")  # length, type
+JSON_BYTES = 2**22  # a thousand times that of a file of Gaussians, and a hundred megabytes once parsed
+MOST_BUFFERS = 256  # files to look for; the Gaussians of a scene are in one or a few
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+EVEN = 1e-4  # by how much the axes of a node may differ in length, or lean
+
+
+class Buffer(NamedTuple):
+    """A run of bytes of a file."""
+
+    path: Path
+    start: int
+    length: int
+
+
+class Document:
+    """An opened .glb or .gltf file.
+
+    Attributes:
+        json: its JSON object.
+        buffers: one for each entry of "buffers".
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        size = self.path.stat().st_size
+        with open(self.path, "rb") as source:
+            binary = source.read(4) == b"glTF"
+            source.seek(0)
+            chunk = None
+            if binary:
+                text, chunk = self._read_chunks(source, size)
+            elif size > JSON_BYTES:
+                raise Unexpected(f"a JSON file of {size} bytes, more than {JSON_BYTES}")
+            else:
+                text = source.read()
+        self.json = _parse(text)
+        if len(self.entries("buffers")) > MOST_BUFFERS:
+            raise Unexpected(f"{len(self.entries('buffers'))} buffers, more than {MOST_BUFFERS}")
+        self.buffers = [self._open(entry, chunk if index == 0 else None) for index, entry in enumerate(self._buffers())]
+
+    @property
+    def data_bytes(self) -> int:
+        """Bytes of all buffers, those that are one file counted once."""
+        return sum({buffer.path: buffer.length for buffer in self.buffers}.values())
+
+    def entries(self, key: str) -> list:
+        """A list of the JSON, empty if it has none."""
+        return _list(self.json, key)
+
+    def entry(self, kind: str, index: Any) -> dict:
+        """The object ``index`` of the list ``kind`` of the JSON."""
+        entries = self.json.get(kind)
+        if not isinstance(entries, list):
+            raise Unexpected(f"no list of {kind}")
+        found = entries[whole(index, f"index of {kind}", len(entries) - 1)]
+        if not isinstance(found, dict):
+            raise Unexpected(f"no object as entry {index} of {kind}")
+        return found
+
+    def accessor(self, index: Any, kind: str) -> np.ndarray:
+        """The values of an accessor of type ``kind`` as float32, [N] or [N, components]."""
+        accessor = self.entry("accessors", index)
+        component = whole(accessor.get("componentType"), "componentType", max(COMPONENTS))
+        if accessor.get("type") != kind or component not in COMPONENTS:
+            raise Unexpected(f"accessor {index} of type {accessor.get('type')!r:.40}, {component}")
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise Unexpected(f"accessor {index} without data of its own (sparse, or compressed)")
+        dtype, width = np.dtype(COMPONENTS[component]), TYPES[kind]
+        view = self.entry("bufferViews", accessor["bufferView"])
+        buffer = self.buffers[whole(view.get("buffer"), "buffer", len(self.buffers) - 1)]
+        first = whole(view.get("byteOffset", 0), "byteOffset", buffer.length)
+        length = whole(view.get("byteLength"), "byteLength of a bufferView", buffer.length - first)
+        offset = whole(accessor.get("byteOffset", 0), "byteOffset of an accessor", length)
+        element = dtype.itemsize * width
+        stride = whole(view.get("byteStride", element), "byteStride", 252)
+        if stride < element:
+            raise ValueError(f"byteStride {stride} for elements of {element} bytes")
+        count = whole(accessor.get("count"), "count", (length - offset - element) // stride + 1)
+        data = np.fromfile(
+            buffer.path, np.uint8, max(0, (count - 1) * stride + element), offset=buffer.start + first + offset
+        )
+        values = np.ndarray((count, width), dtype, data, strides=(stride, dtype.itemsize)).astype(np.float32)
+        if accessor.get("normalized") is True and dtype.kind != "f":
+            values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
+        return values[:, 0] if width == 1 else values
+
+    def placed_meshes(self) -> list[tuple[dict, np.ndarray]]:
+        """The meshes of the scene, each with the matrix [4, 4] from its coordinates to the world's."""
+        nodes = self.entries("nodes")
+        if "scenes" in self.json:
+            roots = _list(self.entry("scenes", self.json.get("scene", 0)), "nodes")
+        else:  # a library of meshes: all that nobody else places
+            children = [child for node in nodes if isinstance(node, dict) for child in _list(node, "children")]
+            roots = sorted(set(range(len(nodes))) - {child for child in children if isinstance(child, int)})
+        open_nodes, seen, found = [(index, np.eye(4)) for index in reversed(roots)], set(), []
+        while open_nodes:
+            index, parent = open_nodes.pop()
+            node = self.entry("nodes", index)
+            if index in seen:
+                raise Unexpected(f"node {index} in two places")
+            seen.add(index)
+            with np.errstate(over="ignore", invalid="ignore"):
+                world = parent @ _matrix(node)
+            if not np.isfinite(world).all():
+                raise ValueError(f"node {index} has a transform that is not finite")
+            if "mesh" in node:
+                found.append((self.entry("meshes", node["mesh"]), world))
+            open_nodes += [(child, world) for child in reversed(_list(node, "children"))]
+        return found
+
+    def _buffers(self) -> list[dict]:
+        return [self.entry("buffers", index) for index in range(len(self.entries("buffers")))]
+
+    def _open(self, entry: dict, chunk: Buffer | None) -> Buffer:
+        if "uri" not in entry:
+            if chunk is None:
+                raise Unexpected("a buffer without data")
+            return chunk._replace(length=whole(entry.get("byteLength"), "byteLength of a buffer", chunk.length))
+        uri = entry["uri"]
+        if not isinstance(uri, str) or uri.startswith("data:"):
+            raise Unexpected("a buffer inside the JSON; export it as .glb, or with a .bin file")
+        folder = self.path.parent.resolve()
+        path = (folder / unquote(uri)).resolve()  # a null byte raises ValueError, as it should
+        if "://" in uri or "\\" in uri or not path.is_relative_to(folder):
+            raise Unexpected(f"a buffer outside of its folder ({uri!r:.80})")
+        if not path.is_file():
+            raise Unexpected(f"no file {path.name!r:.80} beside it, where its data should be")
+        length = path.stat().st_size
+        return Buffer(path, 0, whole(entry.get("byteLength"), "byteLength of a buffer", length))
+
+    def _read_chunks(self, source, size: int) -> tuple[bytes, Buffer | None]:
+        """The JSON and where the binary chunk is, if there is one."""
+        chunks = {}
+        if size < HEADER.size:
+            raise ValueError(f"{size} bytes")
+        _, version, length = HEADER.unpack(source.read(HEADER.size))
+        if version != 2:
+            raise Unexpected(f"version {version}")
+        if length > size:
+            raise ValueError(f"found {size} of {length} bytes")
+        place = HEADER.size
+        while place + CHUNK.size <= length and len(chunks) < 2:  # what follows these two is for others
+            source.seek(place)
+            chunk_length, kind = CHUNK.unpack(source.read(CHUNK.size))
+            place += CHUNK.size
+            if chunk_length > length - place:
+                raise ValueError(f"a chunk of {chunk_length} bytes, of which {length - place} are there")
+            chunks[kind] = Buffer(self.path, place, chunk_length)
+            place += chunk_length
+        text = chunks.get(b"JSON")
+        if text is None or text.length > JSON_BYTES:
+            raise Unexpected("no JSON" if text is None else f"JSON of {text.length} bytes, more than {JSON_BYTES}")
+        source.seek(text.start)
+        return source.read(text.length), chunks.get(b"BIN\0")
+
+
+def whole(value: Any, what: str, most: int) -> int:
+    """``value`` if it is a whole number, 0 to ``most``."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise Unexpected(f"{what} {value!r:.40}, which is no whole number")
+    if not 0 <= value <= most:
+        raise ValueError(f"{what} {value if abs(value) < 10**18 else 'of many digits'}, at most {most} is there")
+    return value
+
+
+def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
+
+    Raises:
+        Unexpected: if it stretches or shears, which would need other Gaussians.
+    """
+    linear = matrix[:3, :3]
+    with np.errstate(over="ignore"):
+        scale = float(np.linalg.norm(linear)) / math.sqrt(3)
+    turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
+    if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
+        raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")
+    u, _, v = np.linalg.svd(turn)
+    return u @ v, matrix[:3, 3], scale
+
+
+def _parse(text: bytes) -> dict:
+    def refuse(name: str):
+        raise ValueError(f"the JSON holds {name}")
+
+    try:
+        parsed = json.loads(text.decode("utf-8"), parse_constant=refuse)
+    except RecursionError as error:
+        raise ValueError("the JSON is nested too deeply") from error
+    if not isinstance(parsed, dict):
+        raise Unexpected("JSON that is no object")
+    return parsed
+
+
+def _list(entry: dict, key: str) -> list:
+    found = entry.get(key, [])
+    if not isinstance(found, list):
+        raise Unexpected(f"{key} that are no list")
+    return found
+
+
+def _matrix(node: dict) -> np.ndarray:
+    """The transform [4, 4] of a node."""
+    if "matrix" in node:
+        return _numbers(node, "matrix", 16).reshape(4, 4).T
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most files have none
+
+    matrix = np.eye(4)
+    matrix[:3, 3] = _numbers(node, "translation", 3) if "translation" in node else 0
+    if "rotation" in node:
+        quat = _numbers(node, "rotation", 4)
+        if not 1e-6 < np.linalg.norm(quat) < 1e6:
+            raise ValueError(f"a rotation {quat.tolist()}")
+        matrix[:3, :3] = Rotation.from_quat(quat).as_matrix()
+    if "scale" in node:
+        matrix[:3, :3] *= _numbers(node, "scale", 3)
+    return matrix
+
+
+def _numbers(node: dict, key: str, count: int) -> np.ndarray:
+    values = _list(node, key)
+    if len(values) != count or not all(isinstance(value, int | float) for value in values):
+        raise Unexpected(f"{key} that are not {count} numbers")
+    array = np.array([float(value) for value in values])
+    if not np.isfinite(array).all():
+        raise ValueError(f"{key} that are not finite")
+    return array

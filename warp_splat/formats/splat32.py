@@ -1,0 +1,83 @@
+"""Gaussians as ``.splat`` files, the format of antimatter15's viewer: 32 bytes each, without a header.
+
+Three float32 of position, three of standard deviation, then bytes: red green blue opacity, and the quaternion w x y z
+as 128 * q + 128. The axes are those of the PLY file. Spherical harmonics above degree 0 have no place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.splats import (
+    LOG_SCALES,
+    SH_C0,
+    SplatArrays,
+    SplatFile,
+    check_shapes,
+    clipped,
+    finite_rows,
+    log_scales,
+    logit,
+    sigmoid,
+    unit_quats,
+)
+
+ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+    """Write Gaussians as a .splat file.
+
+    Args:
+        path: the file to write.
+        file: the Gaussians, of which SH degree 0 is kept.
+        report: called with a part of a sentence for each kind of value that the format cannot hold.
+
+    Raises:
+        InputError: if a shape disagrees with the others; if there are no Gaussians; if the file cannot be written.
+    """
+    check_shapes(file.splats)
+    means, sh, opacities, scales, quats = file.splats
+    if not len(means):
+        raise InputError(f"{path}: there are no Gaussians, and a .splat file cannot say so; choose another format.")
+    colors = clipped("colour", SH_C0 * sh[:, 0] + 0.5, 0, 1, report)
+    rows = np.empty(len(means), ROW)
+    rows["mean"] = means
+    rows["scale"] = np.exp(clipped("log scale", scales, *LOG_SCALES, report))
+    rows["rgba"][:, :3] = np.rint(255 * colors)
+    rows["rgba"][:, 3] = np.rint(255 * sigmoid(opacities))
+    rows["quat"] = np.clip(np.rint(128 * unit_quats(quats) + 128), 0, 255)
+    with atomic_write(path) as temporary:
+        rows.tofile(temporary)
+
+
+def load_splat(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+    """Read a .splat file; rows with a value that is not finite, or a negative scale, are left out.
+
+    Args:
+        path: the file.
+        report: called with one line if rows were left out.
+
+    Raises:
+        InputError: if the file is missing or not a whole number of rows.
+    """
+    with reading(path, "a .splat file, 32 bytes for each Gaussian"), open(path, "rb") as source:
+        size = os.fstat(source.fileno()).st_size
+        if size == 0 or size % ROW.itemsize:
+            raise Unexpected(f"{size} bytes; it may be cut short")
+        rows = np.fromfile(source, ROW, size // ROW.itemsize)
+    splats = SplatArrays(
+        means=rows["mean"].astype(np.float32),
+        sh=((rows["rgba"][:, None, :3] / np.float32(255) - np.float32(0.5)) / np.float32(SH_C0)),
+        opacities=logit(rows["rgba"][:, 3] / 255),
+        scales=log_scales(rows["scale"]),
+        quats=(rows["quat"].astype(np.float32) - 128) / 128,
+    )
+    return SplatFile(finite_rows(splats, path, report))

@@ -1,0 +1,156 @@
+"""Gaussians in memory, as every file format reads and writes them, and what they share: activations, axes.
+
+The frame is that of the scene's files, as trained (COLMAP: x right, y down, z forward). Formats with axes of their own
+turn the Gaussians on writing and back on reading (:func:`turned`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from warp_splat.errors import InputError
+
+COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
+SH_C0 = 0.28209479177387814  # colour = SH_C0 * (coefficient of degree 0) + 0.5
+LOG_SCALES = (-87.0, 88.0)  # exp() of these, and of what lies between, is a normal number in float32
+AXIS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+
+
+class SplatArrays(NamedTuple):
+    """Gaussians as stored, float32: before sigmoid, exp and normalisation."""
+
+    means: np.ndarray  # [N, 3] world units
+    sh: np.ndarray  # [N, K, 3] spherical harmonics, K = 1, 4, 9 or 16
+    opacities: np.ndarray  # [N] logits
+    scales: np.ndarray  # [N, 3] natural logarithms of world units
+    quats: np.ndarray  # [N, 4] w x y z, not necessarily of unit length
+
+
+class SplatFile(NamedTuple):
+    """What a file of Gaussians says."""
+
+    splats: SplatArrays
+    antialiased: bool = False  # trained, and to be rendered, with the opacities of Mip-Splatting (Yu et al. 2024)
+
+
+def check_shapes(splats: SplatArrays) -> None:
+    """Raise InputError if a shape disagrees with the others."""
+    count = len(splats.means)
+    shapes = {"means": (count, 3), "opacities": (count,), "scales": (count, 3), "quats": (count, 4)}
+    for name, shape in shapes.items():
+        found = getattr(splats, name).shape
+        if found != shape:
+            raise InputError(f"{name}: expected shape {shape}, got {found}.")
+    if splats.sh.shape not in [(count, coefficients, 3) for coefficients in COEFFICIENTS]:
+        raise InputError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
+
+
+def finite_rows(splats: SplatArrays, path, report: Callable[[str], None]) -> SplatArrays:
+    """Leave out Gaussians with a value that is not finite, since one can spoil a whole image; ``report`` says so."""
+    count = len(splats.means)
+    finite = np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in splats], axis=0)
+    if finite.all():
+        return splats
+    report(f"{path}: left out {np.count_nonzero(~finite)} of {count} Gaussians with values that are not finite.")
+    return SplatArrays(*(array[finite] for array in splats))
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Opacities 0..1 from logits."""
+    with np.errstate(over="ignore"):
+        return 1.0 / (1.0 + np.exp(-logits))
+
+
+def logit(opacities: np.ndarray) -> np.ndarray:
+    """Logits from opacities; 0 and 1, to which formats round, give the last finite ones of float32: -87 and 16.6."""
+    info = np.finfo(np.float32)
+    inside = np.clip(opacities.astype(np.float64), info.tiny, 1.0 - info.epsneg)
+    return np.log(inside / (1.0 - inside)).astype(np.float32)
+
+
+def log_scales(scales: np.ndarray) -> np.ndarray:
+    """Logarithms of standard deviations; 0 (a flat Gaussian) gives the last finite one, less gives NaN."""
+    with np.errstate(invalid="ignore"):
+        return np.log(np.where(scales == 0, np.finfo(np.float32).tiny, scales)).astype(np.float32)
+
+
+def unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Quaternions of unit length, w x y z; the identity for those of no length, as the renderer takes them."""
+    quats = quats.astype(np.float64)
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0]).astype(np.float32)
+
+
+def clipped(what: str, values: np.ndarray, low: float, high: float, report: Callable[[str], None]) -> np.ndarray:
+    """``values`` [N, ...] moved into a format's range; ``report`` is told of how many Gaussians if there are any."""
+    outside = (values < low) | (values > high)
+    if outside.any():
+        rows = np.count_nonzero(outside.any(axis=tuple(range(1, values.ndim))))
+        report(f"{what} of {rows} of {len(values)} Gaussians moved into {low:.4g}..{high:.4g}")
+    return np.clip(values, low, high)
+
+
+def frame(letters: str) -> np.ndarray:
+    """The matrix [3, 3] that takes coordinates in axes named by ``letters`` to ours, which are "RDF".
+
+    Args:
+        letters: what x, y and z point to, of Right, Left, Up, Down, Forward, Back: "RUB" for OpenGL, "LUF" for glTF.
+    """
+    return np.array([AXIS[letter] for letter in letters], np.float64).T
+
+
+def turned(
+    splats: SplatArrays, turn: np.ndarray, translation: np.ndarray | None = None, scale: float = 1.0
+) -> SplatArrays:
+    """The Gaussians in another frame, x_new = scale * turn @ x + translation, with their rotations and colours.
+
+    Args:
+        splats: the Gaussians.
+        turn: [3, 3], orthogonal; mirrors too: a Gaussian is its own mirror image but for rotation and colour.
+        translation: [3], in units of the new frame.
+        scale: new units per old unit, positive.
+    """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most conversions turn nothing
+
+    x, y, z, w = Rotation.from_matrix(turn * np.linalg.det(turn)).as_quat()
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    count, coefficients, _ = splats.sh.shape
+    # rounded, so that a turn by half a circle only flips signs, and back again gives the same bytes
+    basis = _turn_harmonics(turn, coefficients).round(12).astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, or no longer is, the reader leaves out
+        colors = splats.sh.transpose(0, 2, 1).reshape(count * 3, coefficients) @ basis.T
+        means = scale * (splats.means @ turn.T)
+        return SplatArrays(
+            means=(means if translation is None else means + translation).astype(np.float32),
+            sh=colors.reshape(count, 3, coefficients).transpose(0, 2, 1),
+            opacities=splats.opacities,
+            scales=(splats.scales + np.log(scale)).astype(np.float32),
+            quats=splats.quats @ product.round(12).astype(np.float32).T,
+        )
+
+
+def _turn_harmonics(turn: np.ndarray, coefficients: int) -> np.ndarray:
+    """[K, K]: new coefficients from old, so that the colour seen along ``turn @ d`` is what was seen along d.
+
+    Real harmonics with the Condon-Shortley phase, as in the reference; exact, since a turn keeps each degree.
+    """
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    here, there = _harmonics(directions, coefficients), _harmonics(directions @ turn, coefficients)
+    return np.linalg.lstsq(here, there)[0]
+
+
+def _harmonics(directions: np.ndarray, coefficients: int) -> np.ndarray:
+    """Real spherical harmonics [M, K] along ``directions`` [M, 3] of any length."""
+    from scipy.special import sph_harm_y  # noqa: PLC0415 - as above
+
+    x, y, z = directions.T
+    polar, azimuth = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
+    columns = []
+    for degree in range(COEFFICIENTS.index(coefficients) + 1):
+        for order in range(-degree, degree + 1):
+            value = sph_harm_y(degree, abs(order), polar, azimuth)
+            columns.append(value.real if order == 0 else np.sqrt(2) * (value.imag if order < 0 else value.real))
+    return np.stack(columns, axis=1)
