@@ -27,7 +27,7 @@ CONFIG = {
 
 
 def arrays(tensors) -> dict[str, np.ndarray]:
-    return {name: tensor.detach().numpy() for name, tensor in tensors.items()}
+    return {name: tensor.detach().numpy() for name, tensor in tensors.items() if tensor is not None}
 
 
 def main(folder: Path, source: str, optimizer_type: str) -> None:
