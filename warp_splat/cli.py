@@ -16,11 +16,13 @@ from warp_splat.config import (
     CompareConfig,
     ConvertConfig,
     RenderConfig,
+    SfmConfig,
     TrainConfig,
 )
 from warp_splat.errors import InputError
 
 COMMANDS = {
+    "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
@@ -63,7 +65,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parse(arguments: list[str]) -> TrainConfig | RenderConfig | ConvertConfig | CompareConfig:
+def parse(arguments: list[str]) -> TrainConfig | RenderConfig | SfmConfig | ConvertConfig | CompareConfig:
     """The configuration that the arguments ask for.
 
     Raises:
@@ -99,6 +101,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         if isinstance(config, TrainConfig):
             from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
+        elif isinstance(config, SfmConfig):
+            from warp_splat.sfm.run import sfm as run  # noqa: PLC0415
         elif isinstance(config, ConvertConfig):
             from warp_splat.convert import convert as run  # noqa: PLC0415
         elif isinstance(config, CompareConfig):

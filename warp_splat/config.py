@@ -75,6 +75,7 @@ class TrainConfig:
     images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
     resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
     white_background: bool = flag(False, "composite on white instead of black", "-w")
+    sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = flag("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
@@ -173,6 +174,24 @@ class RenderConfig:
     orbit_output: str = flag("", "keep the orbit's frames: an .mp4 file, or a folder for PNG files")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
+    quiet: bool = flag(False, "print only the summary")
+
+
+@dataclass
+class SfmConfig:
+    """From photographs to a scene: structure from motion."""
+
+    photos: str = argument("folder of photographs, or a video")
+    scene: str = argument("the folder to write: images/ without distortion, sparse/0, and the work in sfm/")
+    frames: int = flag(150, "how many frames to take from a video: the sharpest of each of so many equal spans")
+    matching: str = flag(
+        "auto",
+        "which photographs to compare: exhaustive, all pairs; sequential, neighbors by name; auto: sequential for more "
+        "than 200 frames of a video",
+        choices=("auto", "exhaustive", "sequential"),
+    )
+    threads: int = flag(0, "CPU threads; 0: all cores")
+    seed: int = flag(0, "seed of everything random")
     quiet: bool = flag(False, "print only the summary")
 
 

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.scene.photos import PHOTOS, find_files, is_video, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View
 
 if TYPE_CHECKING:
     from warp_splat.scene.images import Photo
 
-__all__ = ["Scene", "View", "load_scene"]
+__all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
 
@@ -70,6 +71,10 @@ def _read(
     """Training and test photos as the files have them, points [P, 3], colors [P, 3]."""
     from warp_splat.scene import blender, colmap  # noqa: PLC0415  keeps `import warp_splat` light
 
+    if is_video(source):
+        raise InputError(
+            f"{source}: expected the folder of a scene, found a video without cameras; {sfm_hint(source)}."
+        )
     if not source.is_dir():
         found = "a file" if source.exists() else "nothing"
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
@@ -78,10 +83,18 @@ def _read(
         return photos, [], points, colors
     if (source / blender.TRAIN).is_file():
         return blender.read(source)
-    raise InputError(
-        f"{source} holds neither a COLMAP model (sparse/) nor {blender.TRAIN}; photographs alone have no cameras: run "
-        "COLMAP on them first, or give another folder as source."
-    )
+    expected = f"expected a scene with cameras, a COLMAP model (sparse/) or {blender.TRAIN}"
+    photographs = find_files(photo_root(source), PHOTOS)
+    if photographs:
+        raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
+    raise InputError(f"{source}: {expected}, found neither and no photographs; give another folder as source.")
+
+
+def has_cameras(source: str | Path) -> bool:
+    """Whether ``source`` looks like a scene that :func:`load_scene` reads, not like photographs alone."""
+    from warp_splat.scene import blender  # noqa: PLC0415  keeps `import warp_splat` light
+
+    return (Path(source) / "sparse").is_dir() or (Path(source) / blender.TRAIN).is_file()
 
 
 def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], list[Photo]]:
