@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -16,6 +17,8 @@ OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline the projecti
 OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard deviations reach the plane of the camera
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
+
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
 
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
 PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that follow
@@ -193,6 +196,15 @@ class SfmConfig:
     threads: int = flag(0, "CPU threads; 0: all cores")
     seed: int = flag(0, "seed of everything random")
     quiet: bool = flag(False, "print only the summary")
+
+
+@dataclass
+class InspectConfig:
+    """A scene to examine before anyone trains on it."""
+
+    scene: str = argument("scene folder (COLMAP or nerf-synthetic)")
+    images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
+    out: str = flag("", "the page to write; default: output/inspect/<name of the scene>.html", "-o")
 
 
 @dataclass

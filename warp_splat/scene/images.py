@@ -78,6 +78,11 @@ def read_lens(path: Path) -> tuple[int, int, str, float]:
     return spec.width, spec.height, spec.get_string_attribute("Model"), focal
 
 
+def has_alpha(path: Path) -> bool:
+    """Whether the image has an alpha channel. Raises InputError as :func:`read_size` does."""
+    return _open(path).spec().alpha_channel >= 0
+
+
 def read_rgb(path: Path, background: float) -> np.ndarray:
     """Read an image as [H, W, 3] float32, 0..1; gray becomes RGB, alpha is composited on ``background``.
 

@@ -18,8 +18,7 @@ import OpenImageIO  # noqa: F401 - see warp_splat.sfm.stages
 import pycolmap
 from tqdm import tqdm
 
-from warp_splat import launch
-from warp_splat.config import SfmConfig, TrainConfig
+from warp_splat.config import CORES, SfmConfig, TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_json
 from warp_splat.scene import has_cameras, images
@@ -54,7 +53,7 @@ def sfm(config: SfmConfig) -> int:
     """
     started = time.perf_counter()
     source, scene = Path(config.photos), Path(config.scene)
-    threads = min(config.threads or launch.get_threads(), launch.get_threads())
+    threads = min(config.threads or CORES, CORES)
     say = (lambda *_: None) if config.quiet else tqdm.write
     _check_numbers(config)
     _check_source(source)
