@@ -9,11 +9,11 @@ PACKAGE = Path(__file__).parents[1] / "warp_splat"
 LAYERS = [
     {"errors", "config"},
     {"kernels"},
-    {"camera", "devices", "launch", "distributed", "formats", "scene.types"},
+    {"camera", "devices", "launch", "distributed", "formats", "interrupts", "scene.types"},
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
     {"trainer", "selftest", "report", "evaluate", "gradcheck", "differences"},
-    {"train", "render", "convert"},
+    {"train", "render", "convert", "sfm", "doctor"},
     {"compare"},
     {"cli", "__init__", "__main__"},
 ]

@@ -109,7 +109,10 @@ def image_only(path):
 BAD = {
     "no-source": (lambda root: (root / "nowhere", {}), ["nowhere", "found nothing"]),
     "source-is-file": (source_is_file, ["scene.txt", "found a file"]),
-    "plain-photos": (plain_photos, ["neither a COLMAP model (sparse/) nor transforms_train.json", "run COLMAP"]),
+    "plain-photos": (
+        plain_photos,
+        ["model (sparse/) or transforms_train.json", "1 photographs alone", "warp-splat sfm"],
+    ),
     "resolution-0": (colmap_case(lambda root: None, resolution=0), ["resolution", "got 0"]),
     "resolution-negative": (colmap_case(lambda root: None, resolution=-2), ["resolution", "got -2"]),
     "eval-one-image": (no_test_left, ["at least 2 images", "found 1", "--eval"]),

@@ -15,12 +15,17 @@ from warp_splat.config import (
     PRESETS,
     CompareConfig,
     ConvertConfig,
+    InspectConfig,
     RenderConfig,
+    SfmConfig,
     TrainConfig,
 )
 from warp_splat.errors import InputError
 
+Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | CompareConfig
 COMMANDS = {
+    "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
+    "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
@@ -63,7 +68,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parse(arguments: list[str]) -> TrainConfig | RenderConfig | ConvertConfig | CompareConfig:
+def parse(arguments: list[str]) -> Config:
     """The configuration that the arguments ask for.
 
     Raises:
@@ -99,6 +104,10 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         if isinstance(config, TrainConfig):
             from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
+        elif isinstance(config, SfmConfig):
+            from warp_splat.sfm.run import sfm as run  # noqa: PLC0415
+        elif isinstance(config, InspectConfig):
+            from warp_splat.doctor.run import inspect as run  # noqa: PLC0415
         elif isinstance(config, ConvertConfig):
             from warp_splat.convert import convert as run  # noqa: PLC0415
         elif isinstance(config, CompareConfig):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -16,6 +17,8 @@ OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline the projecti
 OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard deviations reach the plane of the camera
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
+
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
 
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
 PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that follow
@@ -75,6 +78,7 @@ class TrainConfig:
     images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
     resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
     white_background: bool = flag(False, "composite on white instead of black", "-w")
+    sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = flag("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
@@ -179,6 +183,33 @@ class RenderConfig:
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
     quiet: bool = flag(False, "print only the summary")
+
+
+@dataclass
+class SfmConfig:
+    """From photographs to a scene: structure from motion."""
+
+    photos: str = argument("folder of photographs, or a video")
+    scene: str = argument("the folder to write: images/ without distortion, sparse/0, and the work in sfm/")
+    frames: int = flag(150, "how many frames to take from a video: the sharpest of each of so many equal spans")
+    matching: str = flag(
+        "auto",
+        "which photographs to compare: exhaustive, all pairs; sequential, neighbors by name; auto: sequential for more "
+        "than 200 frames of a video",
+        choices=("auto", "exhaustive", "sequential"),
+    )
+    threads: int = flag(0, "CPU threads; 0: all cores")
+    seed: int = flag(0, "seed of everything random")
+    quiet: bool = flag(False, "print only the summary")
+
+
+@dataclass
+class InspectConfig:
+    """A scene to examine before anyone trains on it."""
+
+    scene: str = argument("scene folder (COLMAP or nerf-synthetic)")
+    images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
+    out: str = flag("", "the page to write; default: output/inspect/<name of the scene>.html", "-o")
 
 
 @dataclass

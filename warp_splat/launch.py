@@ -25,6 +25,7 @@ import psutil
 import torch
 import warp as wp
 
+from warp_splat.config import CORES
 from warp_splat.devices import choose_device
 from warp_splat.errors import InputError
 
@@ -32,7 +33,7 @@ BLOCK = 256  # threads of a block: one per pixel of a tile
 MOST_THREADS = 1024
 SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
 
-_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+_threads = CORES
 _helpers: list[threading.Thread] = []
 _jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
 _seconds: dict[str, float] | None = None

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import tempfile
-import threading
 import time
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -26,6 +23,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.ply import save_points
 from warp_splat.formats.png import save_png
+from warp_splat.interrupts import interruptible
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
 from warp_splat.selftest import settle_device
@@ -75,6 +73,10 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     config.device = device.type
     if config.data_device == "cuda" and device.type != "cuda":
         raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
+    if config.sfm:
+        from warp_splat.sfm.run import scene_for  # noqa: PLC0415 - only photographs without cameras need it
+
+        config.source_path = scene_for(config, processes.count)
     config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
     if config.model_path and any(Path(config.model_path).glob("point_cloud/*/*.ply")):
         raise InputError(
@@ -105,7 +107,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     with _memory_explained(trainer):
         trainer.warm_up()
         say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
-        with _interruptible() as interrupted:
+        with interruptible() as interrupted:
             try:
                 _loop(trainer, run, interrupted)
             except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
@@ -144,22 +146,6 @@ def _memory_explained(trainer: Trainer):
         fewer.append("--data_device cpu")
     sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
     return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
-
-
-@contextmanager
-def _interruptible():
-    """Ctrl-C (and SIGTERM) ends the loop after the step at hand, so that the model is whole, and is then saved."""
-    interrupted: list[int] = []
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield interrupted
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda number, frame: interrupted.append(number)) for number in numbers]
-    try:
-        yield interrupted
-    finally:
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.scene.types import Scene, View
+from warp_splat.scene.photos import PHOTOS, find_files, is_video, photo_root, sfm_hint
+from warp_splat.scene.types import Scene, View, visible
 
 if TYPE_CHECKING:
     from warp_splat.scene.images import Photo
 
-__all__ = ["Scene", "View", "load_scene"]
+__all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
 
@@ -50,13 +51,13 @@ def load_scene(
         raise InputError(
             f"resolution: expected a positive whole number or -1, got {resolution}; see -r in warp-splat train --help."
         )
-    train, test, points, colors = _read(Path(source), images, report)
+    train, test, points, colors = read_photos(source, images, report)
     if not eval:
         train, test = train + test, []
     elif not test:
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
-    _require_visible(train, points, source)
+    require_visible(train, points, source)
 
     from warp_splat.scene.images import load_views  # noqa: PLC0415  keeps `import warp_splat` light
 
@@ -64,12 +65,21 @@ def load_scene(
     return Scene(views[: len(train)], views[len(train) :], points, colors)
 
 
-def _read(
-    source: Path, folder: str, report: Callable[[str], object]
+def read_photos(
+    source: str | Path, folder: str, report: Callable[[str], object]
 ) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
-    """Training and test photos as the files have them, points [P, 3], colors [P, 3]."""
+    """All of a scene but its pixels; see :func:`load_scene`.
+
+    Returns:
+        Training and test photos as the files have them, points [P, 3], colors [P, 3].
+    """
     from warp_splat.scene import blender, colmap  # noqa: PLC0415  keeps `import warp_splat` light
 
+    source = Path(source)
+    if is_video(source):
+        raise InputError(
+            f"{source}: expected the folder of a scene, found a video without cameras; {sfm_hint(source)}."
+        )
     if not source.is_dir():
         found = "a file" if source.exists() else "nothing"
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
@@ -78,10 +88,18 @@ def _read(
         return photos, [], points, colors
     if (source / blender.TRAIN).is_file():
         return blender.read(source)
-    raise InputError(
-        f"{source} holds neither a COLMAP model (sparse/) nor {blender.TRAIN}; photographs alone have no cameras: run "
-        "COLMAP on them first, or give another folder as source."
-    )
+    expected = f"expected a scene with cameras, a COLMAP model (sparse/) or {blender.TRAIN}"
+    photographs = find_files(photo_root(source), PHOTOS)
+    if photographs:
+        raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
+    raise InputError(f"{source}: {expected}, found neither and no photographs; give another folder as source.")
+
+
+def has_cameras(source: str | Path) -> bool:
+    """Whether ``source`` looks like a scene that :func:`load_scene` reads, not like photographs alone."""
+    from warp_splat.scene import blender  # noqa: PLC0415  keeps `import warp_splat` light
+
+    return (Path(source) / "sparse").is_dir() or (Path(source) / blender.TRAIN).is_file()
 
 
 def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], list[Photo]]:
@@ -95,14 +113,10 @@ def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], lis
     return train, photos[::HOLD_OUT]
 
 
-def _require_visible(photos: list[Photo], points: np.ndarray, source: str | Path) -> None:
+def require_visible(photos: list[Photo], points: np.ndarray, source: str | Path) -> None:
     """Refuse a scene that would only render black, as one in another tool's axes does."""
-    for camera in (photo.camera for photo in photos):
-        x, y, z = camera.rotation @ points.T + camera.translation[:, None]
-        in_width = (x * camera.fx + z * camera.cx >= 0) & (x * camera.fx + z * camera.cx <= z * camera.width)
-        in_height = (y * camera.fy + z * camera.cy >= 0) & (y * camera.fy + z * camera.cy <= z * camera.height)
-        if ((z > 0) & in_width & in_height).any():
-            return
+    if any(visible(photo.camera, points).any() for photo in photos):
+        return
     raise InputError(
         f"{source}: expected points in front of the cameras, but none of the {len(photos)} training cameras sees any "
         f"of the {len(points)} points; the poses' axes are probably mixed up: COLMAP has world to camera in OpenCV "

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
 import pycolmap
 
 from warp_splat.camera import Camera
@@ -47,7 +48,12 @@ def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[li
     return _photos(where, registered, source / folder, report), points, colors
 
 
-def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path, pycolmap.Reconstruction]:
+def find_models(sparse: Path) -> list[Path]:
+    """Folders with a COLMAP model: ``sparse``/0, ``sparse`` itself, further sub-folders; not yet read.
+
+    Raises:
+        InputError: if there is none.
+    """
     folders = dict.fromkeys([sparse / "0", sparse, *sorted(path for path in sparse.iterdir() if path.is_dir())])
     folders = [path for path in folders if any((path / f"cameras.{kind}").is_file() for kind in ("bin", "txt"))]
     if not folders:
@@ -55,7 +61,12 @@ def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path,
             f"{sparse}: expected a COLMAP model (cameras, images and points3D as .bin or .txt) there or in a "
             "sub-folder such as 0, found none; run COLMAP's mapper or copy its model there."
         )
-    models = {path: _read_model(path) for path in folders}
+    return folders
+
+
+def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path, pycolmap.Reconstruction]:
+    folders = find_models(sparse)
+    models = {path: read_model(path) for path in folders}
     largest = max(folders, key=lambda path: models[path].num_reg_images())
     if len(folders) > 1:
         counts = ", ".join(f"{path.relative_to(sparse.parent)}: {models[path].num_reg_images()}" for path in folders)
@@ -63,7 +74,8 @@ def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path,
     return largest, models[largest]
 
 
-def _read_model(folder: Path) -> pycolmap.Reconstruction:
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read the model in ``folder``, binary or text. Raises InputError if it is cut short, damaged or unknown."""
     for name, end in (("cameras.bin", _cameras_end), ("images.bin", _images_end), ("points3D.bin", _points_end)):
         if (folder / name).is_file():
             _check_length(folder / name, end)
@@ -156,11 +168,11 @@ def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: C
             f"{root}: expected the {len(registered)} images of {where}, but {len(missing)} of them cannot be found, "
             f"the first is {missing[0]!r}; copy them there or choose another folder with --images."
         )
-    sampling = functools.lru_cache(maxsize=images.THREADS)(_sampling)  # lives as long as the photos
+    sampling = functools.lru_cache(maxsize=images.THREADS)(sampling_of)  # lives as long as the photos
     photos, scaled, distorted = [], 0, []
     for image in registered:
         size = images.read_size(root / image.name)
-        photos.append(_photo(image, root / image.name, size, sampling))
+        photos.append(make_photo(image, root / image.name, size, sampling))
         scaled += size != (image.camera.width, image.camera.height)
         distorted += [] if photos[-1].sampling is None else [image.camera.model_name]
     if scaled:
@@ -171,7 +183,12 @@ def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: C
     return photos
 
 
-def _photo(image: pycolmap.Image, path: Path, size: tuple[int, int], sampling: Callable[..., np.ndarray]) -> Photo:
+def make_photo(image: pycolmap.Image, path: Path, size: tuple[int, int], sampling: Callable[..., np.ndarray]) -> Photo:
+    """The photo of a registered image whose file has ``size`` = (width, height) pixels.
+
+    Raises:
+        InputError: if the size does not fit the model's camera, or its lens cannot become a pinhole.
+    """
     lens = image.camera
     # The same factor for both sides, up to the rounding of either to whole pixels.
     if abs(size[0] * lens.height - size[1] * lens.width) >= lens.width + lens.height:
@@ -215,7 +232,7 @@ def _undistorted(lens: pycolmap.Camera) -> pycolmap.Camera:
         ) from error
 
 
-def _sampling(*key: object) -> np.ndarray:
+def sampling_of(*key: object) -> np.ndarray:
     """Where in the distorted image each pixel of the undistorted one lies, for :func:`images.undistort`."""
     lens = _lens(*key)
     pinhole = _undistorted(lens)

@@ -67,6 +67,22 @@ def read_size(path: Path) -> tuple[int, int]:
     return spec.width, spec.height
 
 
+def read_lens(path: Path) -> tuple[int, int, str, float]:
+    """What photographs taken through one lens share: width and height [px], the camera's model, focal length [mm].
+
+    Raises:
+        InputError: if the file is not an image that OpenImageIO reads.
+    """
+    spec = _open(path).spec()
+    focal = spec.get_float_attribute("Exif:FocalLength")
+    return spec.width, spec.height, spec.get_string_attribute("Model"), focal
+
+
+def has_alpha(path: Path) -> bool:
+    """Whether the image has an alpha channel. Raises InputError as :func:`read_size` does."""
+    return _open(path).spec().alpha_channel >= 0
+
+
 def read_rgb(path: Path, background: float) -> np.ndarray:
     """Read an image as [H, W, 3] float32, 0..1; gray becomes RGB, alpha is composited on ``background``.
 

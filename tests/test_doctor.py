@@ -1,0 +1,199 @@
+"""The scene doctor finds what was broken on purpose, and nothing else."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scene_files import texture, write_blender, write_colmap, write_image
+from test_scene_input import BAD
+
+from warp_splat.cli import main
+from warp_splat.doctor import geometry
+from warp_splat.doctor.subject import read_subject
+
+EMBEDDED = Path(__file__).parents[1] / "assets" / "still_life"
+
+
+@pytest.fixture
+def life(tmp_path):
+    """A copy of the embedded scene that may be damaged."""
+    shutil.copytree(EMBEDDED, tmp_path / "life")
+    return tmp_path / "life"
+
+
+def examine(scene, tmp_path, capsys, code):
+    """Findings as (level, check, text), with the page."""
+    page = tmp_path / "page.html"
+    assert main(["inspect", str(scene), "-o", str(page)]) == code
+    lines = [re.fullmatch(r"(\w+) +(.{13}) (.*)", line) for line in capsys.readouterr().out.splitlines()]
+    return [(m[1], m[2].strip(), m[3]) for m in lines if m and m[1] in ("ok", "note", "warning", "error")], page
+
+
+def worst(findings):
+    return {(level, check) for level, check, _ in findings if level in ("warning", "error")}
+
+
+def change_model(scene, change):
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    change(model)
+    for path in (scene / "sparse" / "0").iterdir():
+        path.unlink()
+    model.write_binary(scene / "sparse" / "0")
+
+
+def test_a_good_scene_has_no_finding(tmp_path, capsys):
+    findings, page = examine(EMBEDDED, tmp_path, capsys, 0)
+    assert not worst(findings)
+    html = page.read_text()
+    assert html.count('src="data:image/jpeg;base64,') == html.count("<img") == 4
+    assert "http" not in html and "<script" not in html
+    assert {check for _, check, _ in findings} >= {
+        "cameras", "intrinsics", "sizes", "files", "sub-models", "reprojection", "coverage", "unseen points",
+        "axes", "duplicates", "masks", "loading", "forecast",
+    }  # fmt: skip
+
+
+def test_the_reprojection_error_is_that_of_pycolmap(capsys):
+    subject, _ = read_subject(EMBEDDED, "images")
+    measured = geometry.Measured()
+    geometry.check_reprojection(subject, measured)
+    errors = np.concatenate(list(measured.errors.values()))
+    subject.model.update_point_3d_errors()
+    points = subject.model.points3D.values()
+    expected = sum(point.error * point.track.length() for point in points) / len(errors)
+    assert np.isclose(errors.mean(), expected, rtol=1e-6)
+
+
+def push(image, by):
+    pose = image.cam_from_world()
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + by)
+
+
+def move(model, count, place):
+    for point in list(model.points3D.values())[:count]:
+        point.xyz = place
+
+
+def turn_all(model, turn):
+    for number in model.reg_image_ids():
+        image = model.image(number)
+        pose = turn(image.cam_from_world())
+        image.frame.rig_from_world = pose
+
+
+FLIP = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag((1.0, -1.0, -1.0))), np.zeros(3))
+DAMAGE = {
+    "missing": (lambda s: (s / "images" / "view_003.png").unlink(), ("error", "files"), "view_003.png"),
+    "other ending": (
+        lambda s: (s / "images" / "view_003.png").rename(s / "images" / "view_003.tif"),
+        ("error", "files"),
+        "view_003.tif has the same stem",
+    ),
+    "size": (
+        lambda s: write_image(s / "images" / "view_003.png", texture(200, 264)),
+        ("error", "sizes"),
+        "264 x 248",
+    ),
+    "cut": (
+        lambda s: (s / "images" / "view_003.png").write_bytes((s / "images" / "view_003.png").read_bytes()[:9000]),
+        ("error", "files"),
+        "view_003.png",
+    ),
+    "sub-models": (
+        lambda s: shutil.copytree(s / "sparse" / "0", s / "sparse" / "1"),
+        ("warning", "sub-models"),
+        "sparse/1",
+    ),
+    "one pose": (
+        lambda s: change_model(s, lambda model: push(model.image(sorted(model.reg_image_ids())[3]), (0.3, 0, 0))),
+        ("warning", "reprojection"),
+        "1 images are much worse",
+    ),
+    "OpenGL axes": (
+        lambda s: change_model(s, lambda model: turn_all(model, lambda pose: FLIP * pose)),
+        ("error", "axes"),
+        "with OpenGL axes",
+    ),
+    "camera to world": (
+        lambda s: change_model(s, lambda model: turn_all(model, lambda pose: pose.inverse())),
+        ("error", "axes"),
+        "with camera-to-world the",
+    ),
+    "focal length": (
+        lambda s: change_model(s, lambda model: setattr(model.cameras[1], "params", (30.0, 30.0, 130, 125))),
+        ("error", "reprojection"),
+        "do not belong together",
+    ),
+    "same bytes": (
+        lambda s: shutil.copy(s / "images" / "view_003.png", s / "images" / "view_004.png"),
+        ("warning", "duplicates"),
+        "view_003.png = view_004.png",
+    ),
+    "some alpha": (
+        lambda s: write_image(s / "images" / "view_003.png", texture(264, 248, 4)),
+        ("warning", "alpha"),
+        "1 of 50",
+    ),
+    "some masks": (
+        lambda s: write_image(s / "masks" / "view_003.png.png", texture(264, 248, 1)),
+        ("warning", "masks"),
+        "masks for 1 of 50",
+    ),
+    "far points": (
+        lambda s: change_model(
+            s, lambda model: [setattr(p, "xyz", (1e6, 0, 0)) for p in list(model.points3D.values())[:9]]
+        ),
+        ("warning", "points"),
+        "9 of 4500",
+    ),
+    "unseen points": (
+        lambda s: change_model(
+            s, lambda model: [setattr(p, "xyz", (0, 0, 40)) for p in list(model.points3D.values())[:900]]
+        ),
+        ("warning", "unseen points"),
+        "20.0 %",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_damage_is_found(life, tmp_path, capsys, monkeypatch, case):
+    monkeypatch.setattr("warp_splat.doctor.run.draw", lambda subject, measured: ())  # takes long
+    damage, (level, check), text = DAMAGE[case]
+    damage(life)
+    findings, _ = examine(life, tmp_path, capsys, 1 if level == "error" else 0)
+    assert any(text in what for found, name, what in findings if (found, name) == (level, check)), findings
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case):
+    monkeypatch.setattr("warp_splat.doctor.run.draw", lambda subject, measured: ())
+    source, options = BAD[case][0](tmp_path)
+    if options.keys() - {"images"}:
+        return  # of the resolution or the split, which this command does not have
+    folder = options.get("images", "images")
+    assert main(["inspect", str(source), "-o", str(tmp_path / "page.html"), "-i", folder]) == 1
+    assert "Traceback" not in "".join(capsys.readouterr())
+
+
+def test_text_of_the_scene_is_not_html(tmp_path, capsys):
+    name = "<script>alert(1)</script>.png".replace("/", "_")
+    findings, page = examine(write_colmap(tmp_path / "a", names=(name, "b.png", "c.png")), tmp_path, capsys, 0)
+    (tmp_path / "a" / "images" / name).unlink()
+    findings, page = examine(tmp_path / "a", tmp_path, capsys, 1)
+    assert any(name in text for _, _, text in findings) and "<script" not in page.read_text()
+
+
+def test_nerf_synthetic_scenes_are_examined(tmp_path, capsys):
+    findings, _ = examine(write_blender(tmp_path / "a"), tmp_path, capsys, 0)
+    assert worst(findings) == {("warning", "cameras"), ("warning", "duplicates")}  # three images, all the same
+
+
+def test_a_folder_that_is_no_scene_gets_one_sentence(tmp_path, capsys):
+    write_image(tmp_path / "photos" / "a.png", texture())
+    assert main(["inspect", str(tmp_path / "photos")]) == 1
+    assert "warp-splat sfm" in capsys.readouterr().err
+    assert not (tmp_path / "output").exists()

@@ -1,0 +1,249 @@
+"""Photographs and videos to scenes, against the cameras that took them."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pycolmap
+import pytest
+import room
+from scene_files import texture, write_blender, write_image
+from scipy.ndimage import gaussian_filter
+
+from warp_splat.cli import main
+from warp_splat.config import SfmConfig, TrainConfig
+from warp_splat.errors import InputError
+from warp_splat.formats.png import save_video
+from warp_splat.scene import load_scene
+from warp_splat.sfm.run import scene_for, sfm
+from warp_splat.sfm.video import sample_frames
+
+COUNT = 6
+FILES = ["cameras.bin", "images.bin", "points3D.bin"]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """A folder of photographs, and the centers of their cameras."""
+    folder = tmp_path_factory.mktemp("room") / "photos"
+    return folder, room.write_photos(folder, COUNT)
+
+
+@pytest.fixture(scope="module")
+def scene(photos):
+    folder = photos[0].parent / "scene"
+    assert main(["sfm", str(photos[0]), str(folder), "--quiet"]) == 0
+    return folder
+
+
+def model_bytes(scene):
+    return [(scene / "sparse" / "0" / name).read_bytes() for name in FILES]
+
+
+def start(photos, scene):
+    return subprocess.Popen(
+        [sys.executable, "-m", "warp_splat", "sfm", str(photos), str(scene)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_the_cameras_are_found(photos, scene):
+    views = load_scene(scene, report=pytest.fail).train
+    truth = photos[1]
+    assert {view.name for view in views} == set(truth)
+    found = np.array([view.camera.center for view in views])
+    expected = np.array([truth[view.name] for view in views])
+    fitted = pycolmap.estimate_sim3d(found, expected)
+    errors = np.linalg.norm(
+        [fitted * center - center_true for center, center_true in zip(found, expected, strict=True)]
+    )
+    assert errors.max() < 0.01  # the camera goes along 2 units
+    for view in views:
+        assert abs(view.camera.fx / room.FOCAL - 1) < 0.01 and abs(view.camera.fy / room.FOCAL - 1) < 0.01
+
+
+def test_the_scene_is_said_to_be_complete(photos, scene, capsys):
+    before = {path: path.stat().st_mtime_ns for path in (scene / "sparse").rglob("*")}
+    assert sfm(SfmConfig(str(photos[0]), str(scene))) == 0
+    text = capsys.readouterr().out
+    summary = json.loads((scene / "sfm" / "summary.json").read_text())
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    assert "complete already" in text and f"{COUNT} of {COUNT} photographs registered" in text
+    assert summary["registered"] == model.num_reg_images() == COUNT
+    assert summary["points"] == model.num_points3D() > 100
+    assert 0 < summary["reprojection_error_px"] < 1
+    assert {path: path.stat().st_mtime_ns for path in (scene / "sparse").rglob("*")} == before
+    assert sorted(path.name for path in scene.iterdir()) == ["images", "sfm", "sparse"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_run_goes_on_and_finds_the_same(photos, scene, tmp_path, number):
+    stopped = 0
+    for delay in np.linspace(1.0, 6.0, 6):
+        run = start(photos[0], tmp_path / "scene")
+        time.sleep(delay)
+        run.send_signal(number)
+        text = run.communicate()[0]
+        stopped += run.returncode != 0
+        assert run.returncode in (0, 130, -number), text
+        assert "Traceback" not in text
+        assert not (tmp_path / "scene" / "sparse").exists() or run.returncode in (0, -number)
+    assert stopped
+    assert main(["sfm", str(photos[0]), str(tmp_path / "scene"), "--quiet"]) == 0
+    assert model_bytes(tmp_path / "scene") == model_bytes(scene)
+
+
+def test_photographs_that_cannot_be_read_are_left_out(photos, tmp_path, capsys):
+    folder = tmp_path / "photos"
+    for index, name in enumerate(photos[1]):
+        data = (photos[0] / name).read_bytes()
+        (folder / "a b").mkdir(parents=True, exist_ok=True)
+        (folder / "a b" / name).write_bytes(data[: len(data) // 2] if index == 0 else data)
+    (folder / "notes.txt").write_text("not a photograph")
+    assert sfm(SfmConfig(str(folder), str(tmp_path / "scene"))) == 0
+    text = capsys.readouterr().out
+    assert "leaving out" in text and "unreadable: a b/photo_0.png" in text
+    assert len(load_scene(tmp_path / "scene", report=print).train) == COUNT - 1
+
+
+def cannot(run, *words):
+    with pytest.raises(InputError) as caught:
+        run()
+    sentence = str(caught.value)
+    assert sentence.endswith(".") and "\n" not in sentence
+    for word in words:
+        assert word in sentence
+    return sentence
+
+
+def flat_photos(folder, count=4):
+    for index in range(count):
+        write_image(folder / f"{index}.png", np.full((64, 64, 3), 40 * index, np.uint8))
+
+
+def nothing(folder):
+    folder.mkdir()
+
+
+def heic(folder):
+    folder.mkdir()
+    (folder / "IMG_1.HEIC").write_bytes(b"x")
+
+
+def video_inside(folder):
+    folder.mkdir()
+    (folder / "a.mp4").write_bytes(b"x")
+
+
+def two_photos(folder):
+    flat_photos(folder, 2)
+
+
+def broken_photos(folder):
+    flat_photos(folder)
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:60])
+
+
+BAD_PHOTOS = {
+    "missing": (lambda folder: None, ["found nothing"]),
+    "a file": (lambda folder: folder.write_text("x"), ["expected a folder of photographs or a video"]),
+    "empty": (nothing, ["found none", "check the path"]),
+    "heic": (heic, ["IMG_1.HEIC", "convert"]),
+    "video inside": (video_inside, ["name the video itself", "a.mp4"]),
+    "two": (two_photos, ["at least 3 photographs", "found 2"]),
+    "broken": (broken_photos, ["at least 3 photographs", "found 0"]),
+    "without texture": (flat_photos, ["0 of 4 photographs could be registered", "overlap"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PHOTOS)
+def test_bad_photographs_get_one_sentence(tmp_path, case):
+    make, words = BAD_PHOTOS[case]
+    make(tmp_path / "photos")
+    cannot(lambda: sfm(SfmConfig(str(tmp_path / "photos"), str(tmp_path / "scene"), quiet=True)), "photos", *words)
+
+
+def test_a_folder_in_use_stays_as_it_is(photos, scene, tmp_path):
+    other = write_blender(tmp_path / "other")
+    before = sorted(other.rglob("*"))
+    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(other))), "other", "in use")
+    assert sorted(other.rglob("*")) == before
+    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(photos[0]))), "another folder")
+    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(scene), seed=1)), "begun with others")
+    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "x"), frames=2)), "--frames")
+
+
+def test_a_damaged_database_gets_one_sentence(photos, scene, tmp_path):
+    shutil.copytree(scene / "sfm", tmp_path / "scene" / "sfm")
+    (tmp_path / "scene" / "sfm" / "database.db").write_bytes(b"SQLite format 3\0" + bytes(5000))
+    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "scene"), quiet=True)), "sfm", "remove this folder")
+
+
+def test_training_on_photographs_alone_names_the_command(photos, tmp_path):
+    folder = tmp_path / "my photos"
+    flat_photos(folder, 4)
+    sentence = cannot(lambda: load_scene(folder), "4 photographs alone", "--sfm")
+    assert f"`warp-splat sfm '{folder}' '{folder}_scene'`" in sentence
+    (tmp_path / "clip.mp4").write_bytes(b"x")
+    cannot(
+        lambda: load_scene(tmp_path / "clip.mp4"), "a video", f"sfm {tmp_path / 'clip.mp4'} {tmp_path / 'clip_scene'}"
+    )
+
+
+def test_training_with_sfm_makes_the_scene_once(photos, capsys):
+    source, made = str(photos[0]), f"{photos[0]}_scene"
+    config = TrainConfig(source_path=source, sfm=True, quiet=True)
+    assert scene_for(config, 1) == made and len(load_scene(made).train) == COUNT
+    assert scene_for(TrainConfig(source_path=made, sfm=True), 1) == made
+    cannot(lambda: scene_for(config, 2), "one process", "warp-splat sfm")
+
+
+def test_the_sharpest_frame_of_each_span_is_taken(tmp_path):
+    """12 frames of 6 spans: of each pair one is blurred."""
+    textures = room.walls()
+    frames = [room.photo(index / 11, textures) for index in range(12)]
+    sharp = [0, 3, 4, 6, 9, 11]
+    mixed = [frame if index in sharp else gaussian_filter(frame, (2, 2, 0)) for index, frame in enumerate(frames)]
+    save_video(tmp_path / "clip.mp4", mixed, 25)
+    (tmp_path / "frames").mkdir()
+    shares = []
+    written = sample_frames(tmp_path / "clip.mp4", tmp_path / "frames", 6, 2, pytest.fail, shares.append)
+    taken = sorted(int(re.search(r"\d+", path.name)[0]) for path in (tmp_path / "frames").iterdir())
+    assert written == 6 and taken == sharp and shares == sorted(shares)
+
+
+def test_a_video_becomes_a_scene(tmp_path, capsys):
+    textures = room.walls()
+    save_video(tmp_path / "clip.mp4", [room.photo(index / 11, textures) for index in range(12)], 25)
+    assert sfm(SfmConfig(str(tmp_path / "clip.mp4"), str(tmp_path / "scene"), frames=COUNT)) == 0
+    assert "6 sharp frames" in capsys.readouterr().out
+    assert len(load_scene(tmp_path / "scene", report=print).train) == COUNT
+
+
+@pytest.mark.parametrize(("keep", "words"), [(0, ["FFmpeg"]), (0.2, ["clip.mp4"])])
+def test_a_video_that_cannot_be_decoded_gets_one_sentence(tmp_path, keep, words):
+    save_video(tmp_path / "clip.mp4", [texture(64, 64)] * 12, 25)
+    data = (tmp_path / "clip.mp4").read_bytes()
+    (tmp_path / "clip.mp4").write_bytes(data[: int(len(data) * keep)] or b"nothing of a video")
+    config = SfmConfig(str(tmp_path / "clip.mp4"), str(tmp_path / "scene"), quiet=True)
+    cannot(lambda: sfm(config), *words)
+
+
+def test_png_files_can_be_written_after_pycolmap_was_loaded(tmp_path):
+    """The libraries in pycolmap's wheel clash with those in OpenImageIO's if they are loaded first."""
+    code = (
+        "import sys, warp_splat.scene.colmap, numpy as np; from warp_splat.formats.png import save_png; "
+        "save_png(sys.argv[1], np.zeros((8, 8, 3), np.uint8))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], env=os.environ, check=False)
+    assert done.returncode == 0

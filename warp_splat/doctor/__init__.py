@@ -1,0 +1,1 @@
+"""``warp-splat inspect``: what is wrong with a scene, before anyone trains on it."""

@@ -1,0 +1,171 @@
+"""What is examined: all of a scene that can be read, and a finding for each thing that cannot."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import OpenImageIO as oiio
+import pycolmap
+
+from warp_splat.errors import InputError
+from warp_splat.scene import blender, colmap, images
+from warp_splat.scene.images import Photo
+
+Level = Literal["ok", "note", "warning", "error"]
+NAMED = 3  # things that a finding names
+THUMBNAIL = 240  # px, the longer side
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A verdict: which check, how bad, and one sentence."""
+
+    check: str
+    level: Level
+    text: str
+
+
+@dataclass
+class Subject:
+    """A scene as far as it can be read."""
+
+    source: Path
+    root: Path  # of the images
+    photos: list[Photo] = field(default_factory=list)  # whose file and camera fit each other
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [P, 3] float64, finite
+    model: pycolmap.Reconstruction | None = None  # of a COLMAP scene
+    random_points: bool = False  # not measured, but drawn: of a nerf-synthetic scene
+    thumbnails: dict[str, np.ndarray] = field(default_factory=dict)  # by name, [h, w, 3] uint8
+    alpha: list[str] = field(default_factory=list)  # names of images with an alpha channel
+
+
+def few(names: Iterable[str]) -> str:
+    """The first names, and how many more there are."""
+    names = list(names)
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more
+
+
+def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
+    """Read what can be read of the scene in ``source``, with its images in ``folder`` if it is COLMAP's."""
+    if (source / "sparse").is_dir():
+        subject, findings = _read_colmap(source, source / folder)
+    else:
+        subject, findings = Subject(source, source, random_points=True), []
+        try:
+            train, test, subject.points, _ = blender.read(source)
+            subject.photos = train + test
+        except InputError as error:
+            findings.append(Finding("transforms", "error", str(error)))
+    findings += _decode(subject)
+    return subject, findings
+
+
+def _read_colmap(source: Path, root: Path) -> tuple[Subject, list[Finding]]:
+    subject, findings, models = Subject(source, root), [], {}
+    try:
+        folders = colmap.find_models(source / "sparse")
+    except InputError as error:
+        return subject, [Finding("model", "error", str(error))]
+    for path in folders:
+        try:
+            models[path] = colmap.read_model(path)
+        except InputError as error:
+            findings.append(Finding("model", "error", str(error)))
+    if not models:
+        return subject, findings
+    counts = {path.relative_to(source).as_posix(): model.num_reg_images() for path, model in models.items()}
+    largest = max(models, key=lambda path: models[path].num_reg_images())
+    if len(models) > 1:
+        text = f"training takes the largest, {largest.relative_to(source)}; the images of the others are lost."
+        findings.append(Finding("sub-models", "warning", f"{len(models)} models {counts}: {text}"))
+    else:
+        text = f"one model, {largest.relative_to(source)}, with {counts.popitem()[1]} registered images."
+        findings.append(Finding("sub-models", "ok", text))
+    subject.model = models[largest]
+    xyz = np.array([point.xyz for point in subject.model.points3D.values()], np.float64).reshape(-1, 3)
+    subject.points = xyz[np.isfinite(xyz).all(axis=1)]
+    if len(subject.points) < len(xyz):
+        text = f"{len(xyz) - len(subject.points)} of {len(xyz)} points are not finite; training leaves them out."
+        findings.append(Finding("points", "warning", text))
+    return subject, findings + _match_files(subject)
+
+
+def _match_files(subject: Subject) -> list[Finding]:
+    """Find the file of each registered image and compare its size with the camera's; fills ``subject.photos``."""
+    model = subject.model
+    registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+    if not registered:
+        return [Finding("files", "error", "the model has no registered images; run the mapper again.")]
+    findings, missing, scaled = [], [], []
+    sampling = functools.lru_cache(maxsize=images.THREADS)(colmap.sampling_of)
+    for image in registered:
+        path = subject.root / image.name
+        if not path.is_file():
+            missing.append(image.name)
+            continue
+        try:
+            size = images.read_size(path)
+        except InputError as error:
+            findings.append(Finding("files", "error", str(error)))
+            continue
+        try:
+            subject.photos.append(colmap.make_photo(image, path, size, sampling))
+        except InputError as error:
+            findings.append(Finding("sizes", "error", str(error)))
+        if size != (image.camera.width, image.camera.height):
+            scaled.append(image.name)
+    if missing:
+        text = f"{len(missing)} of {len(registered)} images are missing in {subject.root}: {few(missing)}"
+        findings.append(Finding("files", "error", f"{text}; {_missing_hint(subject.root, missing)}."))
+    wrong = any(finding.check == "sizes" for finding in findings)
+    if scaled and not wrong:
+        text = f"{len(scaled)} images have another size than their cameras ({few(scaled)}); the cameras are scaled."
+        findings.append(Finding("sizes", "note", text))
+    elif not wrong and subject.photos:
+        findings.append(Finding("sizes", "ok", "every image has the size that its camera says."))
+    return findings
+
+
+def _missing_hint(root: Path, missing: list[str]) -> str:
+    if not root.is_dir():
+        return "there is no such folder; name another with --images"
+    stems = {path.stem: path.name for path in root.iterdir()}
+    other = next((stems[Path(name).stem] for name in missing if Path(name).stem in stems), None)
+    return f"{other} has the same stem, but not the same ending" if other else "copy them there"
+
+
+def _decode(subject: Subject) -> list[Finding]:
+    """Read every image to its end; fills the thumbnails."""
+
+    def read(photo: Photo) -> tuple[np.ndarray, bool] | str:
+        try:
+            image = images.read_rgb(photo.path, 0.0)
+            scale = THUMBNAIL / max(image.shape[:2])
+            size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+            roi = oiio.ROI(0, size[0], 0, size[1], 0, 1, 0, 3)
+            small = oiio.ImageBufAlgo.resample(oiio.ImageBuf(np.ascontiguousarray(image)), roi=roi, nthreads=1)
+            pixels = np.asarray(small.get_pixels(oiio.FLOAT))
+            return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), images.has_alpha(photo.path)
+        except InputError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(images.THREADS) as pool:
+        outcomes = list(pool.map(read, subject.photos))
+    findings = []
+    for photo, outcome in zip(subject.photos, outcomes, strict=True):
+        if isinstance(outcome, str):
+            findings.append(Finding("files", "error", outcome))
+        else:
+            subject.thumbnails[photo.name] = outcome[0]
+            subject.alpha += [photo.name] if outcome[1] else []
+    if not findings and subject.photos:
+        text = f"{len(subject.photos)} images of {subject.root} were read to their ends."
+        findings.append(Finding("files", "ok", text))
+    return findings

@@ -1,0 +1,264 @@
+"""``warp-splat sfm``: photographs or a video in, a scene to train on out, and what came of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import OpenImageIO  # noqa: F401 - see warp_splat.sfm.stages
+import pycolmap
+from tqdm import tqdm
+
+from warp_splat.config import CORES, SfmConfig, TrainConfig
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import write_json
+from warp_splat.scene import has_cameras, images
+from warp_splat.scene.photos import (
+    OTHER_PHOTOS,
+    PHOTOS,
+    VIDEOS,
+    find_files,
+    is_video,
+    photo_root,
+    scene_of,
+    sfm_hint,
+)
+from warp_splat.sfm import stages
+
+WORK = "sfm"  # the folder of the work inside the scene: what resuming needs
+LEAST = 3  # registered photographs; a scene of fewer shows nothing from another side
+FEW = 0.6  # share of registered photographs below which the user is told what to do
+EXHAUSTIVE_FRAMES = 200  # of a video: 20,000 pairs
+NAMED = 5  # photographs that a message names
+ADVICE = (
+    "photographs should overlap by two thirds, show texture, be sharp, and be taken from different places, not by "
+    "turning on the spot"
+)
+
+
+def sfm(config: SfmConfig) -> int:
+    """Compute cameras as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the photographs or the folder cannot be used, or too few photographs fit together.
+    """
+    started = time.perf_counter()
+    source, scene = Path(config.photos), Path(config.scene)
+    threads = min(config.threads or CORES, CORES)
+    say = (lambda *_: None) if config.quiet else tqdm.write
+    _check_numbers(config)
+    _check_source(source)
+    work = _claim(source, scene, config)
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its progress is ours to tell
+    pycolmap.set_random_seed(config.seed)
+    if (scene / "sparse").is_dir():
+        say(f"{scene} is complete already; remove it to start anew.")
+    else:
+        root = _frames(source, work, config, threads, say) if is_video(source) else photo_root(source)
+        names = find_files(root, PHOTOS, None if is_video(source) else scene)
+        with _explained(work):
+            _reconstruct(root, names, scene, work, config, threads, say)
+        _note_time(work, time.perf_counter() - started)
+    _summarize(scene, json.loads((work / "summary.json").read_text()))
+    return 0
+
+
+def scene_for(config: TrainConfig, processes: int) -> str:
+    """The scene to train on: the source if it has cameras; otherwise one beside it, made or completed now.
+
+    Raises:
+        InputError: as :func:`sfm`; if there are several processes, which would all do the same.
+    """
+    source = Path(config.source_path)
+    if not config.source_path or has_cameras(source):
+        return config.source_path
+    if processes > 1:
+        raise InputError(f"--sfm: expected one process, found {processes}; {sfm_hint(source)}")
+    scene = str(scene_of(source))
+    sfm(SfmConfig(config.source_path, scene, threads=config.threads, seed=config.seed % 2**31, quiet=config.quiet))
+    return scene
+
+
+@contextmanager
+def _explained(work: Path) -> Iterator[None]:
+    """Turn what pycolmap raises, of a full disk or a damaged database, into a sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(
+            f"{work}: pycolmap cannot go on there ({reason}); free some space if the disk is full and run again, or "
+            "remove this folder to start anew."
+        ) from error
+
+
+def _check_numbers(config: SfmConfig) -> None:
+    for name, low in (("frames", LEAST), ("threads", 0), ("seed", 0)):
+        if not low <= getattr(config, name) < 2**31:
+            raise InputError(f"--{name}: expected {low} to 2^31 - 1, got {getattr(config, name)}.")
+
+
+def _check_source(source: Path) -> None:
+    if source.is_dir() or is_video(source):
+        return
+    found = f"a file ending in {source.suffix!r}" if source.is_file() else "nothing"
+    raise InputError(
+        f"{source}: expected a folder of photographs or a video ({', '.join(VIDEOS)}), found {found}; check the path."
+    )
+
+
+def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
+    """The folder of the work in ``scene``, which is new, or was begun on the same input with the same options."""
+    work, options = scene / WORK, {name: getattr(config, name) for name in ("frames", "matching", "seed")}
+    if source.resolve() == scene.resolve():
+        raise InputError(f"{scene}: expected another folder than that of the photographs for the scene; choose one.")
+    if source.is_dir():
+        files = [(name, photo_root(source) / name) for name in find_files(photo_root(source), PHOTOS, scene)]
+        if not files:
+            raise _nothing_found(source)
+    else:
+        files = [(source.name, source)]
+    record = {"options": options, "files": {name: path.stat().st_size for name, path in files}}
+    if (work / "input.json").is_file():
+        try:
+            before = json.loads((work / "input.json").read_text(encoding="utf-8"))
+        except ValueError:
+            before = None
+        if before != record:
+            raise InputError(
+                f"{scene}: expected a folder begun with the same photographs and options, but this one was begun with "
+                "others; choose another folder, or remove this one."
+            )
+    elif scene.exists() and (not scene.is_dir() or any(scene.iterdir())):
+        raise InputError(f"{scene}: expected a new or empty folder, found one that is in use; choose another.")
+    else:
+        write_json(work / "input.json", record)
+    return work
+
+
+def _nothing_found(source: Path) -> InputError:
+    others, videos = (find_files(photo_root(source), endings) for endings in (OTHER_PHOTOS, VIDEOS))
+    hint = "check the path"
+    if others:
+        hint = f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG"
+    elif videos:
+        hint = f"name the video itself: {shlex.quote(str(photo_root(source) / videos[0]))}"
+    return InputError(f"{source}: expected photographs ({', '.join(PHOTOS)}), found none; {hint}.")
+
+
+def _frames(video: Path, work: Path, config: SfmConfig, threads: int, say) -> Path:
+    """The folder of the frames taken from ``video``."""
+    from warp_splat.sfm.video import sample_frames  # noqa: PLC0415 - only videos need PyAV
+
+    frames, part = work / "frames", work / "frames.part"
+    if not frames.is_dir():
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        with tqdm(total=100, desc="frames", unit="%", disable=config.quiet) as bar:
+            count = sample_frames(video, part, config.frames, threads, say, lambda share: bar.update(share - bar.n))
+            bar.update(100 - bar.n)
+        if count < LEAST:
+            raise InputError(f"{video}: expected a video of at least {LEAST} frames, {count} could be decoded.")
+        os.replace(part, frames)
+    say(f"{len(find_files(frames, PHOTOS))} sharp frames of {video.name} in {frames}")
+    return frames
+
+
+def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: SfmConfig, threads: int, say) -> None:
+    """All stages, the largest model as the scene, and a summary of it in the folder ``work``."""
+    groups, broken = _groups(root, names, threads, say)
+    names = [name for group in groups for name in group]
+    if len(names) < LEAST:
+        raise InputError(
+            f"{root}: expected at least {LEAST} photographs that can be read, found {len(names)}; add photographs."
+        )
+    say(f"{len(names)} photographs, {len(groups)} lens{'es' * (len(groups) > 1)}, {threads} threads; work in {work}")
+    database = work / "database.db"
+    stages.extract(database, root, groups, threads, config.quiet)
+    matching = config.matching
+    if matching == "auto":
+        many = root.parent == work and len(names) > EXHAUSTIVE_FRAMES
+        matching = "sequential" if many else "exhaustive"
+    pairs = stages.match(database, matching, config.seed, threads, config.quiet)
+    models = stages.reconstruct(database, root, work / "models", config.seed, threads, config.quiet)
+    sizes = {index: model.num_reg_images() for index, model in models.items()}
+    best = max(sizes, key=lambda index: sizes[index], default=None)
+    if best is None or sizes[best] < LEAST:
+        shutil.rmtree(work / "models")  # the next run may have another seed of luck, and more photographs
+        raise InputError(
+            f"{root}: {sizes.get(best, 0)} of {len(names)} photographs could be registered, expected at least {LEAST} "
+            f"({pairs} pairs of them fit together); {ADVICE}."
+        )
+    model = models[best]
+    registered = {model.image(index).name for index in model.reg_image_ids()}
+    stages.undistort(work / "models" / str(best), root, scene, work / "scene.part", sizes[best], threads, config.quiet)
+    write_json(
+        work / "summary.json",
+        {
+            "photographs": len(names) + len(broken),
+            "unreadable": broken,
+            "registered": sizes[best],
+            "unregistered": sorted(set(names) - registered),
+            "registered_by_model": sorted(sizes.values(), reverse=True),
+            "points": model.num_points3D(),
+            "reprojection_error_px": model.compute_mean_reprojection_error(),
+            "track_length": model.compute_mean_track_length(),
+            "threads": threads,
+        },
+    )
+
+
+def _groups(root: Path, names: list[str], threads: int, say) -> tuple[list[list[str]], list[str]]:
+    """Names of photographs by the lens that they share, and those that cannot be read, which are left out."""
+
+    def lens(name: str) -> tuple | None:
+        try:
+            images.read_rgb(root / name, 0.0)  # to the end: from a file that is cut short, pycolmap takes what there is
+            return images.read_lens(root / name)
+        except InputError as error:
+            say(f"warning: leaving out a photograph: {error}")
+            return None
+
+    with ThreadPoolExecutor(threads) as pool:
+        lenses = list(pool.map(lens, names))
+    groups: dict[Any, list[str]] = defaultdict(list)
+    for name, key in zip(names, lenses, strict=True):
+        groups[key].append(name)
+    broken = groups.pop(None, [])
+    return list(groups.values()), broken
+
+
+def _note_time(work: Path, seconds: float) -> None:
+    summary = json.loads((work / "summary.json").read_text())
+    write_json(work / "summary.json", {**summary, "seconds_of_last_run": round(seconds, 1)})
+
+
+def _summarize(scene: Path, summary: dict[str, Any]) -> None:
+    registered, count = summary["registered"], summary["photographs"]
+    print(
+        f"{scene}: {registered} of {count} photographs registered, {summary['points']} points, mean reprojection error "
+        f"{summary['reprojection_error_px']:.2f} px, {summary['track_length']:.1f} photographs per point, "
+        f"{summary['seconds_of_last_run'] / 60:.1f} min"
+    )
+    for what in ("unreadable", "unregistered"):
+        names = summary[what]
+        if names:
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            print(f"  {what}: {', '.join(names[:NAMED])}{more}")
+    others = summary["registered_by_model"][1:]
+    if others:
+        print(f"  the photographs fall apart into {len(others) + 1} models; others have {', '.join(map(str, others))}")
+    if registered < FEW * count:
+        print(f"  warning: only {registered} of {count} photographs registered; {ADVICE}.")
+    print(f"  train on it: {shlex.join(['warp-splat', 'train', '-s', str(scene), '--eval'])}")

@@ -1,0 +1,190 @@
+"""The stages of structure from motion, each with its progress: features, matches, cameras and points, undistortion.
+
+What a stage has found is in the database at once, so that a run that was stopped, by Ctrl-C or kill -9, goes on there;
+a model or a folder of images gets its name only when it is complete.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
+import pycolmap
+from tqdm import tqdm
+
+from warp_splat.errors import InputError
+from warp_splat.interrupts import interruptible
+
+LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
+POLL = 0.3  # seconds
+BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
+
+
+def run_watched(
+    title: str, total: int, work: Callable[[pycolmap.CancellationToken], object], count: Callable[[], int], quiet: bool
+) -> None:
+    """Run ``work`` in a thread and show a bar until it ends; Ctrl-C lets it end at the next image, then raises."""
+    token, errors = pycolmap.CancellationToken(), []
+
+    def run():
+        try:
+            work(token)
+        except BaseException as error:  # raised again below, in the thread that the user sees
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name=title)
+    pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
+    bar = tqdm(total=total, desc=title, disable=quiet, bar_format=BAR, mininterval=pause, maxinterval=pause)
+    with interruptible() as interrupted, bar:
+        thread.start()
+        while thread.is_alive():
+            thread.join(POLL)
+            bar.update(min(count(), total) - bar.n)
+            if interrupted:
+                token.cancel()
+    if interrupted:
+        raise KeyboardInterrupt
+    if errors:
+        raise errors[0]
+
+
+@contextmanager
+def opened(database: Path) -> Iterator[pycolmap.Database]:
+    """The database, closed at the end of the block.
+
+    What shows the progress of a stage opens it before the stage begins: opening writes, and may be refused, or refuse
+    another. Python's sqlite3 would do harm: it drops the locks of pycolmap's copy of SQLite.
+    """
+    connection = pycolmap.Database.open(database)
+    try:
+        yield connection
+    finally:
+        connection.close()
+
+
+def extract(database: Path, root: Path, groups: list[list[str]], threads: int, quiet: bool) -> None:
+    """Find SIFT features in the photographs below ``root``; those of a group share a lens."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads, options.use_gpu = threads, False
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = LENS
+    for names in groups:  # first, so that images are numbered by name and not by which thread was faster
+        with opened(database) as connection:
+            new = [name for name in names if not connection.exists_image(name)]
+            if len(new) < len(names):
+                reader.existing_camera_id = connection.read_image_with_name((set(names) - set(new)).pop()).camera_id
+        if new:
+            pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, new, reader)
+
+    def work(token):
+        pycolmap.extract_features(
+            database,
+            root,
+            image_names=[name for names in groups for name in names],
+            extraction_options=options,
+            device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )
+
+    with opened(database) as connection:
+        numbers = [image.image_id for image in connection.read_all_images()]
+        found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
+        run_watched("features", len(numbers), work, found, quiet)
+
+
+def match(database: Path, matching: str, seed: int, threads: int, quiet: bool) -> int:
+    """Match all pairs of photographs or, "sequential", neighbors by name; returns how many pairs fit together."""
+    options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    options.num_threads, options.use_gpu = threads, False
+    verification.ransac.random_seed = seed
+    with opened(database) as connection:
+        images = connection.num_images()
+    if matching == "sequential":
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.num_threads = threads
+        # neighbors up to `overlap`, and at distances 2, 4, 8 ... up to 2^(overlap - 1)
+        total, run = _sequential_pairs(images, pairing.overlap), pycolmap.match_sequential
+    else:
+        pairing = pycolmap.ExhaustivePairingOptions()
+        total, run = images * (images - 1) // 2, pycolmap.match_exhaustive
+
+    def work(token):
+        run(
+            database,
+            matching_options=options,
+            pairing_options=pairing,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )
+
+    with opened(database) as connection:
+        run_watched("matches", total, work, connection.num_matched_image_pairs, quiet)
+        _, inliers = connection.read_two_view_geometry_num_inliers()
+    return sum(count > 0 for count in inliers)
+
+
+def _sequential_pairs(images: int, overlap: int) -> int:
+    gaps = {*range(1, overlap + 1), *(1 << power for power in range(overlap))}
+    return sum(max(images - gap, 0) for gap in gaps)
+
+
+def reconstruct(
+    database: Path, root: Path, models: Path, seed: int, threads: int, quiet: bool
+) -> dict[int, pycolmap.Reconstruction]:
+    """Cameras and points, incrementally; the models are in the folder ``models``, empty if no two photographs fit.
+
+    This stage starts anew when it was stopped: it is the shortest on a CPU.
+    """
+    part = models.with_suffix(".part")
+    if not models.is_dir():
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads, options.random_seed = threads, seed
+        options.mapper.random_seed = options.triangulation.random_seed = seed
+        registered = []
+        with opened(database) as connection:
+            images = connection.num_images()
+
+        def work(token):
+            pycolmap.incremental_mapping(
+                database,
+                root,
+                part,
+                options,
+                initial_image_pair_callback=lambda: registered.extend((1, 1)),
+                next_image_callback=lambda: registered.append(1),
+                cancellation_token=token,
+            )
+
+        run_watched("cameras", images, work, lambda: len(registered), quiet)
+        os.replace(part, models)
+    return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir() if folder.is_dir()}
+
+
+def undistort(model: Path, root: Path, scene: Path, part: Path, count: int, threads: int, quiet: bool) -> None:
+    """Write the photographs without distortion to ``scene``/images and their pinhole cameras to ``scene``/sparse/0."""
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
+
+    def work(token):
+        pycolmap.undistort_images(part, model, root, num_threads=threads, cancellation_token=token)
+
+    def written() -> int:
+        return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
+
+    run_watched("undistortion", count, work, written, quiet)
+    if written() < count:
+        raise InputError(f"{part}: only {written()} of {count} images could be written; free some space and run again.")
+    os.replace(part / "images", scene / "images")
+    os.renames(part / "sparse", part / "model" / "0")
+    os.replace(part / "model", scene / "sparse")  # the last step: where sparse/ is, all is
+    shutil.rmtree(part, ignore_errors=True)

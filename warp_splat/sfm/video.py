@@ -1,0 +1,109 @@
+"""Sharp frames of a video: of each of equal spans the frame with the largest variance of the Laplacian.
+
+The measure is that of Pech-Pacheco et al. 2000 (Diatom autofocusing in brightfield microscopy), on the luma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import OpenImageIO as oiio
+from av.error import FFmpegError, InvalidDataError
+
+from warp_splat.errors import InputError
+
+SHARPNESS_WIDTH = 960  # px; frames are shrunk to this width before they are judged, and noise with them
+QUALITY = 97  # of the JPEG files, 0 to 100
+
+
+def sharpness(luma: np.ndarray) -> float:
+    """Variance of the Laplacian of an image [H, W]: large where edges are sharp."""
+    image = luma.astype(np.float32)
+    inner = image[1:-1, 1:-1]
+    return float(np.var(4 * inner - image[:-2, 1:-1] - image[2:, 1:-1] - image[1:-1, :-2] - image[1:-1, 2:]))
+
+
+def sample_frames(
+    path: Path,
+    folder: Path,
+    count: int,
+    threads: int,
+    report: Callable[[str], object],
+    advance: Callable[[int], object],
+) -> int:
+    """Write the sharpest frame of each of ``count`` equal spans of a video, as JPEG named by its number.
+
+    Args:
+        path: the video; the first video stream is read, and turned as its display matrix says.
+        folder: where to write; must exist.
+        count: how many frames; all, if the video has fewer.
+        threads: of the decoder.
+        report: called with a line for each thing that the user should know.
+        advance: called with the share of the video that is read, in percent, as it grows.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        InputError: if the file is not a video that PyAV (FFmpeg) can decode.
+    """
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: expected a video, found no video stream in it; give another file.")
+            total = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+        with av.open(str(path)) as container:
+            return _sample(container, folder, count, total, threads, report, advance)
+    except FFmpegError as error:
+        raise InputError(
+            f"{path}: expected a video that FFmpeg can read, but it cannot ({error.strerror}); convert it to MP4 "
+            "(H.264) or give another file."
+        ) from error
+
+
+def _sample(container, folder: Path, count: int, total: int, threads: int, report, advance) -> int:
+    written, window, best = 0, 0, (-1.0, 0, None)
+    damaged: list[int] = []
+    for index, frame in enumerate(_decode(container, threads, damaged)):
+        here = min(index * count // max(total, 1), count - 1)
+        if here != window:
+            written += _write(best, folder)
+            window, best = here, (-1.0, 0, None)
+            advance(100 * index // total)
+        width = min(SHARPNESS_WIDTH, frame.width)
+        small = frame.reformat(width=width, height=max(3, frame.height * width // frame.width), format="gray")
+        value = sharpness(small.to_ndarray())
+        if value > best[0]:
+            best = (value, index, frame)
+    written += _write(best, folder)
+    if damaged:
+        report(f"warning: {len(damaged)} of {total} packets of the video are damaged and were left out.")
+    return written
+
+
+def _decode(container, threads: int, damaged: list[int]) -> Iterator[av.VideoFrame]:
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    stream.codec_context.thread_count = threads
+    for number, packet in enumerate(container.demux(stream)):
+        try:
+            yield from packet.decode()
+        except InvalidDataError:
+            damaged.append(number)
+
+
+def _write(best: tuple[float, int, av.VideoFrame | None], folder: Path) -> int:
+    _, index, frame = best
+    if frame is None:
+        return 0
+    pixels = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
+    spec.attribute("compression", f"jpeg:{QUALITY}")
+    path = str(folder / f"frame_{index:06d}.jpg")
+    output = oiio.ImageOutput.create(path)
+    if not (output and output.open(path, spec) and output.write_image(pixels) and output.close()):
+        raise InputError(f"{path}: could not be written ({oiio.geterror()}); free some space or choose another folder.")
+    return 1
