@@ -161,13 +161,19 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
         assert f"--{option} {value}: expected" in fails(capsys, "train", "--resume", str(folder), f"--{option}", value)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
+
+@pytest.mark.slow
+def test_at_the_end_and_into_another_folder(whole, tmp_path):
+    """Resuming at the end writes again what is missing; from an earlier checkpoint, another folder is filled."""
+    folder = tmp_path / "model"
+    assert train(folder, "--checkpoint_iterations", "20") == 0
     ply_path(folder, 60).unlink()  # as if killed after the last checkpoint
     assert main(["train", "--resume", str(folder)]) == 0
     assert ply_path(folder, 60).read_bytes() == ply_path(whole, 60).read_bytes() and results(folder) == results(whole)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     branch = tmp_path / "branch"
-    assert main(["train", "--start_checkpoint", str(named), "-m", str(branch), *SHORT]) == 0
+    assert main(["train", "--start_checkpoint", str(folder / "chkpnt20.safetensors"), "-m", str(branch), *SHORT]) == 0
     assert ply_path(branch, 60).read_bytes() == ply_path(whole, 60).read_bytes()
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
