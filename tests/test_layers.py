@@ -13,7 +13,7 @@ LAYERS = [
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify"},
     {"trainer", "selftest", "report", "evaluate", "gradcheck", "differences"},
-    {"train", "render", "convert", "sfm", "doctor"},
+    {"run", "train", "render", "convert", "sfm", "doctor"},
     {"compare"},
     {"cli", "__init__", "__main__"},
 ]

@@ -176,6 +176,7 @@ def test_ctrl_c_saves_the_model(tmp_path):
     assert "Interrupted after" in out and "Traceback" not in err
     (saved,) = (tmp_path / "point_cloud").glob("*/point_cloud.ply")
     assert str(saved) in out and len(load_ply(saved).means) >= 4500
+    assert f"{sys.executable} {ROOT / 'train.py'} --resume {tmp_path}\n" in out
 
 
 def test_help_answers_without_torch_or_warp():
@@ -194,7 +195,7 @@ def test_help_answers_without_torch_or_warp():
     [
         (("--iterations", "0"), ("--iterations", "at least 1", "0")),
         (("--device", "cpu", "--data_device", "cuda"), ("--data_device cuda", "GPU")),
-        (("--start_checkpoint", "x.pth"), ("--start_checkpoint", "not")),
+        (("--start_checkpoint", "x.pth"), ("x.pth", "can run code")),
         (("--iteratons", "5"), ("--iteratons", "--iterations")),
         (("--lambda_dssim", "2"), ("--lambda_dssim", "0 to 1")),
         (("--feature_lr", "nan"), ("--feature_lr", "nan")),

@@ -11,6 +11,7 @@ from dataclasses import fields
 from warp_splat import __version__
 from warp_splat.config import (
     EMBEDDED_DEFAULTS,
+    FIXED_OPTIONS,
     FOREIGN_FLAGS,
     PRESETS,
     CompareConfig,
@@ -53,7 +54,7 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
                 del options["metavar"]
             if item.metadata["many"]:
                 options["nargs"] = "*"
-        parser.add_argument(*item.metadata["names"], f"--{item.name}", **options)
+        parser.add_argument(*item.metadata["names"], f"--{item.name}", dest=item.name, **options)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -72,7 +73,7 @@ def parse(arguments: list[str]) -> Config:
     """The configuration that the arguments ask for.
 
     Raises:
-        InputError: for a flag of the reference that does not exist here.
+        InputError: for a flag that does not exist here, or that cannot change when a training is continued.
     """
     for argument in arguments:
         name = argument.split("=")[0]
@@ -86,10 +87,26 @@ def parse(arguments: list[str]) -> Config:
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
+    if values.get("start_checkpoint"):
+        return TrainConfig(**_continued(values))
     if config_type is TrainConfig:
         embedded = {} if "source_path" in values else EMBEDDED_DEFAULTS
         values = {**embedded, **PRESETS[values.get("preset", "")], **values}
     return config_type(**values)
+
+
+def _continued(given: dict) -> dict:
+    """Options of the checkpoint to start from, but for those that are given."""
+    from warp_splat.formats.checkpoint import load_options  # noqa: PLC0415 - NumPy takes its time to load
+
+    source = given["start_checkpoint"]
+    options = load_options(source)
+    for name, reason in FIXED_OPTIONS.items():
+        if given.get(name, options[name]) != options[name]:
+            raise InputError(
+                f"--{name} {given[name]}: expected {options[name] or 'none'}, as in {source} ({reason}); leave it out."
+            )
+    return {**options, **given}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -80,6 +80,9 @@ class TrainConfig:
     white_background: bool = flag(False, "composite on white instead of black", "-w")
     sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
+    start_checkpoint: str = flag(
+        "", "continue a training: its folder, or a checkpoint; options are the same but for those given", "--resume"
+    )
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = flag("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
     threads: int = flag(
@@ -129,6 +132,10 @@ class TrainConfig:
 
     test_iterations: list[int] = flag([7_000, 30_000], "evaluate after these steps, besides 20 times in all", many=int)
     save_iterations: list[int] = flag([7_000, 30_000], "save the model after these steps, and the last", many=int)
+    checkpoint_iterations: list[int] = flag([], "keep a checkpoint of these steps, besides the last one", many=int)
+    checkpoint_interval: float = flag(
+        5.0, "minutes between two checkpoints, of which the last is kept; 0: one at the start and one at the end"
+    )
 
 
 #: What the embedded scene changes when no ``-s`` is given: a schedule that ends within a few minutes on two cores.
@@ -161,6 +168,15 @@ PRESETS: dict[str, dict[str, Any]] = {
         "sh_interval": 1000,
         "opacity_reset_interval": 100_000,
     },
+}
+
+
+#: What cannot change when a training is continued, and why.
+FIXED_OPTIONS = {
+    "sh_degree": "the number of coefficients of a Gaussian is that of its start",
+    "optimizer_type": "the moments of one are not those of the other",
+    "seed": "random numbers continue from the checkpoint's",
+    "preset": "other options are those of the checkpoint; name the ones to change",
 }
 
 
@@ -236,8 +252,6 @@ class CompareConfig:
 
 #: Flags of the reference that this program does not have, and what to say when somebody uses one.
 FOREIGN_FLAGS = {
-    "--checkpoint_iterations": "checkpoints are not supported yet; --save_iterations saves the model",
-    "--start_checkpoint": "training cannot be resumed yet; it starts from the scene's points",
     "--depths": "depth regularization is not supported",
     "--depth_l1_weight_init": "depth regularization is not supported",
     "--depth_l1_weight_final": "depth regularization is not supported",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from warp_splat.config import TrainConfig
 from warp_splat.distributed import ALONE, Processes
+from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.optimizer import Optimizer
 from warp_splat.renderer import RenderOutput
@@ -71,6 +73,28 @@ class Densifier:
         if iteration % config.opacity_reset_interval < step or at_start:
             self.optimizer.reset_opacities(RESET_OPACITY)
         return change
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Statistics since the last densification, [R, N] with a row for each process, and the random state."""
+        gather = self.processes.gather
+        statistics = {"gradient": gather(self.gradient), "views": gather(self.views), "radius": gather(self.radius)}
+        found = {f"statistics.{name}": rows for name, rows in statistics.items()}
+        return {**found, "random.densification": self.random.get_state()}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Take what :meth:`state` gave from a checkpoint, for the present set; of any number of processes."""
+        rank, count = self.processes.rank, len(self.model)
+
+        def statistic(name: str, dtype: type) -> torch.Tensor:
+            rows = torch.from_numpy(checkpoint.array(f"statistics.{name}", (-1, count), dtype))
+            if len(rows) != self.processes.count:  # the first takes all
+                rows = rows.amax(0, keepdim=True) if name == "radius" else rows.sum(0, keepdim=True)
+                rows = torch.nn.functional.pad(rows, (0, 0, 0, self.processes.count - 1))
+            return rows[rank].to(self.model.device, copy=True)
+
+        self.gradient, self.views = statistic("gradient", np.float32), statistic("views", np.float32)
+        self.radius = statistic("radius", np.int32)
+        self.random.set_state(torch.from_numpy(checkpoint.generator("random.densification")))
 
     def _densify(self, prune_large: bool) -> Change:
         self.processes.sum(self.gradient)

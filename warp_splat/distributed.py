@@ -57,9 +57,13 @@ class Processes:
     def maximum(self, tensor: torch.Tensor) -> None:
         """Replace each element of ``tensor`` by its largest value in any process."""
 
-    def any(self, flag: bool) -> bool:
-        """Whether ``flag`` is set in any process."""
-        return flag
+    def largest(self, value: int) -> int:
+        """The largest ``value`` of all processes."""
+        return value
+
+    def gather(self, tensor: torch.Tensor) -> torch.Tensor:
+        """The tensors of all processes, stacked: [count, ...]."""
+        return tensor[None]
 
     def first(self, text: str) -> str:
         """What process 0 calls ``text``."""
@@ -96,10 +100,15 @@ class ProcessGroup(Processes):
     def maximum(self, tensor: torch.Tensor) -> None:
         self._exchange(dist.all_reduce, tensor, dist.ReduceOp.MAX)
 
-    def any(self, flag: bool) -> bool:
-        found = torch.tensor([flag], dtype=torch.int32)
+    def largest(self, value: int) -> int:
+        found = torch.tensor([value], dtype=torch.int32)
         self.maximum(found)
-        return bool(found)
+        return int(found)
+
+    def gather(self, tensor: torch.Tensor) -> torch.Tensor:
+        found = [torch.empty_like(tensor) for _ in range(self.count)]
+        self._exchange(dist.all_gather, found, tensor)
+        return torch.stack(found)
 
     def first(self, text: str) -> str:
         box = [text]
@@ -111,9 +120,7 @@ class ProcessGroup(Processes):
         for tensor in tensors:
             digest.update(tensor.detach().cpu().contiguous().numpy().data)
         own = torch.tensor(list(digest.digest()), dtype=torch.uint8)
-        found = [torch.empty_like(own) for _ in range(self.count)]
-        self._exchange(dist.all_gather, found, own)
-        names = [bytes(other.tolist()).hex()[:8] for other in found]
+        names = [bytes(other.tolist()).hex()[:8] for other in self.gather(own)]
         if len(set(names)) > 1:
             raise GroupError(
                 f"Process {self.rank}: expected the same model in all {self.count} processes after {iteration} "

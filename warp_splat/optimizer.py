@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 import warp as wp
 
 from warp_splat.config import TrainConfig
+from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.lanes import LANES
@@ -41,6 +43,7 @@ class Optimizer:
             "quats": config.rotation_lr,
         }
         self.model, self.config, self.extent, self.scale = model, config, extent, math.sqrt(batch)
+        self.batch = batch
         groups = [
             {"name": name, "params": [model.parameters[name]], "lr": rate * self.scale} for name, rate in rates.items()
         ]
@@ -112,6 +115,41 @@ class Optimizer:
         for moment in MOMENTS:
             if moment in state:
                 state[moment] = torch.zeros_like(state[moment])
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """The parameters and all that belongs to them, as ``kind.name``: gradients, moments, and images learned from.
+
+        Those are steps times ``batch``: bias correction then goes on as it should for any other ``batch``.
+        """
+        found: dict[str, torch.Tensor] = {}
+        for name, leaf in self.model.parameters.items():
+            found[f"parameters.{name}"] = leaf.detach()
+            if leaf.grad is not None:
+                found[f"gradients.{name}"] = leaf.grad
+            if state := self.adam.state.get(leaf):
+                found |= {f"{moment}.{name}": state[moment] for moment in MOMENTS}
+                found[f"images.{name}"] = state["step"].double() * self.batch
+        return found
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Take what :meth:`state` gave from a checkpoint. Raises InputError if something does not fit."""
+        arrays, count = checkpoint.arrays, len(checkpoint.array("parameters.means", (-1, 3)))
+        for name, old in self.model.parameters.items():
+            shape = (count, *old.shape[1:])
+            tables = {
+                kind: torch.empty(shape, device=old.device).copy_(
+                    torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape))
+                )
+                for kind in ("parameters", "gradients", *MOMENTS)
+                if kind == "parameters" or f"{kind}.{name}" in arrays
+            }
+            self._swap(name, tables["parameters"])
+            leaf = self.model.parameters[name]
+            leaf.grad = tables.get("gradients")
+            if MOMENTS[0] in tables:
+                images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
+                step = torch.tensor(float(images / self.batch), device=leaf.device)
+                self.adam.state[leaf] = {"step": step, **{moment: tables[moment] for moment in MOMENTS}}
 
     def _swap(self, name: str, values: torch.Tensor) -> None:
         """Put a new leaf, without a gradient, in the place of a parameter; its state moves along."""

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from warp_splat import launch, report
+from warp_splat import launch
 from warp_splat.config import TrainConfig, check_train
-from warp_splat.devices import memory_explained, peak_memory
+from warp_splat.devices import memory_explained
 from warp_splat.distributed import GroupError, Processes, join
 from warp_splat.errors import InputError
-from warp_splat.evaluate import evaluate_views
 from warp_splat.formats import model_folder
-from warp_splat.formats.atomic import write_json
+from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
 from warp_splat.formats.ply import save_points
 from warp_splat.formats.png import save_png
 from warp_splat.interrupts import interruptible
+from warp_splat.run import Run, finish, how_to_continue, keep, restore, save_model, save_or_warn, warn
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
 from warp_splat.selftest import settle_device
@@ -32,22 +32,7 @@ from warp_splat.trainer import Trainer
 EVALUATIONS = 20  # over the run, besides --test_iterations
 PROGRESS_VIEWS = 8  # at most, in the evaluations while training
 PREVIEW_SECONDS = 5.0
-SHEET_VIEWS = 6
-
-
-@dataclass
-class Run:
-    """What has happened so far."""
-
-    folder: Path
-    start: float  # of the process's work, on time.perf_counter
-    history: list[dict[str, float]] = field(default_factory=list)
-    losses: list[torch.Tensor] = field(default_factory=list)  # since the last record, scalars on the device
-    iteration: int = 0
-    seconds: float = 0.0  # of training steps alone, without evaluations and pictures
-    preview: float = 0.0  # when last drawn
-    stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
-    dropped: dict[str, int] = field(default_factory=dict)  # see Quarantine
+KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 
 
 def train(config: TrainConfig) -> int:
@@ -66,9 +51,17 @@ def train(config: TrainConfig) -> int:
 def _train(config: TrainConfig, processes: Processes) -> int:
     leads = processes.rank == 0
     config.quiet |= not leads
-    config.iterations += -config.iterations % processes.count  # whole steps
     say = (lambda *_: None) if config.quiet else tqdm.write
     threads = config.threads or max(1, launch.get_threads() // processes.local_count)
+    checkpoint = load_checkpoint(config.start_checkpoint) if config.start_checkpoint else None
+    begun = checkpoint.count("iteration") if checkpoint else 0
+    if checkpoint and begun > config.iterations:  # at the end, what is written there is written again
+        raise InputError(
+            f"--iterations {config.iterations}: expected at least the {begun} after which {checkpoint.path} was "
+            "written; name a later end."
+        )
+    config.iterations += -(config.iterations - begun) % processes.count  # whole steps
+    folder = _choose_folder(config, checkpoint)
     device = settle_device(launch.prepare(config.device, threads), config.device, [config.adjoint], say)
     config.device = device.type
     if config.data_device == "cuda" and device.type != "cuda":
@@ -78,10 +71,6 @@ def _train(config: TrainConfig, processes: Processes) -> int:
 
         config.source_path = scene_for(config, processes.count)
     config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
-    if config.model_path and any(Path(config.model_path).glob("point_cloud/*/*.ply")):
-        raise InputError(
-            f"-m {config.model_path}: this folder already holds a trained model; choose another, or move it."
-        )
     started = time.perf_counter()
     say(f"Scene {config.source_path}")
     scene = load_scene(
@@ -92,7 +81,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         eval=config.eval,
         report=say,
     )
-    run = Run(Path(processes.first(config.model_path or str(model_folder.default_model_path()))), started)
+    run = Run(Path(processes.first(str(folder))), started)
     together = f"{processes.count} processes with " * (processes.count > 1)
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
     say(
@@ -107,18 +96,45 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     with _memory_explained(trainer):
         trainer.warm_up()
         say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
-        with interruptible() as interrupted:
-            try:
-                _loop(trainer, run, interrupted)
-            except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
-                tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
-                return 1
-            finally:  # whatever happened, the model comes first
-                if leads or processes.lost:
-                    print(f"Model after {run.iteration} iterations: {_save(trainer, run)}")
-        if leads:
-            _finish(trainer, run, say)
-    return 130 if run.iteration < config.iterations else 0
+        if checkpoint:
+            restore(trainer, run, checkpoint)
+            say(f"Continuing after {run.iteration} iterations, from {checkpoint.path}")
+            del checkpoint  # its arrays take as much memory as the trainer's
+        else:
+            keep(trainer, run)
+        return _run(trainer, run, say)
+
+
+def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
+    """Train, save, and tell; returns the process's exit code."""
+    processes, end = trainer.processes, trainer.config.iterations
+    with interruptible() as interrupted:
+        try:
+            _loop(trainer, run, interrupted)
+        except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
+            tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
+            return 1
+        finally:  # whatever happened, the model comes first
+            if processes.rank == 0 or processes.lost:
+                print(f"Model after {run.iteration} iterations: {save_model(trainer, run)}")
+            if run.kept is not None and run.iteration < end:
+                print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
+    if processes.rank == 0:
+        finish(trainer, run, say)
+    return 130 if run.iteration < end else 0
+
+
+def _choose_folder(config: TrainConfig, checkpoint: Checkpoint | None) -> Path:
+    """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
+    default = checkpoint.path.parent if checkpoint else model_folder.default_model_path()
+    folder = Path(config.model_path or default)
+    continued = checkpoint and checkpoint.path.resolve() == (folder / LAST).resolve()
+    if not continued and ((folder / LAST).exists() or any(folder.glob("point_cloud/*/*.ply"))):
+        raise InputError(
+            f"{folder}: this folder already holds a training; choose another with -m, move it, or continue where it "
+            f"ended with --resume {folder}."
+        )
+    return folder
 
 
 def embedded_scene() -> Path:
@@ -136,6 +152,7 @@ def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
         {**asdict(config), "model_path": str(folder), "depths": "", "train_test_exp": False},
     )
     model_folder.write_cameras(folder, scene.test, scene.train)
+    remove_leftovers(folder)
     save_points(folder / "input.ply", scene.points, scene.colors)
 
 
@@ -153,33 +170,44 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
     checks = {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
     whole_checks = {*config.test_iterations, config.iterations}
     saves = set(config.save_iterations) - {config.iterations}
-    profiled, before_profile = max(config.iterations - config.profile, 0), 0.0
+    profiled, before_profile = max(config.iterations - config.profile, run.iteration), run.seconds
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     bar = tqdm(
-        total=config.iterations, disable=config.quiet, unit="it", mininterval=pause, maxinterval=pause, miniters=0
+        total=config.iterations,
+        initial=run.iteration,
+        disable=config.quiet,
+        unit="it",
+        mininterval=pause,
+        maxinterval=pause,
+        miniters=0,
     )
-    trainer.check_identical(0)
+    trainer.check_identical(run.iteration)
     with bar, launch.profile(config.profile > 0) as stages:
-        for iteration in range(processes.count, config.iterations + 1, processes.count):
+        for iteration in range(run.iteration + processes.count, config.iterations + 1, processes.count):
             if processes.reaches(iteration, [profiled + 1]):
                 stages.clear()
                 before_profile = run.seconds
             start = time.perf_counter()
+            if run.iteration:  # now, since models and checkpoints are those of before the update
+                trainer.update(run.iteration)
             run.losses.append(trainer.differentiate(iteration))
             run.iteration = iteration
             run.seconds += time.perf_counter() - start
-            stop = processes.any(bool(interrupted)) or iteration == config.iterations
-            if stop or processes.reaches(iteration, checks | whole_checks):
-                with launch.profile(False):
-                    _check(trainer, run, bar, whole=processes.reaches(iteration, whole_checks))
+            wish = processes.largest(STOP if interrupted else KEEP if _keeping_is_due(config, run) else 0)
+            stop = wish == STOP or iteration == config.iterations
+            check, whole = (processes.reaches(iteration, marks) for marks in (checks | whole_checks, whole_checks))
+            named = processes.reaches(iteration, config.checkpoint_iterations)
+            if check:
+                _check(trainer, run, bar, whole)
+            if stop or wish == KEEP or named:
+                keep(trainer, run, named)
+            if stop and not check:  # after the checkpoint: a run that goes on from there never had this record
+                _check(trainer, run, bar, whole=False)
             if processes.reaches(iteration, saves) and not stop:
-                _save_or_warn(trainer, run)
+                save_or_warn(trainer, run)
             bar.update(processes.count)
             if stop:
                 break
-            start = time.perf_counter()
-            trainer.update(iteration)
-            run.seconds += time.perf_counter() - start
     run.dropped = trainer.quarantine.read(processes)
     steps = -(-(run.iteration - profiled) // processes.count)
     if config.profile and steps > 0:
@@ -188,6 +216,11 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
         run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
 
 
+def _keeping_is_due(config: TrainConfig, run: Run) -> bool:
+    return 0 < 60 * config.checkpoint_interval <= time.perf_counter() - run.kept_at
+
+
+@launch.profile(False)
 def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
     trainer.check_identical(run.iteration)
@@ -213,77 +246,4 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         try:
             save_png(run.folder / "preview.png", np.concatenate([view.image, trainer.picture(view.camera)], 1))
         except InputError as error:
-            _warn(error)
-
-
-def _warn(error: Exception) -> None:
-    tqdm.write(f"warning: {error}", file=sys.stderr)
-
-
-def _save(trainer: Trainer, run: Run) -> Path:
-    """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
-    path = model_folder.ply_path(run.folder, run.iteration)
-    antialiased = trainer.config.antialiasing
-    try:
-        trainer.model.save(path, antialiased)
-    except InputError as error:
-        _warn(error)
-        path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
-        trainer.model.save(path, antialiased)
-        tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
-    return path
-
-
-def _save_or_warn(trainer: Trainer, run: Run) -> None:
-    """Save on the way: training goes on if that fails."""
-    if trainer.processes.rank > 0:
-        return
-    try:
-        _save(trainer, run)
-    except (InputError, OSError) as error:
-        _warn(error)
-
-
-def _finish(trainer: Trainer, run: Run, say) -> None:
-    """Pictures, curves and numbers of the saved model, and where they lie."""
-    wall = time.perf_counter() - run.start
-    split, views = trainer.scene.evaluated
-    extra = {
-        "split": split,
-        "iterations": run.iteration,
-        "gaussians": len(trainer.model),
-        "seconds": round(wall, 2),
-        "iterations_per_second": round(run.iteration / run.seconds, 2),
-        "processes": trainer.processes.count,
-        "peak_memory_mb": peak_memory(),
-        "dropped": run.dropped,
-    }
-    means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)
-    sheet, plot = run.folder / "contact_sheet.png", run.folder / "training.png"
-    chosen = pictures[:: -(-len(pictures) // SHEET_VIEWS)]
-    portrait = chosen[0][1].shape[0] > chosen[0][1].shape[1]
-    report.contact_sheet(sheet, chosen, columns=2 if portrait else 1)
-    report.plot_training(plot, run.history)
-    write_json(run.folder / "history.json", run.history)
-    lines = [("pictures", sheet), ("curves", plot), ("numbers", run.folder / "results.json")]
-    if run.stages:
-        report.plot_profile(run.folder / "profile.png", run.stages)
-        lines += [("profile", run.folder / "profile.png")]
-        total = sum(run.stages.values())
-        rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
-        say(report.format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    state = "Interrupted" if run.iteration < trainer.config.iterations else "Done"
-    print(
-        f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
-        f"{split} PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f}, {len(trainer.model)} Gaussians"
-    )
-    for name, where in lines:
-        print(f"  {name:9s} {where}")
-    dropped = run.dropped
-    if dropped["prunings"]:
-        print(f"  warning   {dropped['prunings']} prunings would have removed every Gaussian and were refused")
-    if dropped["pixels"] or dropped["gradients"] or dropped["gaussians"]:
-        print(
-            f"  kept from spreading: {dropped['pixels']} pixels and {dropped['gradients']} Gaussians with gradients, "
-            f"and {dropped['gaussians']} Gaussians with parameters, that were not finite"
-        )
+            warn(error)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import random
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from warp_splat.densify import Densifier
 from warp_splat.devices import choose_device
 from warp_splat.distributed import ALONE, Processes
 from warp_splat.errors import InputError
+from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.launch import stage
 from warp_splat.losses import image_loss
@@ -74,7 +77,7 @@ class Trainer:
         self._deck: list[View] = []
         self._shrink = 1  # of the images in this step
         self._photographs: dict[View, torch.Tensor] = {}  # those that were used, [H, W, 3] uint8, at that size
-        self._radii = torch.zeros(0, dtype=torch.int32, device=self.device)  # of the view that was differentiated last
+        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
 
     def differentiate(self, iteration: int) -> torch.Tensor:
         """Gradients of the loss of one view; returns the loss, a scalar. Means over the processes, if there are more.
@@ -85,8 +88,7 @@ class Trainer:
         unsettled and renders several dB worse.
         """
         config = self.config
-        self.optimizer.set_iteration(iteration)
-        self.degree = min(iteration // config.sh_interval, config.sh_degree)
+        self._set_iteration(iteration)
         view = self._next_view()
         camera, photograph = self._at_size(view, iteration)
         background = self.background
@@ -131,6 +133,63 @@ class Trainer:
     def check_identical(self, iteration: int) -> None:
         """Raise GroupError if the model is not the same, byte for byte, in all processes."""
         self.processes.check_identical(self.model.parameters.values(), iteration)
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Tensors by name and values of JSON: all that :meth:`restore` needs to go on as if nothing had happened.
+
+        To be called by all processes before the first step, or between :meth:`differentiate` and :meth:`update`, where
+        models are saved: a checkpoint holds the same parameters as the model of its iteration, and their gradients.
+        """
+        places = {view: place for place, view in enumerate(self.scene.train)}
+        tensors = {
+            **self.optimizer.state(),
+            **self.densifier.state(),
+            "radii": self._radii,
+            "random.background": self._background_random.get_state(),
+        }
+        return tensors, {
+            "views": [view.name for view in self.scene.train],
+            "extent": self.scene.extent,
+            "deck": [places[view] for view in self._deck],
+            "random.views": list(self._views_random.getstate()[1]),
+            **{f"dropped.{name}": count for name, count in self.quarantine.read(self.processes).items()},
+        }
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint, by :meth:`update` of its iteration. Other options and devices may be at work.
+
+        Raises:
+            InputError: if its training views are not those of the scene, or something in it does not fit.
+        """
+        names, extent = [view.name for view in self.scene.train], self.scene.extent
+        if checkpoint.fact("views", list) != names or not math.isclose(
+            checkpoint.fact("extent", float), extent, rel_tol=1e-6
+        ):
+            raise InputError(
+                f"{checkpoint.path}: expected training views of the same names and positions as in this checkpoint, "
+                "found other ones in the scene; name the scene that it was trained on (-s, -i, --eval)."
+            )
+        deck, words = checkpoint.fact("deck", list), checkpoint.fact("random.views", list)
+        try:
+            self._deck = list(dict.fromkeys(self.scene.train[place] for place in deck))
+            self._views_random.setstate((3, tuple(words), None))
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
+            raise InputError(
+                f"{checkpoint.path}: expected a deck of views and a random state, found other values ({error!s:.100})."
+            ) from error
+        dropped = {item.name: checkpoint.count(f"dropped.{item.name}") for item in fields(Quarantine)}
+        if self.processes.rank > 0:  # they are summed over the processes, but for the prunings
+            dropped = {"prunings": dropped["prunings"]}
+        self.quarantine = Quarantine(**dropped)
+        self.optimizer.restore(checkpoint)
+        self.densifier.restore(checkpoint)
+        self._radii = torch.from_numpy(checkpoint.array("radii", (len(self.model),), np.int32)).to(self.device)
+        self._background_random.set_state(torch.from_numpy(checkpoint.generator("random.background")))
+        self._set_iteration(checkpoint.count("iteration"))
+
+    def _set_iteration(self, iteration: int) -> None:
+        self.optimizer.set_iteration(iteration)
+        self.degree = min(iteration // self.config.sh_interval, self.config.sh_degree)
 
     def _next_view(self) -> View:
         """Views in random order, each once before any comes again; all processes deal, each takes its own."""

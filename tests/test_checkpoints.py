@@ -1,0 +1,526 @@
+"""Nothing is lost: a run that stops and resumes ends in the same bytes, kill -9 leaves a loadable file.
+
+And a damaged or forged checkpoint is refused in one sentence.
+"""
+
+import json
+import os
+import random
+import resource
+import signal
+import struct
+import subprocess
+import sys
+import time
+import tracemalloc
+import warnings
+
+import numpy as np
+import pytest
+import safetensors.numpy
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_distributed import TORCHRUN, Pretended
+from test_hostile_files import changed, changed_json
+from test_train import ROOT, SCENE, SHORT, fails, train
+
+from warp_splat.cli import main, parse
+from warp_splat.config import TrainConfig
+from warp_splat.errors import InputError
+from warp_splat.formats.checkpoint import LAST, load_checkpoint, load_options, save_checkpoint
+from warp_splat.formats.model_folder import ply_path
+from warp_splat.formats.ply import load_ply
+from warp_splat.run import Run, keep, restore
+from warp_splat.scene import load_scene
+from warp_splat.trainer import Trainer
+
+STOP = 33  # of 60; densification has added Gaussians and the opacities were reset
+#: Densifies, prunes, resets opacities and raises the SH degree within 50 steps.
+SCHEDULE = {
+    "device": "cpu",
+    "iterations": 50,
+    "densify_from_iter": 10,
+    "densification_interval": 10,
+    "densify_until_iter": 45,
+    "opacity_reset_interval": 20,
+    "sh_interval": 15,
+    "densify_grad_threshold": 0.00005,
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene(SCENE, resolution=8, report=str)
+
+
+def begin(scene, folder, **options):
+    """A trainer and its run, as :func:`warp_splat.train.train` starts them."""
+    return Trainer(scene, TrainConfig(**{**SCHEDULE, **options})), Run(folder, time.perf_counter())
+
+
+def steps(trainer, run, end):
+    """Train until the loss of iteration ``end`` is differentiated, which is where models and checkpoints are saved."""
+    for iteration in range(run.iteration + 1, end + 1):
+        if run.iteration:
+            trainer.update(run.iteration)
+        run.losses.append(trainer.differentiate(iteration))
+        run.iteration = iteration
+
+
+def state_of(trainer, run):
+    """All that the state holds, as bytes and values."""
+    tensors, facts = trainer.state()
+    tensors["losses"] = torch.stack(run.losses)
+    return {name: (tensor.dtype, tensor.shape, tensor.numpy().tobytes()) for name, tensor in tensors.items()}, facts
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"optimizer_type": "sparse_adam", "random_background": True, "coarse": 4, "coarse_until_iter": 40},
+        {"white_background": True, "prune_screen_size": 20, "antialiasing": True, "sh_degree": 1},
+        {"max_gaussians": 5000, "sh_degree": 0, "seed": 7},
+    ],
+    ids=str,
+)
+def test_a_run_that_stops_again_and_again_ends_in_the_same_bytes(options, scene, tmp_path):
+    """At the start, after one step, where the set is about to change and opacities to be reset, and in between."""
+    trainer, run = begin(scene, tmp_path, **options)
+    steps(trainer, run, 50)
+    expected, facts = state_of(trainer, run)
+    trainer, run = begin(scene, tmp_path, **options)
+    for stop in (0, 1, 20, 37):
+        steps(trainer, run, stop)
+        keep(trainer, run)
+        trainer, run = begin(scene, tmp_path, **options)
+        trainer.warm_up()
+        restore(trainer, run, load_checkpoint(tmp_path))
+        assert run.iteration == stop
+    steps(trainer, run, 50)
+    found, found_facts = state_of(trainer, run)
+    assert found_facts == facts and found.keys() == expected.keys()
+    assert [name for name in expected if found[name] != expected[name]] == []
+    assert expected["parameters.means"][1][0] not in (4500, 0) or options.get("max_gaussians")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that was never stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert train(folder, "--threads", "2") == 0
+    return folder
+
+
+def interrupt(monkeypatch, iteration):
+    """Send SIGINT, as Ctrl-C does, while ``iteration`` is computed."""
+    differentiate = Trainer.differentiate
+
+    def interrupted(self, number):
+        if number == iteration:
+            os.kill(os.getpid(), signal.SIGINT)
+        return differentiate(self, number)
+
+    monkeypatch.setattr(Trainer, "differentiate", interrupted)
+
+
+def results(folder):
+    """What a run has measured, without times."""
+    history = json.loads((folder / "history.json").read_text())
+    entry = json.loads((folder / "results.json").read_text())["ours_60"]
+    timed = ("seconds", "iterations_per_second", "peak_memory_mb")
+    return [{k: v for k, v in item.items() if k not in timed} for item in (*history, entry)]
+
+
+def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
+    """Through the command line, with another number of threads; then beyond the end, and what is refused."""
+    folder = tmp_path / "model"
+    with monkeypatch.context() as patch:
+        interrupt(patch, STOP)
+        assert train(folder, "--threads", "2", "--checkpoint_iterations", "20") == 130
+    out = capsys.readouterr().out
+    assert f"To continue after iteration {STOP}: warp-splat train --resume {folder}\n" in out
+    checkpoint, model = load_checkpoint(folder), load_ply(ply_path(folder, STOP))
+    assert np.array_equal(checkpoint.arrays["parameters.means"], model.means)
+    assert safetensors.numpy.load_file(folder / LAST)["parameters.scales"].tobytes() == model.scales.tobytes()
+    named = folder / "chkpnt20.safetensors"
+    assert {path.name for path in folder.glob("*.safetensors")} == {LAST, named.name}
+    (folder / ".tmp-0123456789ab.safetensors").write_bytes(b"left by a process that was killed")
+
+    assert main(["train", "--resume", str(folder), "--threads", "1"]) == 0
+    assert ply_path(folder, 60).read_bytes() == ply_path(whole, 60).read_bytes()
+    assert results(folder) == results(whole)
+    assert not list(folder.glob(".tmp-*")) and "To continue" not in capsys.readouterr().out
+
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert "already holds" in fails(capsys, "train", "-s", str(SCENE), "-m", str(folder))
+    assert f"--resume {folder}" in fails(capsys, "train", "--resume", str(named))
+    assert "at least the 60 after which" in fails(capsys, "train", "--resume", str(folder), "--iterations", "59")
+    for option, value in (("sh_degree", "2"), ("optimizer_type", "sparse_adam"), ("seed", "1"), ("preset", "fast")):
+        assert f"--{option} {value}: expected" in fails(capsys, "train", "--resume", str(folder), f"--{option}", value)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.slow
+def test_at_the_end_and_into_another_folder(whole, tmp_path):
+    """Resuming at the end writes again what is missing; from an earlier checkpoint, another folder is filled."""
+    folder = tmp_path / "model"
+    assert train(folder, "--checkpoint_iterations", "20") == 0
+    ply_path(folder, 60).unlink()  # as if killed after the last checkpoint
+    assert main(["train", "--resume", str(folder)]) == 0
+    assert ply_path(folder, 60).read_bytes() == ply_path(whole, 60).read_bytes() and results(folder) == results(whole)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+    branch = tmp_path / "branch"
+    assert main(["train", "--start_checkpoint", str(folder / "chkpnt20.safetensors"), "-m", str(branch), *SHORT]) == 0
+    assert ply_path(branch, 60).read_bytes() == ply_path(whole, 60).read_bytes()
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.slow
+def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
+    """And with other options, while Gaussians that an earlier end has left settle."""
+    assert train(tmp_path / "longer", "--iterations", "90") == 0
+    assert main(["train", "--resume", str(whole), "--iterations", "90", "--quiet"]) == 0
+    assert ply_path(tmp_path / "longer", 90).read_bytes() == ply_path(whole, 90).read_bytes()
+    options = (
+        "--iterations 120 -r 2 --adjoint stepwise --densify_until_iter 110 --max_gaussians 40000 --white_background"
+    )
+    assert main(["train", "--resume", str(whole), *options.split()]) == 0
+    config = parse(["train", "--resume", str(whole)])
+    assert (config.resolution, config.adjoint, config.max_gaussians, config.sh_interval) == (2, "stepwise", 40000, 15)
+    assert len(load_ply(ply_path(whole, 120)).means) <= 40000
+
+
+def test_another_scene_is_refused(whole, tmp_path, capsys):
+    options = ["--resume", str(whole), "--iterations", "70", "-m", str(tmp_path / "a")]
+    assert "training views" in fails(capsys, "train", *options, "--no-eval")
+    message = fails(capsys, "train", *options, "-s", str(tmp_path))
+    assert str(tmp_path) in message
+
+
+def test_resume_on(device, scene, tmp_path):
+    """A checkpoint of a CPU goes on where one is: the same parameters, then another step."""
+    trainer, run = begin(scene, tmp_path)
+    steps(trainer, run, STOP)
+    keep(trainer, run)
+    other, continued = begin(scene, tmp_path, device=device)
+    restore(other, continued, load_checkpoint(tmp_path))
+    assert all(leaf.device.type == device for leaf in other.model.parameters.values())
+    assert all(table.device.type == device for state in other.optimizer.adam.state.values() for table in state.values())
+    steps(trainer, run, STOP + 2)
+    steps(other, continued, STOP + 2)
+    assert [float(loss) for loss in continued.losses] == pytest.approx([float(loss) for loss in run.losses], rel=1e-3)
+
+
+def test_other_numbers_of_processes(scene, tmp_path):
+    """Statistics are sums over the processes; steps of Adam are counted in images."""
+    trainer, run = begin(scene, tmp_path)
+    steps(trainer, run, STOP)
+    keep(trainer, run)
+    checkpoint = load_checkpoint(tmp_path)
+    config = TrainConfig(**SCHEDULE)
+    pair = [Trainer(scene, config, Pretended(rank, 2)) for rank in (0, 1)]
+    for one in pair:
+        one.restore(checkpoint)
+        assert float(one.optimizer.adam.state[one.model.parameters["means"]]["step"]) * 2 == len(
+            [i for i in range(1, STOP) if i % 10 or i <= 10]
+        )
+    assert torch.equal(pair[0].densifier.gradient, trainer.densifier.gradient)
+    assert not pair[1].densifier.gradient.any() and len(pair[1].densifier.gradient) == len(trainer.model)
+    rows = {name: np.repeat(checkpoint.arrays[f"statistics.{name}"], 3, 0) for name in ("gradient", "views", "radius")}
+    arrays = {**checkpoint.arrays, **{f"statistics.{name}": values for name, values in rows.items()}}
+    save_checkpoint(tmp_path / LAST, arrays, checkpoint.facts)
+    other, _ = begin(scene, tmp_path)
+    other.restore(load_checkpoint(tmp_path))
+    assert torch.allclose(other.densifier.gradient, 3 * trainer.densifier.gradient, rtol=1e-6)
+    assert torch.equal(other.densifier.views, 3 * trainer.densifier.views)
+    assert torch.equal(other.densifier.radius, trainer.densifier.radius)
+
+
+@pytest.mark.slow
+def test_two_processes_stop_and_resume(tmp_path):
+    """The same bytes as without a stop; one process goes on as well."""
+
+    def torchrun(*arguments):
+        command = [*TORCHRUN, ROOT / "train.py", *map(str, arguments)]
+        subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+
+    torchrun("-s", SCENE, "-m", tmp_path / "whole", *SHORT)
+    torchrun("-s", SCENE, "-m", tmp_path / "parts", *SHORT, "--iterations", "34")
+    torchrun("--resume", tmp_path / "parts", "--iterations", "60")
+    assert ply_path(tmp_path / "parts", 60).read_bytes() == ply_path(tmp_path / "whole", 60).read_bytes()
+    assert main(["train", "--resume", str(tmp_path / "parts"), "--iterations", "65", "--quiet"]) == 0
+    assert ply_path(tmp_path / "parts", 65).is_file()
+
+
+WRITER = """
+import itertools, sys, numpy as np
+from warp_splat.formats.checkpoint import save_checkpoint
+for count in itertools.count():
+    save_checkpoint(sys.argv[1], {"a": np.full(500_000, count, np.float32)}, {"count": count})
+    print(count, flush=True)
+"""
+
+
+@pytest.mark.parametrize("moments", [5, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_writer_that_is_killed_leaves_a_whole_checkpoint(moments, tmp_path):
+    path, moment = tmp_path / LAST, random.Random(0)
+    for _ in range(moments):
+        command = [sys.executable, "-c", WRITER, path]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": ROOT})
+        assert process.stdout.readline() == "0\n"
+        time.sleep(moment.uniform(0, 0.1))
+        process.kill()
+        said = [0, *map(int, process.communicate()[0].split())]
+        checkpoint = load_checkpoint(path)
+        count = checkpoint.count("count")
+        assert count in (said[-1], said[-1] + 1) and (checkpoint.arrays["a"] == count).all()
+
+
+@pytest.mark.slow
+def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path):
+    """Killed at 50 random moments, from start-up to the last pictures; a checkpoint is written after every step."""
+    options = [*SHORT, "--iterations", "300", "--checkpoint_interval", "0.00001"]
+    assert train(tmp_path / "whole", *options) == 0
+    moment, kills, runs, reached = random.Random(0), 0, 0, 0
+    while True:
+        folder = tmp_path / f"model{runs}"
+        start = ["--resume", folder] if (folder / LAST).exists() else ["-s", SCENE, "-m", folder, *options]
+        process = subprocess.Popen([sys.executable, ROOT / "train.py", *start], stderr=subprocess.PIPE)
+        try:
+            _, err = process.communicate(timeout=moment.uniform(0.5, 8.0) if kills < 50 else None)
+            assert process.returncode == 0, err
+            assert ply_path(folder, 300).read_bytes() == ply_path(tmp_path / "whole", 300).read_bytes()
+            if kills == 50:
+                break
+            runs, reached = runs + 1, 0
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+            kills += 1
+            if (folder / LAST).exists():
+                before, reached = reached, load_checkpoint(folder).count("iteration")
+                assert reached >= before
+
+
+@pytest.mark.slow
+def test_the_command_that_is_printed_continues(tmp_path):
+    command = [sys.executable, "train.py", "-s", SCENE, "-m", tmp_path, "-r", "8", "--iterations", "100000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    for line in process.stderr:
+        if "it/s" in line:
+            break
+    process.send_signal(signal.SIGINT)
+    out = process.communicate(timeout=120)[0]
+    line = next(line for line in out.splitlines() if line.startswith("To continue after iteration "))
+    reached, continued = line.removeprefix("To continue after iteration ").split(": ", 1)
+    end = str(int(reached) + 5)
+    run = subprocess.run(
+        f"{continued} --iterations {end}", shell=True, check=True, capture_output=True, text=True, cwd=ROOT
+    )
+    assert f"Done after {end} iterations" in run.stdout
+
+
+def test_a_disk_that_is_full_costs_the_checkpoint_only(tmp_path, monkeypatch, capsys):
+    path = tmp_path / LAST
+    save_checkpoint(path, {"a": np.zeros(3, np.float32)}, {"count": 1})
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"checkpoint.safetensors: could not be written .* is untouched"):
+            save_checkpoint(path, {"a": np.zeros(2**20, np.float32)}, {"count": 2})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert load_checkpoint(path).count("count") == 1 and os.listdir(tmp_path) == [LAST]
+
+    def full(path, *rest):
+        raise InputError(f"{path}: could not be written (no space left on device).")
+
+    monkeypatch.setattr("warp_splat.run.save_checkpoint", full)
+    assert train(tmp_path / "model", "--iterations", "5", "--checkpoint_iterations", "3") == 0
+    assert capsys.readouterr().err.count("no space left") == 3  # at the start, after iteration 3, at the end
+    assert ply_path(tmp_path / "model", 5).is_file()
+
+
+@pytest.fixture(scope="module")
+def kept(scene, tmp_path_factory):
+    """A trainer, and the checkpoint that it wrote."""
+    folder = tmp_path_factory.mktemp("kept")
+    trainer, run = begin(scene, folder)
+    steps(trainer, run, 12)
+    run.history.append({"iteration": 5, "loss": 0.5, "psnr": 20.0, "gaussians": 4500, "seconds": 1.0})
+    keep(trainer, run)
+    return trainer, load_checkpoint(folder)
+
+
+def one_sentence(error, path):
+    message = str(error.value if hasattr(error, "value") else error)
+    assert message.startswith(str(path)) and "\n" not in message and len(message) < 600 + 2 * len(str(path))
+    return message
+
+
+def test_damage_is_found(kept, tmp_path):
+    """Cut anywhere, or one bit changed anywhere: the file is refused, in little memory."""
+    data, path, place = kept[1].path.read_bytes(), tmp_path / "a.safetensors", random.Random(0)
+    files = [data[: place.randrange(len(data))] for _ in range(20)] + [b"", data[:7], data[:-1], data + b"\0"]
+    for _ in range(40):
+        where = place.choice([place.randrange(len(data)), place.randrange(2000)])
+        flipped = bytes([data[where] ^ 1 << place.randrange(8)])
+        files.append(data[:where] + flipped + data[where + 1 :])
+    lie = json.dumps({"a": {"dtype": "F32", "shape": [10**12], "data_offsets": [0, 4 * 10**12]}}).encode()
+    files += [struct.pack("<Q", 10**18), struct.pack("<Q", len(lie)) + lie, struct.pack("<Q", 90_000) + b"[" * 90_000]
+    for content in files:
+        path.write_bytes(content)
+        tracemalloc.start()
+        with pytest.raises(InputError) as error:
+            load_checkpoint(path)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        one_sentence(error, path)
+        assert peak < 3 * len(content) + 2**20
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, ("no such file",)),
+        ({"name": "chkpnt7000.pth"}, ("can run code", ".ply")),
+        ({"metadata": None}, ("other safetensors",)),
+        ({"metadata": {"warp_splat": "[1"}}, ("damaged",)),
+        ({"metadata": {"warp_splat": "[" * 100_000}}, ("damaged", "nested")),
+        ({"metadata": {"warp_splat": '{"format": 99}'}}, ("format 99", "newer")),
+        ({"metadata": {"warp_splat": '{"format": 1}'}}, ("checksum",)),
+    ],
+    ids=str,
+)
+def test_what_is_no_checkpoint(content, words, tmp_path, capsys):
+    path = tmp_path / "a.safetensors"
+    if content:
+        path = tmp_path / content.get("name", path.name)
+        safetensors.numpy.save_file({"a": np.zeros(3, np.float32)}, path, content.get("metadata"))
+    with pytest.raises(InputError) as error:
+        load_checkpoint(path)
+    assert all(word in one_sentence(error, path) for word in words)
+    assert str(path) in fails(capsys, "train", "--resume", str(path))
+
+
+def test_a_folder_without_its_last_checkpoint(kept, tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        load_options(tmp_path)
+    save_checkpoint(tmp_path / "chkpnt7.safetensors", kept[1].arrays, kept[1].facts)
+    with pytest.raises(InputError, match=r"chkpnt7.safetensors can be named"):
+        load_options(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("iterations", "60"),
+        ("iterations", 0),
+        ("iterations", 10**30),
+        ("iterations", True),
+        ("optimizer_type", "sgd"),
+        ("lambda_dssim", 2.0),
+        ("lambda_dssim", float("nan")),
+        ("save_iterations", [1, "2"]),
+        ("source_path", None),
+        ("unheard_of", 1),
+    ],
+)
+def test_impossible_options(option, value, kept, tmp_path):
+    facts = {**kept[1].facts, "options": {**kept[1].facts["options"], option: value}}
+    save_checkpoint(tmp_path / LAST, {}, facts)
+    with pytest.raises(InputError) as error:
+        load_options(tmp_path)
+    assert option in one_sentence(error, tmp_path / LAST)
+    del facts["options"][option]  # an older program may not have known it
+    save_checkpoint(tmp_path / LAST, {}, facts)
+    assert load_options(tmp_path).get(option) == getattr(TrainConfig(), option, None)
+
+
+def test_a_generator_that_would_read_beyond_its_words(kept, tmp_path):
+    """Torch itself takes this state."""
+    state = kept[1].arrays["random.background"].copy()
+    struct.pack_into("<iiQ", state, 8, 624, 1, 624)
+    torch.Generator().set_state(torch.from_numpy(state.copy()))
+    save_checkpoint(tmp_path / LAST, {**kept[1].arrays, "random.background": state}, kept[1].facts)
+    with pytest.raises(InputError, match="generator"):
+        kept[0].restore(load_checkpoint(tmp_path))
+
+
+@st.composite
+def forged(draw, arrays, facts):
+    """A checkpoint with a right checksum and wrong contents."""
+    if draw(st.booleans()):
+        facts = changed_json(draw, facts)
+    arrays = dict(arrays)
+    for name in draw(st.lists(st.sampled_from(sorted(arrays)), max_size=3)):
+        array = arrays.pop(name, None)
+        match draw(st.sampled_from(["remove", "cut", "fill", "bits", "dtype"])):
+            case "cut" if array is not None and array.ndim:
+                arrays[name] = array[: draw(st.integers(0, len(array)))]
+            case "fill" if array is not None:
+                value = draw(st.sampled_from([0, 1, 2**31 - 1, -1, 255]))
+                arrays[name] = np.full_like(array, np.array(value).astype(array.dtype))
+            case "bits" if array is not None:
+                filled = np.frombuffer(draw(st.binary(min_size=1, max_size=8)) * array.nbytes, np.uint8, array.nbytes)
+                arrays[name] = filled.view(array.dtype).reshape(array.shape) if array.ndim else array
+            case "dtype" if array is not None:
+                arrays[name] = array.astype(np.float64 if array.dtype == np.float32 else np.float32)
+    return arrays, facts
+
+
+def survive(path, trainer):
+    """Load and restore; if that is not refused, train for a step. Whether it was restored."""
+    try:
+        load_options(path)
+        checkpoint = load_checkpoint(path)
+        run = Run(path.parent, time.perf_counter())
+        restore(trainer, run, checkpoint)
+    except InputError as error:
+        one_sentence(error, path)
+        return False
+    with warnings.catch_warnings(action="error"):
+        trainer.update(12)
+        trainer.differentiate(13)
+    return True
+
+
+@pytest.mark.parametrize("examples", [60, pytest.param(3000, marks=pytest.mark.slow)])
+def test_forged_checkpoints(examples, kept, scene, tmp_path):
+    trainer = begin(scene, tmp_path)[0]
+    arrays, facts, path = kept[1].arrays, kept[1].facts, tmp_path / LAST
+
+    @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(forged(arrays, facts))
+    def check(content):
+        save_checkpoint(path, *content)
+        survive(path, trainer)
+
+    check()
+
+
+@pytest.mark.parametrize("examples", [100, pytest.param(5000, marks=pytest.mark.slow)])
+def test_changed_bytes(examples, tmp_path, kept):
+    """A small file with bytes changed, inserted, removed, repeated, cut: most of it is the header."""
+    path = tmp_path / LAST
+    save_checkpoint(path, {"losses": np.zeros(3, np.float32), "radii": np.zeros(4, np.int32)}, kept[1].facts)
+    data = path.read_bytes()
+
+    @st.composite
+    def other(draw):
+        return changed(draw, data)
+
+    @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck), database=None)
+    @given(other())
+    def check(content):
+        path.write_bytes(content)
+        for load in (load_checkpoint, load_options):
+            try:
+                load(path)
+            except InputError as error:
+                one_sentence(error, path)
+
+    check()

@@ -1,0 +1,228 @@
+"""Checkpoints: a file of safetensors, so that reading one runs no code, whoever wrote it.
+
+Arrays have names; all else is one JSON text in the file's metadata. safetensors proves, before anything is allocated,
+that the arrays fill the file exactly; a CRC-32 of names, shapes, bytes and text finds what was damaged.
+docs/checkpoints.md lists the names.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from warp_splat import __version__
+from warp_splat.config import TrainConfig, check_train
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.reading import Unexpected, reading
+
+LAST = "checkpoint.safetensors"  # where the run in a model folder stands
+FORMAT = 1  # rises when older programs could not read what newer ones write
+DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "U8": np.uint8}
+EXPECTED = "a checkpoint of this program"
+GENERATOR_BYTES, TWISTER_WORDS = 5056, 624  # of the state of torch's generator on the CPU, a Mersenne Twister
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a file holds. The methods check what they return; they raise InputError if it is not as expected."""
+
+    path: Path
+    arrays: Mapping[str, np.ndarray]
+    facts: Mapping[str, Any]
+
+    def array(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+        """An array by name, of ``dtype`` and ``shape``; -1 stands for any length but 0."""
+        found = self.arrays.get(name, np.zeros(0, bool))
+        fits = len(found.shape) == len(shape) and all(
+            length == wanted or (wanted == -1 and length > 0) for length, wanted in zip(found.shape, shape, strict=True)
+        )
+        if not fits or found.dtype != dtype:
+            raise InputError(
+                f"{self.path}: expected {name!r} as {np.dtype(dtype)} {list(shape)}, found {found.dtype} "
+                f"{list(found.shape)}; start from another checkpoint."
+            )
+        return found
+
+    def fact(self, name: str, kind: type) -> Any:
+        """A value of exactly this type."""
+        found = self.facts.get(name)
+        if type(found) is not kind:
+            raise InputError(
+                f"{self.path}: expected {name!r} as {kind.__name__}, found {type(found).__name__}; start from another "
+                "checkpoint."
+            )
+        return found
+
+    def count(self, name: str) -> int:
+        """A whole number, 0 to 2^63 - 1."""
+        found = self.fact(name, int)
+        if not 0 <= found < 2**63:
+            raise InputError(f"{self.path}: expected {name!r} as 0 to 2^63 - 1, found another; start from another one.")
+        return found
+
+    def generator(self, name: str) -> np.ndarray:
+        """The state of a generator of torch; its place is checked, by which torch would read beyond its words."""
+        state = self.array(name, (GENERATOR_BYTES,), np.uint8)
+        left, seeded, place = struct.unpack_from("<iiQ", state, 8)
+        if seeded != 1 or not 1 <= left <= TWISTER_WORDS or place + left > TWISTER_WORDS + 1:
+            raise InputError(f"{self.path}: expected {name!r} as a generator's state, found other bytes.")
+        return state
+
+
+def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
+    """Write a checkpoint; an older one of this name is replaced when the new one is complete, on the disk.
+
+    Args:
+        path: the file.
+        arrays: float32, float64, int32 or uint8.
+        facts: values of JSON.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    text = json.dumps({"format": FORMAT, "version": __version__, **facts})
+    header: dict[str, Any] = {"__metadata__": {"warp_splat": text, "crc32": _checksum(text, arrays)}}
+    end = 0
+    for name, array in arrays.items():
+        start, end = end, end + array.nbytes
+        dtype = next(key for key, kind in DTYPES.items() if kind == array.dtype)
+        header[name] = {"dtype": dtype, "shape": array.shape, "data_offsets": [start, end]}
+    encoded = json.dumps(header).encode()
+    encoded += b" " * (-len(encoded) % 8)
+    # Tried: safetensors' save_file; what it writes only the owner may read, and if killed it leaves a file of its own
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(struct.pack("<Q", len(encoded)) + encoded)
+        for array in arrays.values():
+            file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint: a file, or that of a model folder.
+
+    Raises:
+        InputError: if there is none, or it is damaged, cut short, of a newer program, or something else.
+    """
+    path = find_checkpoint(path)
+    with _opened(path) as file:
+        text, facts = _facts(file)
+        arrays = {}
+        for name in file.keys():
+            dtype = file.get_slice(name).get_dtype()
+            if dtype not in DTYPES:
+                raise Unexpected(f"an array of {dtype}")
+            arrays[name] = file.get_tensor(name)
+        if file.metadata().get("crc32") != _checksum(text, arrays):
+            raise ValueError("its checksum does not match")
+    return Checkpoint(path, arrays, facts)
+
+
+def load_options(path: str | Path) -> dict[str, Any]:
+    """The training options in a checkpoint, by name; only the beginning of the file is read.
+
+    Raises:
+        InputError: as :func:`load_checkpoint`, or if an option is unknown or has an impossible value.
+    """
+    path = find_checkpoint(path)
+    with _opened(path) as file:
+        found = _facts(file)[1].get("options")
+        if not isinstance(found, dict):
+            raise Unexpected("one without options")
+        config = TrainConfig()
+        for item in fields(TrainConfig):
+            if item.name in found:
+                value = found.pop(item.name)
+                if not _is_like(value, getattr(config, item.name)) or value not in (
+                    item.metadata["choices"] or [value]
+                ):
+                    raise Unexpected(f"{value!r:.50} as its option {item.name}")
+                setattr(config, item.name, value)
+        if found:
+            raise Unexpected(f"an option that it does not have, {next(iter(found))!r:.50}")
+        if problem := check_train(config):
+            raise Unexpected(f"an impossible option ({problem.rstrip('.')})")
+    return asdict(config)
+
+
+def find_checkpoint(path: str | Path) -> Path:
+    """The file of a checkpoint; in a model folder, that of the last.
+
+    Raises:
+        InputError: if there is none, or it is a file of torch's pickles.
+    """
+    path = Path(path)
+    if path.is_dir():
+        others = sorted(path.glob("*.safetensors"))
+        path /= LAST
+        if not path.is_file() and others:
+            raise InputError(f"{path}: no such file; {others[-1]} can be named instead.")
+    if path.suffix in (".pth", ".pt", ".ckpt"):
+        raise InputError(
+            f"{path}: expected {EXPECTED} ({LAST}), found one of torch's, which can run code when it is read; convert "
+            "its Gaussians to .ply with the program that wrote it."
+        )
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a model folder with {LAST}, or a checkpoint in it.")
+    return path
+
+
+def remove_leftovers(folder: str | Path) -> None:
+    """Remove half-written checkpoints of a process that was killed: each may be as large as a whole one."""
+    for path in Path(folder).glob(".tmp-*.safetensors"):
+        path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    with reading(path, EXPECTED):
+        try:
+            with safe_open(path, framework="numpy") as file:
+                yield file
+        except SafetensorError as error:
+            raise ValueError(str(error)) from error
+
+
+def _facts(file: Any) -> tuple[str, dict[str, Any]]:
+    """The JSON text and its values."""
+    text = (file.metadata() or {}).get("warp_splat")
+    if text is None:
+        raise Unexpected("other safetensors")
+    try:
+        facts = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("JSON that is nested too deep") from error
+    found = facts.get("format") if isinstance(facts, dict) else None
+    if type(found) is not int:
+        raise Unexpected("one without a format number")
+    if found > FORMAT:
+        raise Unexpected(f"one of format {found!r:.20} (this program knows up to {FORMAT}); install a newer version")
+    return text, facts
+
+
+def _is_like(value: Any, default: Any) -> bool:
+    """Whether ``value`` can stand in the place of an option's default."""
+    if isinstance(default, list):
+        return type(value) is list and all(_is_like(item, 0) for item in value)
+    if type(default) is float:
+        return type(value) is float or _is_like(value, 0)
+    return type(value) is type(default) and (type(value) is not int or abs(value) < 2**63)
+
+
+def _checksum(text: str, arrays: Mapping[str, np.ndarray]) -> str:
+    """CRC-32 of all that a checkpoint holds, as hexadecimal digits."""
+    crc = zlib.crc32(text.encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape}".encode(), crc)
+        crc = zlib.crc32(array.reshape(-1).view(np.uint8), crc)
+    return f"{crc:08x}"
