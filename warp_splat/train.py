@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warp_splat import launch, report
+from warp_splat import forecast, launch, report
 from warp_splat.config import TrainConfig, check_train
 from warp_splat.devices import memory_explained, peak_memory
 from warp_splat.distributed import GroupError, Processes, join
@@ -105,6 +105,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     with _memory_explained(trainer):
         trainer.warm_up()
         say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
+        if device.type == "cpu":
+            say(forecast.describe(scene, config, processes.local_count))
         with _interruptible() as interrupted:
             try:
                 _loop(trainer, run, interrupted)
