@@ -9,7 +9,8 @@ import warp as wp
 
 from warp_splat.config import TrainConfig
 from warp_splat.gaussians import GaussianModel
-from warp_splat.kernels.adam import adam_rows
+from warp_splat.kernels.adam import make_adam
+from warp_splat.kernels.lanes import LANES
 from warp_splat.launch import launch, view
 
 BETAS = (0.9, 0.999)
@@ -71,13 +72,16 @@ class Optimizer:
         state = self.adam.state[parameter]
         if not state:
             state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=torch.tensor(0.0))
-        tables = [tensor.detach().view(len(radii), -1) for tensor in (parameter, *(state[name] for name in MOMENTS))]
-        grad = parameter.grad.reshape(len(radii), -1)
+        numbers = parameter.numel() // len(radii)
+        pieces = -(-numbers // LANES)
+        columns = numbers // pieces  # of 1, 3, 4, 9, 24 or 45: these divide
+        tables = [tensor.detach().view(-1, columns) for tensor in (parameter, *(state[name] for name in MOMENTS))]
+        grad, row = parameter.grad.reshape(-1, columns), wp.types.vector(length=columns, dtype=float)
         launch(
-            adam_rows,
-            len(radii),
-            [view(radii, wp.int32), view(grad, wp.float32), group["lr"], *group["betas"], group["eps"]],
-            [view(table, wp.float32) for table in tables],
+            make_adam(columns, pieces),
+            len(grad),
+            [view(radii, wp.int32), view(grad, row), group["lr"], *group["betas"], group["eps"]],
+            [view(table, row) for table in tables],
             device=radii.device,
         )
 
