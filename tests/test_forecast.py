@@ -14,7 +14,7 @@ from warp_splat.scene.types import Scene, View
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-import scaling  # noqa: E402
+import scaling
 
 
 @pytest.fixture
