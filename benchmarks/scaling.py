@@ -66,7 +66,7 @@ GROWTH = (
 )
 
 
-def measure(count: int, width: int, height: int, size: float, faint: bool) -> dict:
+def measure(count: int, width: int, height: int, size: float, faint: bool, seconds: float = SECONDS) -> dict:
     """One point, in this process: milliseconds of a step and of its stages, peak and forecast in MiB."""
     launch.prepare("cpu", 0)
     small = make_trainer(64, 2 * TILE, TILE, "cpu")  # loads every kernel
@@ -82,7 +82,7 @@ def measure(count: int, width: int, height: int, size: float, faint: bool) -> di
     for iteration in range(10, 13):
         take_step(trainer, iteration)
     change_set(trainer)
-    while len(steps) < REPEATS[0] or (len(steps) < REPEATS[1] and sum(steps) < SECONDS):
+    while len(steps) < REPEATS[0] or (len(steps) < REPEATS[1] and sum(steps) < seconds):
         with launch.profile() as profile:
             start = time.perf_counter()
             take_step(trainer, 13 + len(steps))

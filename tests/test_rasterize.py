@@ -294,7 +294,7 @@ def test_several_views_equal_separate_calls(device):
         sum((out.image.square().sum() + out.alpha.sum()) for out in outputs).backward()
         gradients = {name: leaf.grad for name, leaf in leaves.items()}
         results.append((outputs, gradients, [out.means2d.grad for out in outputs]))
-    check_image(results[0][0][0], expected)
+    check_image(results[0][0][0], expected.out)
     assert [out.image.shape for out in results[0][0]] == [(c.height, c.width, 3) for c in cameras]
     for a, b in zip(results[0][0], results[1][0], strict=True):
         assert equal((a, {}), (b, {}))

@@ -61,7 +61,8 @@ def step_memory(gaussians: int, coefficients: int, instances: int, pixels: int, 
         adjoint: one of ADJOINTS.
     """
     parameters = 3 + 4 + 3 + 1 + 3 * coefficients  # means, quats, scales, opacities, sh
-    changing = 2 * max(4, 3 * (coefficients - 1))  # the largest of them while the set changes: rows kept, all rows
+    # while the set changes: all of the old one, and the largest tensor twice, as rows kept and with those added
+    changing = parameters + 2 * max(4, 3 * (coefficients - 1))
     of_gaussian = COPIES * parameters + changing + PER_GAUSSIAN
     of_instance = PER_INSTANCE + (STATES if adjoint == "stored" else 0)
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * PER_PIXEL)
