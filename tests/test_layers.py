@@ -11,7 +11,7 @@ LAYERS = [
     {"kernels"},
     {"camera", "devices", "launch", "distributed", "formats", "interrupts", "scene.types"},
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
-    {"gaussians", "optimizer", "densify"},
+    {"gaussians", "optimizer", "densify", "forecast"},
     {"trainer", "selftest", "report", "evaluate", "gradcheck", "differences"},
     {"run", "train", "render", "convert", "sfm", "doctor"},
     {"compare"},

@@ -5,8 +5,9 @@ Gaussian's share. Their upstream gradients are zero, so that the gradients do no
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import scenes
 import torch
@@ -272,6 +273,34 @@ def test_bit_identical_between_thread_counts(name, device):
     finally:
         warp_splat.set_threads(threads)
     assert equal(*results)
+
+
+def test_several_views_equal_separate_calls(device):
+    """Outputs and gradients, bit for bit, for cameras of different sizes; of the first, against float64 as well."""
+    expected = truth("degree3", PLAIN)
+    first = expected.scene.camera
+    moved = replace(first, translation=first.translation + np.array([0.2, -0.1, 0.3]))
+    cameras = [first, first.resized(31, 47), moved]
+    results = []
+    for together in (True, False):
+        leaves = leaves_of(expected.scene.to(device))
+        gaussians, background = [leaves[name] for name in PARAMETERS], leaves["background"]
+        if together:
+            outputs = warp_splat.rasterize_views(*gaussians, cameras, background)
+        else:
+            outputs = [warp_splat.rasterize(*gaussians, camera, background) for camera in cameras]
+        for out in outputs:
+            out.means2d.retain_grad()
+        sum((out.image.square().sum() + out.alpha.sum()) for out in outputs).backward()
+        gradients = {name: leaf.grad for name, leaf in leaves.items()}
+        results.append((outputs, gradients, [out.means2d.grad for out in outputs]))
+    check_image(results[0][0][0], expected.out)
+    assert [out.image.shape for out in results[0][0]] == [(c.height, c.width, 3) for c in cameras]
+    for a, b in zip(results[0][0], results[1][0], strict=True):
+        assert equal((a, {}), (b, {}))
+    assert all(torch.equal(results[0][1][name], results[1][1][name]) for name in results[0][1])
+    assert all(torch.equal(a, b) and a.abs().max() > 0 for a, b in zip(results[0][2], results[1][2], strict=True))
+    assert warp_splat.rasterize_views(*gaussians, []) == []
 
 
 def test_sh_pair_equals_sh_tensor(device):

@@ -124,6 +124,15 @@ def test_camera(camera, device):
         call(device, camera=camera)
 
 
+@pytest.mark.parametrize(
+    "cameras", [SCENE.camera, None, iter(()), [SCENE.camera, None]], ids=["one", "None", "iterator", "list"]
+)
+def test_cameras(cameras, device):
+    found = "NoneType" if isinstance(cameras, list) else type(cameras).__name__
+    with pytest.raises(InputError, match=f"(?s)camera.*{found}"):
+        warp_splat.rasterize_views(*SCENE.to(device).parameters(), cameras)
+
+
 @pytest.mark.parametrize("name", ["magic", None])
 def test_adjoint(name, device):
     with pytest.raises(InputError, match=rf"(?s)adjoint.*{name}"):

@@ -17,6 +17,7 @@ _HOMES = {
     "get_threads": "launch",
     "load_scene": "scene",
     "rasterize": "renderer",
+    "rasterize_views": "renderer",
     "set_threads": "launch",
 }
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "get_threads",
     "load_scene",
     "rasterize",
+    "rasterize_views",
     "set_threads",
 ]
 
@@ -37,7 +39,7 @@ if TYPE_CHECKING:
     from warp_splat.errors import InputError
     from warp_splat.gradcheck import check_gradients
     from warp_splat.launch import get_threads, set_threads
-    from warp_splat.renderer import RenderOutput, rasterize
+    from warp_splat.renderer import RenderOutput, rasterize, rasterize_views
     from warp_splat.scene import load_scene
 
 

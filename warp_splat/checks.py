@@ -12,10 +12,14 @@ from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, Raste
 from warp_splat.errors import InputError
 
 
-def check_options(adjoint: str, options: RasterOptions | None, camera: Camera) -> RasterOptions:
-    """The options to use, numbers as Python's. Raises InputError for an unknown adjoint, option or camera."""
+def check_camera(camera: Camera) -> None:
+    """Raise InputError if ``camera`` is something else."""
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
+
+
+def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
+    """The options to use, numbers as Python's. Raises InputError for an unknown adjoint or option."""
     if adjoint not in ADJOINTS:
         raise InputError(f"adjoint: expected one of {', '.join(ADJOINTS)}, got {adjoint!r}.")
     options = options or RasterOptions()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.checks import check_background, check_gaussians, check_options, explain_invalid
+from warp_splat.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.differences import INPUTS, INTERMEDIATES, RUNGS, MovableScene, Trial, try_direction, try_directions
 from warp_splat.errors import InputError
@@ -155,7 +155,8 @@ def _check(adjoint, options, camera, parameters, directions, tolerance) -> Raste
         raise InputError(f"directions: expected a whole number, at least 1, got {directions!r}.")
     if not (isinstance(tolerance, (int, float)) and 0 < tolerance < 1):
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}.")
-    return check_options(ADJOINTS[0], options, camera)
+    check_camera(camera)
+    return check_options(ADJOINTS[0], options)
 
 
 def _rms(values: Sequence[float]) -> float:

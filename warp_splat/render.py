@@ -170,18 +170,27 @@ def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     return center, up / np.linalg.norm(up), distance
 
 
+def focus_orbit(scene: Scene, count: int) -> list[Camera]:
+    """``count`` cameras around the point that the scene's cameras look at, level with it and as far from it as they.
+
+    Raises:
+        InputError: if there is no such point.
+    """
+    center, up, distance = focus_point(scene)
+    first = scene.train[0].camera.center - center
+    level = first - np.dot(first, up) * up
+    if not (distance > 1e-6 and np.linalg.norm(level) > 1e-6 * distance):
+        raise InputError("--orbit_center focus: the cameras look at no common point; use --orbit_center origin.")
+    return orbit_cameras(center, up, center + distance * level / np.linalg.norm(level), count)
+
+
 def _orbit(picture: Callable[[Camera], np.ndarray], scene: Scene | None, output: str) -> None:
     """Ten frames to warm up, a hundred timed; keep them if ``output`` says where."""
     if scene is None:
-        center, up, start = np.zeros(3), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -ORBIT_RADIUS])
+        up, start = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -ORBIT_RADIUS])
+        cameras = orbit_cameras(np.zeros(3), up, start, FRAMES)
     else:
-        center, up, distance = focus_point(scene)
-        first = scene.train[0].camera.center - center
-        level = first - np.dot(first, up) * up
-        if not (distance > 1e-6 and np.linalg.norm(level) > 1e-6 * distance):
-            raise InputError("--orbit_center focus: the cameras look at no common point; use --orbit_center origin.")
-        start = center + distance * level / np.linalg.norm(level)
-    cameras = orbit_cameras(center, up, start, FRAMES)
+        cameras = focus_orbit(scene, FRAMES)
     for camera in cameras[:WARM_UP]:
         picture(camera)
     start = time.perf_counter()

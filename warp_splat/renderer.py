@@ -6,6 +6,7 @@ are torch tensors with gradients of their own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,8 +16,9 @@ import warp as wp
 from warp_splat.binning import bin_tiles, views2d
 from warp_splat.blocks import adjoint_of_blocks, blend_blocks
 from warp_splat.camera import Camera
-from warp_splat.checks import check_background, check_gaussians, check_options, explain_invalid
+from warp_splat.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
+from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.project import UNSEEN, CameraView, project, quarantine
 from warp_splat.lanes import adjoint_of_lanes, blend_lanes
@@ -100,13 +102,60 @@ def rasterize(
         InputError: if a shape, dtype, device or value is not as stated (the message names the argument), or if the
             memory does not suffice for "stored".
     """
-    options = check_options(adjoint, options, camera)
+    return _checked(means, quats, scales, opacities, sh, [camera], background, adjoint, options)[0]
+
+
+def rasterize_views(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    cameras: Sequence[Camera],
+    background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    adjoint: str = "manual",
+    options: RasterOptions | None = None,
+) -> list[RenderOutput]:
+    """:func:`rasterize` through each of ``cameras``, which may differ in size; the Gaussians are checked but once.
+
+    Outputs and gradients are those of separate calls, bit for bit. Without gradients an output keeps 56 bytes per
+    Gaussian besides its image; with gradients it keeps what its adjoint reads, until that has run.
+
+    Args:
+        means: as in :func:`rasterize`, like all but ``cameras``.
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        sh: [N, K, 3], or the pair.
+        cameras: any number.
+        background: RGB, the same in all images.
+        adjoint: how the pixel loop is differentiated.
+        options: what to compute.
+
+    Returns:
+        A :class:`RenderOutput` for each camera, in their order.
+
+    Raises:
+        InputError: as :func:`rasterize` does.
+    """
+    if isinstance(cameras, Camera) or not isinstance(cameras, Sequence):
+        raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
+    return _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options)
+
+
+def _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options) -> list[RenderOutput]:
+    """See :func:`rasterize_views`."""
+    for camera in cameras:
+        check_camera(camera)
+    options = check_options(adjoint, options)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = check_background(background, means.device)
-    out = render(gaussians, camera, background, options, adjoint)
-    if out.invalid:
-        explain_invalid(out.invalid, gaussians[1])
-    return out
+    outputs = []
+    for camera in cameras:
+        outputs.append(render(gaussians, camera, background, options, adjoint))
+        if outputs[-1].invalid:
+            explain_invalid(outputs[-1].invalid, gaussians[1])
+    return outputs
 
 
 def render(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warp_splat import launch
+from warp_splat import forecast, launch
 from warp_splat.config import TrainConfig, check_train
 from warp_splat.devices import memory_explained
 from warp_splat.distributed import GroupError, Processes, join
@@ -102,6 +102,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
             del checkpoint  # its arrays take as much memory as the trainer's
         else:
             keep(trainer, run)
+        if device.type == "cpu":
+            say(forecast.describe(scene, config, len(trainer.model), processes.local_count))
         return _run(trainer, run, say)
 
 

@@ -1,0 +1,66 @@
+"""The memory that is forecast is the memory that is taken, and the user is told on what grounds."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from warp_splat import forecast
+from warp_splat.camera import Camera
+from warp_splat.config import TrainConfig
+from warp_splat.scene.types import Scene, View
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import scaling
+
+
+@pytest.fixture
+def scene():
+    camera = Camera(600, 400, 500.0, 500.0, 300.0, 200.0, np.eye(3), np.zeros(3))
+    view = View("one.png", camera, np.zeros((400, 600, 3), np.uint8), camera)
+    return Scene([view], [], np.zeros((5000, 3), np.float32), np.zeros((5000, 3), np.uint8))
+
+
+@pytest.mark.parametrize("point", [(200_000, 64, 64), (1000, 1200, 900)], ids=str)
+def test_forecast_is_what_a_step_takes(point):
+    """In a process of its own, beyond what that takes before the first step."""
+    found = scaling.measure_apart([*point, 1.0, False, 0.0])
+    loaded = found["peak"] - found["added"]
+    assert found["forecast"] - loaded == pytest.approx(found["added"], rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("options", "count", "reason"),
+    [
+        ({"max_gaussians": 70_000}, 70_000, "(--max_gaussians)."),
+        ({"max_gaussians": 70}, 5000, "(--max_gaussians)."),
+        ({"iterations": 400}, 5000, "(as at the beginning)"),
+        ({"densify_until_iter": 0, "max_gaussians": 70_000}, 5000, "(as at the beginning)."),
+        ({}, 120_000, "for 2 px of a photograph; --max_gaussians limits them), 1.8 GiB more for each further million."),
+    ],
+)
+def test_grounds(scene, options, count, reason):
+    told = forecast.describe(scene, TrainConfig(**options), len(scene.points))
+    assert told.startswith("About ") and f" at {count} Gaussians (" in told and reason in told
+
+
+def test_what_does_not_fit_is_told(scene, monkeypatch):
+    pair = forecast.step_memory(10**6, 16, 3 * 10**6, 600 * 400) * 2
+    own = forecast.GIB
+    monkeypatch.setattr(
+        forecast.psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=own))
+    )
+    config = TrainConfig(max_gaussians=10**6)
+    for available, fits in ((pair, True), (pair - 2, False)):
+        monkeypatch.setattr(forecast, "available_memory", lambda device, available=available: available)
+        told = forecast.describe(scene, config, len(scene.points), processes=2)
+        assert "in each of 2 processes" in told and f"{(own + pair / 2) / forecast.GIB:.1f} GiB" in told
+        assert ("(-r)" not in told and "Only" not in told) if fits else ("(-r)" in told and "Only" in told)
+
+
+def test_stored_states_are_counted():
+    more = forecast.step_memory(10, 16, 1000, 100, "stored") - forecast.step_memory(10, 16, 1000, 100)
+    assert more == 1000 * 1024

@@ -1,0 +1,107 @@
+"""How much memory training will take, told before it does: the tensors of a step on the CPU, counted.
+
+They are counted as if none took the place of one that was freed, since the pieces of a heap seldom fit what comes next:
+``benchmarks/scaling.py`` compares with measured peaks.
+"""
+
+from __future__ import annotations
+
+import psutil
+import torch
+
+from warp_splat.config import TILE, TrainConfig
+from warp_splat.launch import available_memory
+from warp_splat.scene.types import Scene
+
+FLOAT, GIB = 4, 2**30  # bytes
+INSTANCES = 3  # of a Gaussian, guessed: 1.4 to 2.8 on photographs of 270 x 480 and 540 x 960 px
+PIXELS = 2  # per Gaussian, guessed where nothing limits their number: 2.2 after 7,000 iterations at 540 x 960 px
+
+COPIES = 4  # of a parameter: itself, its gradient, and the two moments of Adam
+#: Floats of a Gaussian besides its parameters.
+PER_GAUSSIAN = sum(
+    (
+        3 + 3 + 1,  # clamped scales, scales, opacities
+        2 + 3 + 1 + 3 + 1 + 2 + 1 + 1,  # means2d, conics, opacities2d, colors, depths, extents, radii (twice)
+        2 + 3 + 1 + 3 + 1,  # their gradients, without those of the last three
+        3 + 1 + 1,  # gradients of scales and opacities before activation, and whether one is not finite
+        2 + 2 + 3,  # depths and indices in the sort, indices of the drawn (32 and 64 bits)
+        12 + 2 + 2,  # Splat2D, and where its rows and slots end (64 bits)
+        3 + 3,  # densification: its statistics, and what is added to them
+    )
+)
+#: Floats of a tile instance.
+PER_INSTANCE = sum(
+    (
+        2 + 9,  # (rank, slot), and its row of gradients
+        2,  # the span of a row of tiles that one Gaussian touches, at most one for each instance
+    )
+)
+STATES = TILE * TILE  # floats of a tile instance more, for --adjoint stored
+#: Floats of a pixel.
+PER_PIXEL = sum(
+    (
+        3 + 1 + 1 + 1,  # image, alpha, transmittance and steps in blocks
+        3 + 3,  # the image clamped, the photograph as floats
+        3 + 3 + 15 + 9,  # loss: both images with margins, five moments and three slopes of SSIM
+        9 + 3 + 3,  # their adjoints: slopes blurred, image, image before it was clamped
+        3 + 1 + 1,  # upstream gradients of image and transmittance in blocks, of alpha
+    )
+)
+
+
+def step_memory(gaussians: int, coefficients: int, instances: int, pixels: int, adjoint: str = "manual") -> int:
+    """Bytes that training steps take on the CPU, beyond what the process takes before the first.
+
+    Args:
+        gaussians: N.
+        coefficients: of spherical harmonics, K for each channel.
+        instances: pairs of a Gaussian and a tile that it touches.
+        pixels: of a view.
+        adjoint: one of ADJOINTS.
+    """
+    parameters = 3 + 4 + 3 + 1 + 3 * coefficients  # means, quats, scales, opacities, sh
+    # while the set changes: all of the old one, and the largest tensor twice, as rows kept and with those added
+    changing = parameters + 2 * max(4, 3 * (coefficients - 1))
+    of_gaussian = COPIES * parameters + changing + PER_GAUSSIAN
+    of_instance = PER_INSTANCE + (STATES if adjoint == "stored" else 0)
+    return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * PER_PIXEL)
+
+
+def describe(scene: Scene, config: TrainConfig, gaussians: int, processes: int = 1) -> str:
+    """What to tell the user once kernels are loaded: memory and the Gaussians assumed, and whether that can be had.
+
+    Args:
+        scene: its photographs are in memory already.
+        config: options of the run.
+        gaussians: that it begins with.
+        processes: that train on this machine, each in memory of its own.
+    """
+    pixels = max(view.camera.width * view.camera.height for view in scene.train)
+    count, reason = expected_gaussians(gaussians, pixels, config)
+
+    def step(gaussians: int) -> int:
+        return step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, pixels, config.adjoint)
+
+    base, needed = psutil.Process().memory_info().rss, step(count)
+    each = f" in each of {processes} processes" if processes > 1 else ""
+    text = f"About {(base + needed) / GIB:.1f} GiB of memory{each} at {count} Gaussians ({reason})"
+    if not config.max_gaussians:
+        text += f", {(step(10**6) - step(0)) / GIB:.1f} GiB more for each further million"
+    available = available_memory(torch.device("cpu"))
+    if processes * needed > available:
+        text += (
+            f". Only {(base + available // processes) / GIB:.1f} GiB can be had: take smaller images (-r) or fewer "
+            "Gaussians (--max_gaussians)"
+        )
+    return f"{text}."
+
+
+def expected_gaussians(beginning: int, pixels: int, config: TrainConfig) -> tuple[int, str]:
+    """How many Gaussians there will be of so many at the beginning, and why; ``pixels`` of a view."""
+    if min(config.iterations, config.densify_until_iter) <= config.densify_from_iter:
+        return beginning, "as at the beginning"
+    if config.max_gaussians:
+        return max(beginning, config.max_gaussians), "--max_gaussians"
+    guess = max(beginning, pixels // PIXELS)
+    return guess, f"guessed: one for {PIXELS} px of a photograph; --max_gaussians limits them"
