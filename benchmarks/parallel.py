@@ -37,7 +37,7 @@ SCHEDULE = (
 
 def flags_of(iterations: int) -> list[str]:
     """The embedded scene's flags, the schedule stretched or compressed to ``iterations``."""
-    defaults = TrainConfig(**EMBEDDED_DEFAULTS)
+    defaults = TrainConfig(**EMBEDDED_DEFAULTS[""])
     share = iterations / defaults.iterations
     schedule = [(f"--{name}", str(round(getattr(defaults, name) * share))) for name in SCHEDULE]
     return [word for pair in schedule for word in pair] + ["--max_gaussians", str(defaults.max_gaussians), "--eval"]

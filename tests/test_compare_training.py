@@ -31,7 +31,7 @@ def tiny(monkeypatch):
 
 
 def test_short_schedule_is_whole_within_its_steps():
-    assert set(EMBEDDED_DEFAULTS) < set(training.SHORT)
+    assert set(EMBEDDED_DEFAULTS[""]) < set(training.SHORT)
     assert training.SHORT["iterations"] == training.SHORT["position_lr_max_steps"] == 300
     assert training.COMPARED[-1] < 2 * training.SHORT["densification_interval"] < training.SHORT["densify_until_iter"]
 

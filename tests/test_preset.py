@@ -28,11 +28,12 @@ def test_flags_go_before_the_preset_and_the_preset_before_defaults():
     embedded = parse(["train", "--preset", "fast", "--sh_interval", "7"])
     assert embedded.sh_interval == 7 and embedded.eval
     assert embedded.coarse == PRESETS["fast"]["coarse"]
+    assert embedded.iterations == EMBEDDED_DEFAULTS["fast"]["iterations"]
 
 
 def test_presets_are_made_of_documented_flags():
     documented = {item.name for item in fields(TrainConfig) if item.metadata["help"]}
-    for values in (EMBEDDED_DEFAULTS, *PRESETS.values()):
+    for values in (*EMBEDDED_DEFAULTS.values(), *PRESETS.values()):
         assert set(values) <= documented
 
 

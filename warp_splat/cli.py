@@ -90,8 +90,11 @@ def parse(arguments: list[str]) -> Config:
     if values.get("start_checkpoint"):
         return TrainConfig(**_continued(values))
     if config_type is TrainConfig:
-        embedded = {} if "source_path" in values else EMBEDDED_DEFAULTS
-        values = {**embedded, **PRESETS[values.get("preset", "")], **values}
+        preset = values.get("preset", "")
+        defaults = [PRESETS[preset]]
+        if "source_path" not in values:
+            defaults = [EMBEDDED_DEFAULTS[""], PRESETS[preset], EMBEDDED_DEFAULTS[preset]]
+        values = {**{name: value for table in defaults for name, value in table.items()}, **values}
     return config_type(**values)
 
 

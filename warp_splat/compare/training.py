@@ -34,7 +34,7 @@ from warp_splat.scene import Scene, View
 from warp_splat.trainer import Trainer
 
 SHORT: dict[str, Any] = {
-    **EMBEDDED_DEFAULTS,
+    **EMBEDDED_DEFAULTS[""],
     "iterations": 300,
     "position_lr_max_steps": 300,
     "densify_from_iter": 50,
@@ -104,7 +104,7 @@ def run(
         InputError: if a file cannot be written.
     """
     out, names = Path(out), list(dict.fromkeys(("manual", *modes)))
-    schedule = {**(EMBEDDED_DEFAULTS if full else SHORT), "device": device}
+    schedule = {**(EMBEDDED_DEFAULTS[""] if full else SHORT), "device": device}
     variants: dict[str, dict[str, Any]] = {name: {"adjoint": name} for name in names}
     variants |= {f"cap {cap}": {"max_steps": cap} for cap in CAPS} | {"ellipsoid": {"projection": "ellipsoid"}}
     results: dict[str, Any] = {"schedule": schedule, "runs": [], "summary": [], "equality": {}}
