@@ -23,7 +23,7 @@ def test_contact_sheet_size(tmp_path, count, columns):
     assert sheet.shape[1] == 1600
     lines = -(-count // columns)
     cell_height = 1600 / (3 * columns) * 60 / 80
-    assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 80
+    assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 132  # two lines at its head
 
 
 def test_contact_sheet_shows_the_amplified_difference(tmp_path):
@@ -36,6 +36,27 @@ def test_contact_sheet_shows_the_amplified_difference(tmp_path):
     photo_at, render_left, render_right, difference_left, difference_right = middle[[250, 600, 950, 1150, 1450]]
     assert photo_at.sum() == 0 and render_left.sum() == 765 and render_right.sum() == 0
     assert difference_left.sum() > 500 and difference_right.sum() < 10
+
+
+def test_scale_of_a_sheet_has_the_colors_of_its_errors(tmp_path):
+    """The bar at the head runs from the color of no error to that of one of 64 or more, past that of 32."""
+    photo = np.zeros((60, 90, 3), np.uint8)
+    render = photo.copy()
+    render[:, 30:60], render[:, 60:] = 32, 64
+    report.contact_sheet(tmp_path / "sheet.png", {"a": [("", photo, render, "")], "b": [("", photo, render, "")]})
+    sheet = load_png(tmp_path / "sheet.png").astype(int)
+    heading = sheet[15:40, 1000:]
+    row, left, right = next(
+        (line, columns[0], columns[-1])
+        for line in heading
+        if len(columns := np.flatnonzero(np.ptp(line, axis=1) > 60)) > 100
+    )
+    error = sheet[300, [1150, 1300, 1480]]
+    assert np.abs(row[left - 20] - error[0]).max() < 8 and np.abs(row[right - 1] - error[2]).max() < 8
+    halfway = np.abs(row[left:right] - error[1]).max(axis=1)
+    assert 0.4 < np.argmin(halfway) / (right - left) < 0.6 and halfway.min() < 12
+    report.contact_sheet(tmp_path / "one.png", {"a": [("", photo, render, ""), ("", photo, render, "")]})
+    assert sheet.shape[0] == load_png(tmp_path / "one.png").shape[0] + 52  # another heading
 
 
 def test_contact_sheet_takes_mixed_sizes_long_names_and_jpeg(tmp_path):

@@ -26,14 +26,15 @@ class EventLog:
     def write_losses(self, iteration: int, losses: Sequence[float], stride: int) -> None:
         """The losses of the steps up to ``iteration``, ``stride`` iterations apart."""
         if self.writer:
-            for back, loss in enumerate(reversed(losses)):
-                self.writer.add_scalar("train/loss", loss, iteration - back * stride)
+            first = iteration - (len(losses) - 1) * stride
+            for number, loss in enumerate(losses):
+                self.writer.add_scalar("train/loss", loss, first + number * stride)
 
     def write_record(self, record: Mapping[str, float], split: str) -> None:
         """What an evaluation on the way found, as in ``history.json``."""
         if self.writer:
             step = int(record["iteration"])
-            self.writer.add_scalar(f"{split}/psnr on the way", record["psnr"], step)
+            self.writer.add_scalar(f"{split}/psnr_on_the_way", record["psnr"], step)
             self.writer.add_scalar("gaussians", record["gaussians"], step)
             self.writer.add_scalar("seconds", record["seconds"], step)
             self.writer.flush()

@@ -6,6 +6,7 @@ network that was trained on photographs; its package downloads them, here they a
 
 from __future__ import annotations
 
+import math
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,6 +19,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.metrics import METRICS, Metric, unit_images
 
+SMALLEST = 32  # px; the networks halve what they see too often for less
 WEIGHTS = "torchvision's weights of VGG16 or AlexNet, such as vgg16-397923af.pth"
 #: By network: its name in the results, the layer that tells it from the others, and whether images go from -1 to 1.
 #: VGG16 as in the reference's metrics.py, which leaves them at 0 to 1; AlexNet as in gsplat and the metric's authors'.
@@ -88,6 +90,8 @@ def _load_lpips(path: str) -> tuple[str, Metric]:
     name, _, signed = NETWORKS[network]
 
     def measure(image: np.ndarray, reference: np.ndarray) -> float:
+        if min(image.shape[:2]) < SMALLEST:
+            return math.nan
         pair = [
             torch.from_numpy(array.astype(np.float32)).permute(2, 0, 1)[None] for array in unit_images(image, reference)
         ]

@@ -6,6 +6,7 @@ Colours are those of Okabe and Ito (2008), which people with colour vision defic
 from __future__ import annotations
 
 import datetime
+import itertools
 import os
 import platform
 import re
@@ -56,17 +57,18 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
     margin, gap, text, heading = 0.1, 0.04, 0.22, 0.26  # inches
     cell = (WIDTH - 2 * margin - (columns - 1) * 2 * gap) / (3 * columns)
     heights = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) * (cell - gap) for _, line in lines]
-    titles = [heading * bool(title) for title, _ in lines]
+    titles = [heading * (bool(title) or number == 0) for number, (title, _) in enumerate(lines)]
     figure = new_figure(WIDTH, heading + sum(heights) + sum(titles) + len(lines) * (text + gap) + margin)
-    top = figure.get_figheight() - heading
-    widest = max(len(line) for _, line in lines)
-    lefts = [margin + column * (3 * cell + 2 * gap) for column in range(widest)]
-    for left in lefts:
-        _head_columns(figure, left, top + 0.04, cell, gap)
-    for (title, line), height, extra in zip(lines, heights, titles, strict=True):
+    top = figure.get_figheight()
+    _draw_scale(figure, WIDTH - margin - gap, top - heading + 0.04)
+    lefts = [margin + column * (3 * cell + 2 * gap) for column in range(max(len(line) for _, line in lines))]
+    for number, ((title, line), height, extra) in enumerate(zip(lines, heights, titles, strict=True)):
         top -= extra
-        if title:
-            _write(figure, margin, top + 0.02, title, weight="bold")
+        _write(figure, margin, top + 0.04, title, weight="bold")
+        if number == 0:
+            top -= heading
+            for left, (place, head) in itertools.product(lefts, enumerate(("photo", "render", "error"))):
+                _write(figure, left + place * cell, top + 0.04, head, weight="bold")
         top -= text + height
         for left, (name, photo, render, said) in zip(lefts, line, strict=False):
             captions = (_shorten(name, cell), said if cell > 2 else said.partition(",")[0], "")
@@ -220,24 +222,20 @@ def _place_picture(
     axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5)
 
 
-def _head_columns(figure: Figure, left: float, bottom: float, cell: float, gap: float) -> None:
-    """Name the three pictures of a view [inches], the last with the scale of its colors."""
-    for place, title in enumerate(("photo", "render", "error")):
-        _write(figure, left + place * cell, bottom, title, weight="bold")
-    white = f"{255 / DIFFERENCE_GAIN:.0f} of 255"
-    bar, end = 0.3 * cell, 0.62  # inches; the end takes the words
-    start = left + 3 * cell - gap - end - bar
-    ramp = np.linspace(0, 255, 256)[None].repeat(2, 0)
-    _place_picture(figure, (start, bottom, bar, 0.1), ramp, "", aspect="auto")
-    _write(figure, start - 0.09, bottom, "0")
-    _write(figure, start + bar + 0.04, bottom, white)
+def _draw_scale(figure: Figure, right: float, bottom: float) -> None:
+    """What the colors of an error mean, ending at ``right`` [inches]."""
+    bar, words = 0.8, 0.62  # inches
+    start = right - words - bar
+    _write(figure, start - 0.06, bottom, "error, mean of the channels:  0", align="right")
+    _place_picture(figure, (start, bottom, bar, 0.1), np.linspace(0, 255, 256)[None].repeat(2, 0), "", aspect="auto")
+    _write(figure, start + bar + 0.06, bottom, f"{255 / DIFFERENCE_GAIN:.0f} of 255")
 
 
-def _write(figure: Figure, left: float, bottom: float, text: str, weight: str = "normal") -> None:
-    """Text at a place in inches."""
+def _write(figure: Figure, left: float, bottom: float, text: str, weight: str = "normal", align: str = "left") -> None:
+    """Text that begins, or ends, at a place in inches."""
     size = 9 if weight == "bold" else 8
     width, height = figure.get_size_inches()
-    figure.text(left / width, bottom / height, text, fontsize=size, fontweight=weight, color=INK)
+    figure.text(left / width, bottom / height, text, fontsize=size, fontweight=weight, color=INK, ha=align)
 
 
 def _shorten(name: str, inches: float) -> str:

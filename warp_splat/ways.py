@@ -102,7 +102,7 @@ def spiral_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     depth = np.median((seen - middle.center) @ middle.forward) if len(seen) else scene.extent
     target = middle.center + depth * middle.forward
     radii = np.percentile(np.abs((centers - middle.center) @ middle.rotation.T), 90, axis=0)
-    radii = np.clip(radii, 0.05 * depth, LARGEST_SPIRAL * depth)
+    radii = np.clip(radii, 0.05 * depth, LARGEST_SPIRAL * depth) * [1.0, 1.0, 0.5]  # less towards it than across
     angles = 2.0 * np.pi * np.arange(count) / count
     turns = np.stack([np.cos(TURNS * angles), np.sin(TURNS * angles), np.sin(angles)], axis=1)
     places = middle.center + (radii * turns) @ middle.rotation
