@@ -1,4 +1,4 @@
-"""The pictures of the documentation that no benchmark makes: ``python docs/make_pictures.py sheet -m output/abc123``."""
+"""The pictures of the documentation that no benchmark makes: `python docs/make_pictures.py sheet -m output/abc123`."""
 
 import argparse
 import tempfile
