@@ -12,9 +12,9 @@ from warp_splat.camera import Camera
 from warp_splat.config import TrainConfig
 from warp_splat.densify import Densifier
 from warp_splat.gaussians import GaussianModel
-from warp_splat.render import ORBIT_RADIUS, ORBIT_SIZE, orbit_cameras
 from warp_splat.scene.types import Scene, View
 from warp_splat.trainer import Trainer
+from warp_splat.ways import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
 
 RADIUS = 4.0  # world units, of the ball that the Gaussians fill; the orbit lies outside
 VIEWS = 8
@@ -44,9 +44,7 @@ def make_gaussians(count: int, device: str) -> GaussianModel:
 
 def cameras(width: int, height: int, count: int) -> list[Camera]:
     """On the orbit of ``warp-splat render``, for images of another size."""
-    start = np.array([0.0, 0.0, -ORBIT_RADIUS])
-    found = orbit_cameras(np.zeros(3), np.array([0.0, -1.0, 0.0]), start, count)
-    return [camera.resized(width, height) for camera in found]
+    return [camera.resized(width, height) for camera in origin_orbit(count)]
 
 
 def make_scene(width: int, height: int) -> Scene:

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from common import machine, write_table
 
-from warp_splat.config import EMBEDDED_DEFAULTS, TrainConfig
+from warp_splat.config import TrainConfig
+from warp_splat.presets import EMBEDDED_DEFAULTS
 
 ROOT = Path(__file__).parents[1]
 #: name: processes, threads of each, factor of the schedule

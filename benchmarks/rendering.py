@@ -16,9 +16,10 @@ from warp_splat import launch, rasterize, rasterize_views
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.metrics import psnr
-from warp_splat.render import focus_orbit, make_picture
+from warp_splat.render import make_picture
 from warp_splat.report import format_table
 from warp_splat.scene import load_scene
+from warp_splat.ways import focus_orbit
 
 FRAMES = 12  # of the orbit, in each round
 ROUNDS = 5

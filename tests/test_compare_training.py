@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from warp_splat.compare import training
-from warp_splat.config import ADJOINTS, EMBEDDED_DEFAULTS
+from warp_splat.config import ADJOINTS
+from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.scene import load_scene
 from warp_splat.train import embedded_scene
 

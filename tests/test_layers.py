@@ -7,12 +7,12 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "warp_splat"
 LAYERS = [
-    {"errors", "config"},
+    {"errors", "config", "flags", "presets"},
     {"kernels"},
     {"camera", "devices", "launch", "distributed", "formats", "interrupts", "scene.types"},
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
-    {"gaussians", "optimizer", "densify", "forecast"},
-    {"trainer", "selftest", "report", "evaluate", "gradcheck", "differences"},
+    {"gaussians", "optimizer", "densify", "forecast", "perceptual", "ways"},
+    {"trainer", "selftest", "report", "evaluate", "events", "gradcheck", "differences"},
     {"run", "train", "render", "convert", "sfm", "doctor"},
     {"compare"},
     {"cli", "__init__", "__main__"},

@@ -1,7 +1,8 @@
-"""PSNR and SSIM against a closed form and an independent torch implementation, and the JSON files."""
+"""Metrics against closed forms and other implementations, and the JSON files that they are kept in."""
 
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import torch.nn.functional as F
 
 from warp_splat.errors import InputError
 from warp_splat.formats.png import load_png, save_png
-from warp_splat.metrics import evaluate_folder, psnr, ssim, write_results
+from warp_splat.metrics import METRICS, evaluate_folder, psnr, ssim, write_results
+from warp_splat.perceptual import choose_metrics, flip
 
 
 def images(height, width, noise=20, seed=0):
@@ -142,3 +144,115 @@ def test_results_that_are_not_json_are_left_alone(tmp_path, text):
     with pytest.raises(InputError, match=r"results\.json.*move it away"):
         write_results(tmp_path, 1, {"SSIM": 1.0, "PSNR": 2.0}, {})
     assert (tmp_path / "results.json").read_bytes() == text.encode("latin-1")
+
+
+def flip_of_colors(color, reference):
+    """FLIP of two areas of one color each, by the paper alone (Andersson et al. 2020, sections 4.1 and 4.3).
+
+    Filters leave a constant as it is and there are no edges or points, so the error of colors is all.
+    """
+    to_xyz = np.array([[10135552, 8788810, 4435075], [2613072, 8788810, 887015], [1425312, 8788810, 70074405]]) / [
+        [24577794, 24577794, 24577794],
+        [12288897, 12288897, 12288897],
+        [73733382, 73733382, 73733382],
+    ]
+
+    def hunt(rgb):
+        rgb = np.asarray(rgb, np.float64)
+        linear = np.where(rgb > 0.04045, ((rgb + 0.055) / 1.055) ** 2.4, rgb / 12.92)
+        x, y, z = to_xyz @ linear / (to_xyz @ np.ones(3))
+        f = [np.cbrt(v) if v > (6 / 29) ** 3 else v / (3 * (6 / 29) ** 2) + 4 / 29 for v in (x, y, z)]
+        lightness = 116 * f[1] - 16
+        return np.array([lightness, 5 * lightness * (f[0] - f[1]), 2 * lightness * (f[1] - f[2])])
+
+    def distance(a, b):
+        difference = np.abs(hunt(a) - hunt(b))
+        return (difference[0] + np.hypot(difference[1], difference[2])) ** 0.7
+
+    largest, found = distance([0, 1, 0], [0, 0, 1]), distance(color, reference)
+    knee = 0.4 * largest
+    return 0.95 * found / knee if found < knee else 0.95 + 0.05 * (found - knee) / (largest - knee)
+
+
+@pytest.mark.parametrize(
+    ("color", "reference"),
+    [
+        ((0, 0, 0), (255, 255, 255)),
+        ((0, 255, 0), (0, 0, 255)),
+        ((10, 20, 30), (12, 20, 28)),
+        ((200, 90, 40), (90, 180, 200)),
+        ((128, 128, 128), (128, 128, 128)),
+    ],
+)
+def test_flip_of_constant_colors_is_that_of_the_paper(color, reference):
+    image, other = (np.broadcast_to(np.array(c, np.uint8), (20, 24, 3)).copy() for c in (color, reference))
+    expected = flip_of_colors(np.array(color) / 255, np.array(reference) / 255)
+    assert flip(image, other) == pytest.approx(expected, abs=2e-4)
+
+
+def test_flip_of_pictures():
+    image, reference = images(40, 30, 20)
+    assert flip(image, image) == 0 and flip(image, reference) == flip(image, reference)
+    errors = [flip(images(40, 30, noise)[1], image) for noise in (2, 10, 50)]
+    assert 0 < errors[0] < errors[1] < errors[2] < 1
+    assert flip(*images(1, 1)) > 0
+
+
+def test_flip_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setattr("warp_splat.perceptual.find_spec", lambda _: None)
+    metrics, absent = choose_metrics("")
+    assert set(metrics) == set(METRICS)
+    assert [sentence.split()[0] for sentence in absent] == ["FLIP", "LPIPS"] and "pip install flip" in absent[0]
+
+
+@pytest.mark.parametrize(
+    ("net", "name"), [pytest.param("vgg16", "LPIPS", marks=pytest.mark.slow), ("alexnet", "LPIPS_ALEX")]
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_lpips_takes_weights_from_disk(tmp_path, net, name):
+    """The layers of torchvision's own network put into the authors' LPIPS, against the file of its weights."""
+    lpips, torchvision = pytest.importorskip("lpips"), pytest.importorskip("torchvision")
+    torch.manual_seed(0)
+    layers = getattr(torchvision.models, net)(weights=None).features
+    file = tmp_path / f"{net}.pth"
+    torch.save({f"features.{key}": value for key, value in layers.state_dict().items()}, file)
+    metrics, absent = choose_metrics(str(file))
+    assert not absent and list(metrics)[-1] == name
+    theirs = lpips.LPIPS(net="alex" if net == "alexnet" else "vgg", pnet_rand=True, verbose=False)
+    for block in theirs.net.children():
+        for index in list(block._modules):
+            block._modules[index] = layers[int(index)]
+    image, reference = images(40, 50)
+    pair = [torch.from_numpy(array).permute(2, 0, 1)[None] / 255 for array in (image, reference)]
+    with torch.no_grad():
+        expected = float(theirs(*pair, normalize=net == "alexnet"))
+    assert expected > 0 and metrics[name](image, reference) == pytest.approx(expected, rel=1e-5)
+    assert metrics[name](image, image) == 0 and math.isnan(metrics[name](*images(40, 20)))
+
+
+class Trap:
+    """Runs something when it is unpickled."""
+
+    def __reduce__(self):
+        return (print, ("sprung",))
+
+
+def test_lpips_weights_that_are_none(tmp_path, capsys):
+    with pytest.raises(InputError, match=r"none\.pth: no such file"):
+        choose_metrics(str(tmp_path / "none.pth"))
+    file = tmp_path / "a.pth"
+    for value in ({"fc.weight": torch.zeros(2)}, [1, 2], {"features.28.weight": torch.zeros(2)}, Trap()):
+        torch.save(value, file)
+        with pytest.raises(InputError, match=r"a\.pth: expected torchvision's weights"):
+            choose_metrics(str(file))
+    file.write_text("not weights")
+    with pytest.raises(InputError, match=r"a\.pth: expected torchvision's weights"):
+        choose_metrics(str(file))
+    assert "sprung" not in capsys.readouterr().out
+
+
+def test_lpips_without_its_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    torch.save({"features.28.weight": torch.zeros(2)}, tmp_path / "a.pth")
+    with pytest.raises(InputError, match="pip install lpips"):
+        choose_metrics(str(tmp_path / "a.pth"))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from warp_splat.cli import parse
-from warp_splat.config import EMBEDDED_DEFAULTS, PRESETS, TrainConfig
+from warp_splat.config import TrainConfig
+from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
 from warp_splat.trainer import Trainer
 

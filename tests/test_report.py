@@ -13,24 +13,24 @@ from warp_splat.formats.png import load_png, save_png, save_video
 
 def view(name="0001.jpg", height=60, width=80, gap=8):
     photo = np.zeros((height, width, 3), np.uint8)
-    return name, photo, photo + np.uint8(gap), 30.0
+    return name, photo, photo + np.uint8(gap), "30.00 dB"
 
 
 @pytest.mark.parametrize(("count", "columns"), [(1, 1), (3, 1), (5, 2), (7, 3), (2, 4)])
 def test_contact_sheet_size(tmp_path, count, columns):
-    report.contact_sheet(tmp_path / "sheet.png", [view() for _ in range(count)], columns=columns)
+    report.contact_sheet(tmp_path / "sheet.png", {"": [view() for _ in range(count)]}, columns=columns)
     sheet = load_png(tmp_path / "sheet.png")
     assert sheet.shape[1] == 1600
     lines = -(-count // columns)
     cell_height = 1600 / (3 * columns) * 60 / 80
-    assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 80
+    assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 132  # two lines at its head
 
 
 def test_contact_sheet_shows_the_amplified_difference(tmp_path):
-    name, photo, _, psnr = view()
+    name, photo, _, said = view()
     render = photo.copy()
     render[:, :40] = 255
-    report.contact_sheet(tmp_path / "sheet.png", [(name, photo, render, psnr)])
+    report.contact_sheet(tmp_path / "sheet.png", {"": [(name, photo, render, said)]})
     sheet = load_png(tmp_path / "sheet.png").astype(int)
     middle = sheet[sheet.shape[0] // 2]
     photo_at, render_left, render_right, difference_left, difference_right = middle[[250, 600, 950, 1150, 1450]]
@@ -38,15 +38,36 @@ def test_contact_sheet_shows_the_amplified_difference(tmp_path):
     assert difference_left.sum() > 500 and difference_right.sum() < 10
 
 
+def test_scale_of_a_sheet_has_the_colors_of_its_errors(tmp_path):
+    """The bar at the head runs from the color of no error to that of one of 64 or more, past that of 32."""
+    photo = np.zeros((60, 90, 3), np.uint8)
+    render = photo.copy()
+    render[:, 30:60], render[:, 60:] = 32, 64
+    report.contact_sheet(tmp_path / "sheet.png", {"a": [("", photo, render, "")], "b": [("", photo, render, "")]})
+    sheet = load_png(tmp_path / "sheet.png").astype(int)
+    heading = sheet[15:40, 1000:]
+    row, left, right = next(
+        (line, columns[0], columns[-1])
+        for line in heading
+        if len(columns := np.flatnonzero(np.ptp(line, axis=1) > 60)) > 100
+    )
+    error = sheet[300, [1150, 1300, 1480]]
+    assert np.abs(row[left - 20] - error[0]).max() < 8 and np.abs(row[right - 1] - error[2]).max() < 8
+    halfway = np.abs(row[left:right] - error[1]).max(axis=1)
+    assert 0.4 < np.argmin(halfway) / (right - left) < 0.6 and halfway.min() < 12
+    report.contact_sheet(tmp_path / "one.png", {"a": [("", photo, render, ""), ("", photo, render, "")]})
+    assert sheet.shape[0] == load_png(tmp_path / "one.png").shape[0] + 52  # another heading
+
+
 def test_contact_sheet_takes_mixed_sizes_long_names_and_jpeg(tmp_path):
     rows = [view("a/very/long/folder/" * 5 + "0001.jpg"), view(height=80, width=60), view(height=1, width=1)]
-    report.contact_sheet(tmp_path / "sheet.jpg", rows, columns=2)
+    report.contact_sheet(tmp_path / "sheet.jpg", {"": rows}, columns=2)
     assert load_png(tmp_path / "sheet.jpg").shape[1] == 1600
 
 
 def test_pictures_are_the_same_bytes_each_time(tmp_path):
     for name in ("a.png", "b.png"):
-        report.contact_sheet(tmp_path / name, [view()])
+        report.contact_sheet(tmp_path / name, {"": [view()]})
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
@@ -71,15 +92,15 @@ def test_plot_profile(tmp_path):
 
 def test_nothing_to_draw_is_said(tmp_path):
     for draw, nothing in (
-        (report.contact_sheet, []),
+        (report.contact_sheet, {}),
         (report.plot_training, [{"iteration": 1}]),
         (report.plot_profile, {}),
     ):
         with pytest.raises(InputError, match="expected"):
             draw(tmp_path / "a.png", nothing)
-    name, photo, render, psnr = view()
+    name, photo, render, said = view()
     with pytest.raises(InputError, match="expected a render of shape"):
-        report.contact_sheet(tmp_path / "a.png", [(name, photo, render[1:], psnr)])
+        report.contact_sheet(tmp_path / "a.png", {"": [(name, photo, render[1:], said)]})
     assert not list(tmp_path.iterdir())
 
 
@@ -142,7 +163,7 @@ def test_full_disk_keeps_the_older_pictures(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8)
     writers = {
         "a.png": lambda path: save_png(path, noise),
-        "b.png": lambda path: report.contact_sheet(path, [("a", noise, noise, 1.0)]),
+        "b.png": lambda path: report.contact_sheet(path, {"": [("a", noise, noise, "")]}),
         "c.mp4": lambda path: save_video(path, [noise] * 3, fps=10),
     }
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -10,10 +10,7 @@ from dataclasses import fields
 
 from warp_splat import __version__
 from warp_splat.config import (
-    EMBEDDED_DEFAULTS,
     FIXED_OPTIONS,
-    FOREIGN_FLAGS,
-    PRESETS,
     CompareConfig,
     ConvertConfig,
     InspectConfig,
@@ -22,21 +19,24 @@ from warp_splat.config import (
     TrainConfig,
 )
 from warp_splat.errors import InputError
+from warp_splat.flags import FOREIGN_FLAGS
+from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
 Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | CompareConfig
 COMMANDS = {
     "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
     "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
-    "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
+    "render": (RenderConfig, "render the views of a trained model with their metrics, or a video"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
     "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
 }
 
 
 def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
-    """A flag for each field of the configuration, with its default and help."""
+    """A flag for each field of the configuration, with its default and help, under the heading of its group."""
     defaults = config_type()
+    groups = {"": parser}  # the few that matter first stand beside --help
     for item in fields(config_type):
         default = getattr(defaults, item.name)
         if item.metadata["positional"]:
@@ -51,10 +51,12 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
             options["metavar"] = options["type"].__name__.upper()
             options["choices"] = item.metadata["choices"]
             if options["choices"]:
-                del options["metavar"]
+                options["metavar"] = f"{{{','.join(str(choice) for choice in options['choices'] if choice != '')}}}"
             if item.metadata["many"]:
                 options["nargs"] = "*"
-        parser.add_argument(*item.metadata["names"], f"--{item.name}", dest=item.name, **options)
+        title = item.metadata["group"]
+        groups[title] = groups.get(title) or parser.add_argument_group(title)
+        groups[title].add_argument(*item.metadata["names"], f"--{item.name}", dest=item.name, **options)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -65,7 +67,10 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"warp-splat {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
     for name, (config_type, help) in COMMANDS.items():
-        add_flags(commands.add_parser(name, help=help, description=help.capitalize() + "."), config_type)
+        places = [item.name.upper() for item in fields(config_type) if item.metadata["positional"]]
+        usage = " ".join(["warp-splat", name, *places, "[options]"])  # not all flags before the first line of help
+        command = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", usage=usage)
+        add_flags(command, config_type)
     return parser
 
 
@@ -73,7 +78,8 @@ def parse(arguments: list[str]) -> Config:
     """The configuration that the arguments ask for.
 
     Raises:
-        InputError: for a flag that does not exist here, or that cannot change when a training is continued.
+        InputError: for a flag that does not exist here, or that cannot change when a training is continued; for a
+            configuration file that is not one.
     """
     for argument in arguments:
         name = argument.split("=")[0]
@@ -87,6 +93,10 @@ def parse(arguments: list[str]) -> Config:
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
+    if values.get("config"):
+        from warp_splat.formats.config_file import read_config  # noqa: PLC0415 - seldom needed
+
+        values = {**read_config(values["config"]), **values}
     if values.get("start_checkpoint"):
         return TrainConfig(**_continued(values))
     if config_type is TrainConfig:

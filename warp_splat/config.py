@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, fields
+
+from warp_splat.flags import argument, data, film, flag, growing, learning, machinery, rendering, reporting
 
 # The renderer's constants (those of the reference implementation, Kerbl et al. 2023).
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is skipped there
@@ -24,6 +25,9 @@ ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; 
 PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that follow
 EXTENTS = ("ellipse", "square")
 EXP_DEGREES = (3, 4, 5, 6, None)
+VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.ways
+
+LPIPS_HELP = "also measure LPIPS: torchvision's weights of VGG16 or AlexNet, a .pth file; needs the package lpips"
 
 
 @dataclass(frozen=True)
@@ -56,135 +60,81 @@ class RasterOptions:
     exp_degree: int | None = 5
 
 
-def flag(default: Any, help: str, *names: str, choices: tuple | None = None, many: type | None = None) -> Any:
-    """A dataclass field that is also a command-line flag: its default, its help, further names."""
-    metadata = {"help": help, "names": names, "choices": choices, "many": many, "positional": False}
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata=metadata)
-    return field(default=default, metadata=metadata)
-
-
-def argument(help: str) -> Any:
-    """A dataclass field that is also an argument of the command line without a flag: known by its place."""
-    return field(default="", metadata={"help": help, "positional": True})
-
-
 @dataclass
 class TrainConfig:
     """Training options; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
     source_path: str = flag("", "scene folder (COLMAP or nerf-synthetic); without it, the embedded scene", "-s")
     model_path: str = flag("", "output folder; default: output/<random name>", "-m")
-    images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
-    resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
-    white_background: bool = flag(False, "composite on white instead of black", "-w")
     sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
-    start_checkpoint: str = flag(
-        "", "continue a training: its folder, or a checkpoint; options are the same but for those given", "--resume"
-    )
-    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    data_device: str = flag("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
-    threads: int = flag(
-        0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)"
-    )
-    seed: int = flag(0, "seed of everything random")
-    quiet: bool = flag(False, "print only the summary")
+    resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
     preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
-    profile: int = flag(0, "time the stages of the last N iterations, as a table and a plot")
-
     iterations: int = flag(
         30_000,
         "images to train on, one in each step; n in each under torchrun with n processes; schedules count images",
     )
-    sh_degree: int = flag(3, "highest degree of the view-dependent color", choices=(0, 1, 2, 3))
-    optimizer_type: str = flag(
+    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
+    start_checkpoint: str = flag(
+        "", "continue a training: its folder, or a checkpoint; options are the same but for those given", "--resume"
+    )
+    quiet: bool = flag(False, "print only the summary")
+
+    images: str = data("images", "folder of the photographs inside a COLMAP scene", "-i")
+    white_background: bool = data(False, "composite on white instead of black", "-w")
+    config: str = data("", "options from a TOML file, such as a model's config.toml; flags that are given go before")
+
+    sh_degree: int = rendering(3, "highest degree of the view-dependent color", choices=(0, 1, 2, 3))
+    adjoint: str = rendering("manual", "how the pixel loop is differentiated", choices=ADJOINTS)
+    projection: str = rendering("affine", "from 3D to 2D Gaussians", choices=PROJECTIONS)
+    antialiasing: bool = rendering(False, "keep small Gaussians from growing brighter (Mip-Splatting)")
+    random_background: bool = rendering(False, "a random background color in every step")
+
+    lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss")
+    position_lr_init: float = learning(0.00016, "rate of the means at the start (times the scene's extent)")
+    position_lr_final: float = learning(0.0000016, "rate of the means after position_lr_max_steps")
+    position_lr_max_steps: int = learning(30_000, "steps over which the means' rate decays")
+    feature_lr: float = learning(0.0025, "rate of the base color; the higher degrees learn 20 times slower")
+    opacity_lr: float = learning(0.025, "rate of the opacity logits")
+    scaling_lr: float = learning(0.005, "rate of the log scales")
+    rotation_lr: float = learning(0.001, "rate of the quaternions")
+    sh_interval: int = learning(1000, "steps between two rises of the active SH degree")
+    optimizer_type: str = learning(
         "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
     )
-    adjoint: str = flag("manual", "how the pixel loop is differentiated", choices=ADJOINTS)
-    projection: str = flag("affine", "from 3D to 2D Gaussians", choices=PROJECTIONS)
-    antialiasing: bool = flag(False, "keep small Gaussians from growing brighter (Mip-Splatting)")
-    random_background: bool = flag(False, "a random background color in every step")
-    lambda_dssim: float = flag(0.2, "share of 1 - SSIM in the loss")
-    position_lr_init: float = flag(0.00016, "rate of the means at the start (times the scene's extent)")
-    position_lr_final: float = flag(0.0000016, "rate of the means after position_lr_max_steps")
-    position_lr_max_steps: int = flag(30_000, "steps over which the means' rate decays")
-    feature_lr: float = flag(0.0025, "rate of the base color; the higher degrees learn 20 times slower")
-    opacity_lr: float = flag(0.025, "rate of the opacity logits")
-    scaling_lr: float = flag(0.005, "rate of the log scales")
-    rotation_lr: float = flag(0.001, "rate of the quaternions")
-    sh_interval: int = flag(1000, "steps between two rises of the active SH degree")
+    coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
+    coarse_until_iter: int = learning(3000, "by this step the size has doubled, at equal intervals, to the full one")
+    seed: int = learning(0, "seed of everything random")
 
-    densify_from_iter: int = flag(500, "first step of densification")
-    densify_until_iter: int = flag(15_000, "last step of densification")
-    densification_interval: int = flag(100, "steps between two densifications")
-    densify_grad_threshold: float = flag(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
-    percent_dense: float = flag(
+    densify_from_iter: int = growing(500, "first step of densification")
+    densify_until_iter: int = growing(15_000, "last step of densification")
+    densification_interval: int = growing(100, "steps between two densifications")
+    densify_grad_threshold: float = growing(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
+    percent_dense: float = growing(
         0.01, "share of the scene's extent above which a Gaussian splits instead of being cloned"
     )
-    opacity_reset_interval: int = flag(3000, "steps between two resets of all opacities to 0.01")
-    coarse: int = flag(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
-    coarse_until_iter: int = flag(3000, "by this step the size has doubled, at equal intervals, to the full one")
-    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
-    prune_screen_size: int = flag(
+    opacity_reset_interval: int = growing(3000, "steps between two resets of all opacities to 0.01")
+    prune_screen_size: int = growing(
         0, "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does"
     )
 
-    test_iterations: list[int] = flag([7_000, 30_000], "evaluate after these steps, besides 20 times in all", many=int)
-    save_iterations: list[int] = flag([7_000, 30_000], "save the model after these steps, and the last", many=int)
-    checkpoint_iterations: list[int] = flag([], "keep a checkpoint of these steps, besides the last one", many=int)
-    checkpoint_interval: float = flag(
+    test_iterations: list[int] = reporting(
+        [7_000, 30_000], "evaluate after these steps, besides 20 times in all", many=int
+    )
+    save_iterations: list[int] = reporting([7_000, 30_000], "save the model after these steps, and the last", many=int)
+    checkpoint_iterations: list[int] = reporting([], "keep a checkpoint of these steps, besides the last one", many=int)
+    checkpoint_interval: float = reporting(
         5.0, "minutes between two checkpoints, of which the last is kept; 0: one at the start and one at the end"
     )
+    lpips_weights: str = reporting("", LPIPS_HELP)
+    tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
+    profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot")
 
-
-#: What the embedded scene changes by preset when no ``-s`` is given: schedules that end within minutes on two cores.
-EMBEDDED_DEFAULTS: dict[str, dict[str, Any]] = {
-    "": {
-        "eval": True,
-        "iterations": 3000,
-        "position_lr_max_steps": 3000,
-        "densify_until_iter": 2000,
-        "max_gaussians": 50_000,
-        "sh_interval": 500,
-    },
-    "fast": {
-        "iterations": 1500,
-        "position_lr_max_steps": 1500,
-        "feature_lr": 0.0075,
-        "opacity_lr": 0.075,
-        "scaling_lr": 0.015,
-        "rotation_lr": 0.003,
-        "coarse_until_iter": 500,
-        "densify_from_iter": 200,
-        "densify_until_iter": 1000,
-        "max_gaussians": 50_000,
-        "sh_interval": 350,
-    },
-}
-
-#: What ``--preset`` changes; a flag that is given goes before. Tried: sparse_adam, whose step takes twice as long as
-#: torch's fused one where most Gaussians are in view; rates that decay to a tenth, 3.8 dB worse after 1,500 steps at
-#: half size, where doubled rates are 0.8 dB better. Threefold rates are better by 0.8 dB again on the embedded scene,
-#: but worse by 0.2 dB on photographs.
-PRESETS: dict[str, dict[str, Any]] = {
-    "": {},
-    "fast": {
-        "iterations": 4500,
-        "position_lr_max_steps": 4500,
-        "feature_lr": 0.005,
-        "opacity_lr": 0.05,
-        "scaling_lr": 0.01,
-        "rotation_lr": 0.002,
-        "coarse": 4,
-        "coarse_until_iter": 1500,
-        "densify_from_iter": 300,
-        "densify_until_iter": 2700,
-        "max_gaussians": 150_000,
-        "sh_interval": 1000,
-        "opacity_reset_interval": 100_000,
-    },
-}
+    device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    data_device: str = machinery("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
+    threads: int = machinery(
+        0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)"
+    )
 
 
 #: What cannot change when a training is continued, and why.
@@ -205,16 +155,32 @@ class RenderConfig:
     iteration: int = flag(-1, "which saved model; -1: the last")
     skip_train: bool = flag(False, "no images of the training views")
     skip_test: bool = flag(False, "no images of the test views")
-    orbit: bool = flag(False, "time an orbit of 100 frames at 980 x 545 instead of rendering the views")
-    orbit_center: str = flag(
-        "origin",
-        "what the orbit goes around: the world's origin, or the point that the cameras look at",
-        choices=("origin", "focus"),
+    video: str = flag(
+        "",
+        "a video instead of the views: around what the cameras look at (orbit), a spiral before it, or along the "
+        "cameras of training (path)",
+        choices=("", *VIDEOS),
     )
-    orbit_output: str = flag("", "keep the orbit's frames: an .mp4 file, or a folder for PNG files")
-    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    threads: int = flag(0, "CPU threads; 0: all cores (results do not depend on it)")
     quiet: bool = flag(False, "print only the summary")
+
+    frames: int = film(250, "frames of the video, 25 a second")
+    video_output: str = film(
+        "",
+        "where to keep the frames: an .mp4 file, or a folder for PNG files; default: <model>/<video>.mp4",
+        "--orbit_output",
+    )
+    orbit: bool = film(False, "time an orbit of 100 frames at 980 x 545; kept only if --orbit_output says where")
+    orbit_center: str = film(
+        "",
+        "what an orbit goes around: the world's origin (default of --orbit), or the point that the cameras look at "
+        "(default of --video)",
+        choices=("", "origin", "focus"),
+    )
+
+    lpips_weights: str = reporting("", LPIPS_HELP)
+
+    device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = machinery(0, "CPU threads; 0: all cores (results do not depend on it)")
 
 
 @dataclass
@@ -264,28 +230,6 @@ class CompareConfig:
     full: bool = flag(False, "train by the whole schedule instead of 300 steps")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores")
-
-
-#: Flags of the reference that this program does not have, and what to say when somebody uses one.
-FOREIGN_FLAGS = {
-    "--depths": "depth regularization is not supported",
-    "--depth_l1_weight_init": "depth regularization is not supported",
-    "--depth_l1_weight_final": "depth regularization is not supported",
-    "--train_test_exp": "exposure compensation is not supported",
-    "--exposure_lr_init": "exposure compensation is not supported",
-    "--exposure_lr_final": "exposure compensation is not supported",
-    "--exposure_lr_delay_steps": "exposure compensation is not supported",
-    "--exposure_lr_delay_mult": "exposure compensation is not supported",
-    "--position_lr_delay_mult": "the delay of the means' rate has no effect in the reference and is left out",
-    "--convert_SHs_python": "colors are always computed by the kernels",
-    "--compute_cov3D_python": "covariances are always computed by the kernels",
-    "--ip": "there is no network viewer",
-    "--port": "there is no network viewer",
-    "--disable_viewer": "there is no network viewer",
-    "--debug": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
-    "--debug_from": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
-    "--detect_anomaly": "gradients that are not finite are always dropped and counted",
-}
 
 
 def check_train(config: TrainConfig) -> str | None:

@@ -1,16 +1,21 @@
-"""Renders beside photographs, in the reference's folders, and their metrics."""
+"""Renders beside photographs, in the reference's folders, and their metrics: as numbers, a table and a sheet."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from warp_splat import report
 from warp_splat.camera import Camera
+from warp_splat.formats.atomic import write_text
 from warp_splat.formats.png import save_png
-from warp_splat.metrics import evaluate_folder, write_results
+from warp_splat.metrics import Metric, evaluate_folder, write_results
 from warp_splat.scene.types import View
+
+TOLD = 10  # views, at most, in the table that is printed
 
 
 def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
@@ -29,6 +34,15 @@ def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], fold
     return renders
 
 
+class Comparison(NamedTuple):
+    """One view, seen and rendered."""
+
+    name: str
+    photo: np.ndarray  # [H, W, 3] uint8
+    render: np.ndarray  # of the same size
+    values: dict[str, float]  # of each metric
+
+
 def evaluate_views(
     picture: Callable[[Camera], np.ndarray],
     views: list[View],
@@ -36,18 +50,66 @@ def evaluate_views(
     split: str,
     iteration: int,
     extra: dict,
-) -> tuple[dict[str, float], list[tuple[str, np.ndarray, np.ndarray, float]]]:
-    """Render ``views`` into ``<model>/<split>/ours_<iteration>``, then PSNR and SSIM of the saved 8-bit images.
+    metrics: Mapping[str, Metric],
+) -> tuple[dict[str, float], list[Comparison]]:
+    """Render ``views`` into ``<model>/<split>/ours_<iteration>``, then ``metrics`` of the saved 8-bit images.
 
     Returns:
-        The mean of each metric, and for each view its name, photograph, render and PSNR [dB].
+        The mean of each metric, and each view with its values.
 
     Raises:
         InputError: if a file cannot be written.
     """
     folder = model_folder / split / f"ours_{iteration}"
     renders = write_views(picture, views, folder)
-    means, per_view = evaluate_folder(folder)
+    means, per_view = evaluate_folder(folder, metrics)
     write_results(model_folder, iteration, means, per_view, extra)
-    values = per_view["PSNR"].values()
-    return means, [(v.name, v.image, r, p) for v, r, p in zip(views, renders, values, strict=True)]
+    values = [
+        dict(zip(per_view, row, strict=True)) for row in zip(*(v.values() for v in per_view.values()), strict=True)
+    ]
+    return means, [Comparison(v.name, v.image, r, row) for v, r, row in zip(views, renders, values, strict=True)]
+
+
+def show_views(
+    compared: list[Comparison], folder: Path, split: str, iteration: int, say: Callable[[str], None]
+) -> None:
+    """A sheet of the worst and the best views, and a table of all: ``contact_sheet.png``, ``per_view.md``.
+
+    ``say`` gets the table, or the worst of its lines where there are many.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    ranked = sorted(compared, key=lambda view: view.values["PSNR"])
+    portrait = compared[0].photo.shape[0] > compared[0].photo.shape[1]
+    columns, each = (2, 4) if portrait else (1, 3)  # whole lines
+    what = f"{len(compared)} {split} views after {iteration} iterations"
+    if len(ranked) <= 2 * each:
+        sections = {f"{what}, the worst first": ranked}
+    else:
+        sections = {f"the worst of {what}": ranked[:each], "the best": ranked[: -each - 1 : -1]}
+    rows = {
+        title: [(view.name, view.photo, view.render, describe(view.values)) for view in views]
+        for title, views in sections.items()
+    }
+    report.contact_sheet(folder / "contact_sheet.png", rows, columns)
+    write_text(folder / "per_view.md", f"{what}:\n\n{_table(compared)}\n")
+    if len(ranked) > TOLD:
+        say(f"The worst {TOLD} of {what} (all of them in {folder / 'per_view.md'}):")
+    say(_table(ranked[:TOLD]))
+
+
+def describe(values: Mapping[str, float]) -> str:
+    """PSNR 27.68 dB, SSIM 0.8514, ..."""
+    order = sorted(values, key=lambda name: name != "PSNR")
+    return ", ".join(f"{name} {_rounded(name, values[name])}{' dB' * (name == 'PSNR')}" for name in order)
+
+
+def _table(views: list[Comparison]) -> str:
+    names = list(views[0].values)
+    rows = [(view.name, *(_rounded(name, view.values[name]) for name in names)) for view in views]
+    return report.format_table(("view", *names), rows)
+
+
+def _rounded(metric: str, value: float) -> str:
+    return f"{value:.2f}" if metric == "PSNR" else f"{value:.4f}"

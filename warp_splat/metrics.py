@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
-    image, reference = _unit_images(image, reference)
+    image, reference = unit_images(image, reference)
     error = np.mean((image - reference) ** 2)
     return float(-10 * np.log10(error)) if error > 0 else math.inf
 
@@ -49,7 +49,7 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
-    x, y = _unit_images(image, reference)
+    x, y = unit_images(image, reference)
     mean_x, mean_y = _blur(x), _blur(y)
     var_x, var_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2
     covariance = _blur(x * y) - mean_x * mean_y
@@ -57,11 +57,18 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
     return float(np.mean(similarity / ((mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2))))
 
 
-def evaluate_folder(folder_split: Path) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
+Metric = Callable[[np.ndarray, np.ndarray], float]  # of an image and its reference, [H, W, 3] uint8
+METRICS: dict[str, Metric] = {"SSIM": ssim, "PSNR": psnr}  # those that need nothing but this file
+
+
+def evaluate_folder(
+    folder_split: Path, metrics: Mapping[str, Metric] = METRICS
+) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Compare ``renders/*.png`` with ``gt/*.png`` of the same name.
 
     Args:
         folder_split: such as ``<model>/test/ours_30000``.
+        metrics: what to measure, by name.
 
     Returns:
         The mean over the images of each metric, ``{"SSIM": ..., "PSNR": ...}``, and the values for each image,
@@ -77,7 +84,7 @@ def evaluate_folder(folder_split: Path) -> tuple[dict[str, float], dict[str, dic
             f"{folder_split}: expected the same PNG files in renders and gt, found {len(names[0])} and "
             f"{len(names[1])}; render the views again."
         )
-    per_view: dict[str, dict[str, float]] = {"SSIM": {}, "PSNR": {}}
+    per_view: dict[str, dict[str, float]] = {metric: {} for metric in metrics}
     for name in names[0]:
         image, reference = load_png(folder_split / "renders" / name), load_png(folder_split / "gt" / name)
         if image.shape != reference.shape:
@@ -85,8 +92,8 @@ def evaluate_folder(folder_split: Path) -> tuple[dict[str, float], dict[str, dic
                 f"{folder_split / 'renders' / name}: expected the size of gt/{name}, "
                 f"{reference.shape[1]}x{reference.shape[0]}, found {image.shape[1]}x{image.shape[0]}."
             )
-        per_view["SSIM"][name] = ssim(image, reference)
-        per_view["PSNR"][name] = psnr(image, reference)
+        for metric, measure in metrics.items():
+            per_view[metric][name] = measure(image, reference)
     return {metric: sum(values.values()) / len(values) for metric, values in per_view.items()}, per_view
 
 
@@ -137,8 +144,12 @@ def _blur(image: np.ndarray) -> np.ndarray:
     return correlate1d(rows, WINDOW, axis=1, mode="constant")
 
 
-def _unit_images(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both images in float64, 0..1."""
+def unit_images(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both images in float64, 0..1.
+
+    Raises:
+        InputError: if the shapes differ or the type is not uint8.
+    """
     for array in (image, reference):
         if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
             raise InputError(f"image: expected (H, W, 3) uint8, got {array.shape} {array.dtype}.")

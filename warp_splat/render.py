@@ -1,35 +1,36 @@
-"""Pictures of a trained model: its views with their metrics, or a timed orbit."""
+"""Pictures of a trained model: its views with their metrics, or frames along a way, as a video or timed."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from warp_splat import launch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions, RenderConfig
 from warp_splat.devices import memory_explained
 from warp_splat.errors import InputError
-from warp_splat.evaluate import evaluate_views, write_views
+from warp_splat.evaluate import describe, evaluate_views, show_views, write_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
+from warp_splat.perceptual import choose_metrics
 from warp_splat.renderer import render as render_gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
 from warp_splat.selftest import settle_device
 from warp_splat.trainer import to_bytes
+from warp_splat.ways import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
 
-ORBIT_SIZE = (980, 545)  # px
-ORBIT_VIEW = (1.4, 0.9)  # horizontal and vertical field of view, rad
-ORBIT_RADIUS = 5.0  # world units from the world's origin
-WARM_UP, FRAMES, FPS = 10, 100, 25
+WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
 
 
 def render(config: RenderConfig) -> int:
@@ -39,6 +40,8 @@ def render(config: RenderConfig) -> int:
         InputError: if the model, its scene or an option is not usable.
     """
     say = (lambda *_: None) if config.quiet else print
+    _check(config)
+    metrics, absent = choose_metrics(config.lpips_weights)
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     folder, iteration, gaussians, trained = _open(config)
     model = GaussianModel.from_splats(gaussians.splats)
@@ -47,14 +50,32 @@ def render(config: RenderConfig) -> int:
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
-    scene = None if config.orbit and config.orbit_center == "origin" else _load(config, trained, say)
+    scene = _load(config, trained, say) if _needs_scene(config) else None
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = make_picture(model.to(device), bool(trained.get("white_background")), options)
-        if config.orbit:
-            _orbit(picture, scene, config.orbit_output)
+        if config.orbit or config.video:
+            output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
+            _film(picture, _cameras(config, scene), output, config)
         elif scene:
-            _write_splits(picture, scene, config, folder, iteration, len(model))
+            evaluate = partial(evaluate_views, extra={"split": "test", "gaussians": len(model)}, metrics=metrics)
+            for sentence in absent:
+                say(sentence)
+            _write_splits(picture, scene, config, folder, iteration, evaluate, say)
     return 0
+
+
+def _check(config: RenderConfig) -> None:
+    if config.orbit and config.video:
+        raise InputError(f"--orbit, --video {config.video}: expected one of them; leave the other out.")
+    if config.video_output and not (config.orbit or config.video):
+        raise InputError(f"--video_output {config.video_output}: expected --video or --orbit beside it.")
+    if config.frames < 1:
+        raise InputError(f"--frames: expected at least 1, got {config.frames}.")
+
+
+def _needs_scene(config: RenderConfig) -> bool:
+    """Whether cameras of a scene are looked at: all but the timed orbit around the world's origin does."""
+    return not config.orbit or config.orbit_center == "focus"
 
 
 def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene | None):
@@ -72,17 +93,18 @@ def _write_splits(
     config: RenderConfig,
     folder: Path,
     iteration: int,
-    count: int,
+    evaluate: Callable,
+    say: Callable[[str], None],
 ) -> None:
-    """The views of both splits, and the metrics of those held out."""
+    """The views of both splits, and what ``evaluate`` finds of those held out."""
     if scene.train and not config.skip_train:
         write_views(picture, scene.train, folder / "train" / f"ours_{iteration}")
         print(f"  train  {len(scene.train)} views in {folder / 'train' / f'ours_{iteration}'}")
     if scene.test and not config.skip_test:
-        extra = {"split": "test", "gaussians": count}
-        means, _ = evaluate_views(picture, scene.test, folder, "test", iteration, extra)
+        means, compared = evaluate(picture, scene.test, folder, "test", iteration)
+        show_views(compared, folder, "test", iteration, say)
         print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-        print(f"  PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f} in {folder / 'results.json'}")
+        print(f"  {describe(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
 
 
 def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
@@ -97,7 +119,7 @@ def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
         iteration = model_folder.find_iteration(path, config.iteration)
         trained = model_folder.read_cfg_args(path) if (path / "cfg_args").exists() or not config.orbit else {}
         return path, iteration, load_gaussians(model_folder.ply_path(path, iteration)), trained
-    if not config.source_path and not (config.orbit and config.orbit_center == "origin"):
+    if not config.source_path and _needs_scene(config):
         raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
     gaussians = load_gaussians(path)
     return Path(f"{path}.renders"), 0, gaussians, {"eval": True, "antialiasing": gaussians.antialiased}
@@ -132,83 +154,55 @@ def make_picture(
     return picture
 
 
-def orbit_cameras(center: np.ndarray, up: np.ndarray, start: np.ndarray, count: int) -> list[Camera]:
-    """Cameras on a circle around ``center``, looking at it.
-
-    Args:
-        center: [3], world.
-        up: unit vector, [3]; the circle lies in the plane across it.
-        start: the first camera's place, [3]; fixes radius and height.
-        count: cameras.
-    """
-    (width, height), fov = ORBIT_SIZE, ORBIT_VIEW
-    fx, fy = 0.5 * width / np.tan(0.5 * fov[0]), 0.5 * height / np.tan(0.5 * fov[1])
-    arm = start - center
-    lift = np.dot(arm, up) * up
-    first = arm - lift
-    second = np.cross(up, first)
-    cameras = []
-    for angle in 2.0 * np.pi * np.arange(count) / count:
-        place = center + lift + np.cos(angle) * first + np.sin(angle) * second
-        forward = (center - place) / np.linalg.norm(center - place)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        cameras.append(Camera(width, height, fx, fy, 0.5 * width, 0.5 * height, rotation, -rotation @ place))
-    return cameras
-
-
-def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
-    """The point nearest to all optical axes (least squares), the cameras' mean up, their mean distance from it."""
-    cameras = [view.camera for view in scene.train]
-    across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
-    center = np.linalg.lstsq(
-        sum(across), sum(a @ camera.center for a, camera in zip(across, cameras, strict=True)), rcond=None
-    )[0]
-    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
-    distance = float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
-    return center, up / np.linalg.norm(up), distance
-
-
-def focus_orbit(scene: Scene, count: int) -> list[Camera]:
-    """``count`` cameras around the point that the scene's cameras look at, level with it and as far from it as they.
-
-    Raises:
-        InputError: if there is no such point.
-    """
-    center, up, distance = focus_point(scene)
-    first = scene.train[0].camera.center - center
-    level = first - np.dot(first, up) * up
-    if not (distance > 1e-6 and np.linalg.norm(level) > 1e-6 * distance):
-        raise InputError("--orbit_center focus: the cameras look at no common point; use --orbit_center origin.")
-    return orbit_cameras(center, up, center + distance * level / np.linalg.norm(level), count)
-
-
-def _orbit(picture: Callable[[Camera], np.ndarray], scene: Scene | None, output: str) -> None:
-    """Ten frames to warm up, a hundred timed; keep them if ``output`` says where."""
+def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:
+    """Those of ``--orbit`` or of ``--video``; a video has the size and the focal lengths of the first photograph."""
     if scene is None:
-        up, start = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -ORBIT_RADIUS])
-        cameras = orbit_cameras(np.zeros(3), up, start, FRAMES)
+        return origin_orbit(TIMED)
+    if config.orbit:
+        return focus_orbit(scene, TIMED)
+    lens = scene.train[0].camera
+    if config.video == "spiral":
+        return spiral_cameras(scene, config.frames, lens)
+    if config.video == "path":
+        return path_cameras(scene, config.frames, lens)
+    return (
+        origin_orbit(config.frames, lens)
+        if config.orbit_center == "origin"
+        else focus_orbit(scene, config.frames, lens)
+    )
+
+
+def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output: str, config: RenderConfig) -> None:
+    """Render a frame from each camera and keep it, if ``output`` says where; ``--orbit`` times them before."""
+    if config.orbit:
+        for camera in cameras[:WARM_UP]:
+            picture(camera)
+        start = time.perf_counter()
+        rendered = [picture(camera) for camera in cameras]
+        seconds = time.perf_counter() - start
+        size = f"{cameras[0].width} x {cameras[0].height}"
+        print(f"{len(rendered)} frames at {size} in {seconds:.2f} s: {len(rendered) / seconds:.1f} frames per second")
     else:
-        cameras = focus_orbit(scene, FRAMES)
-    for camera in cameras[:WARM_UP]:
-        picture(camera)
-    start = time.perf_counter()
-    frames = [picture(camera) for camera in cameras]
-    seconds = time.perf_counter() - start
-    size = f"{ORBIT_SIZE[0]} x {ORBIT_SIZE[1]}"
-    print(f"{FRAMES} frames at {size} in {seconds:.2f} s: {FRAMES / seconds:.1f} frames per second")
-    if not any(frame.max() != frame.min() for frame in frames):
-        print("Every frame is empty: no Gaussian lies on the orbit's way; try --orbit_center focus.")
-    if output:
-        _keep(iter(frames), output)
-
-
-def _keep(frames: Iterator[np.ndarray], output: str) -> None:
+        rendered = map(picture, tqdm(cameras, disable=config.quiet, unit="frame"))
+    frames = _watched(rendered)
     if output.endswith(".mp4"):
         save_video(output, frames, FPS)
-    else:
+    elif output:
         folder = model_folder.prepare(output)
         for index, frame in enumerate(frames):
             save_png(folder / f"{index:05d}.png", frame)
-    print(f"  frames in {output}")
+    else:
+        for _ in frames:
+            pass
+    if output:
+        print(f"  frames in {output}")
+
+
+def _watched(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The same frames; says so if all of them were empty."""
+    contrast = 0
+    for frame in frames:
+        contrast = max(contrast, int(frame.max()) - int(frame.min()))
+        yield frame
+    if contrast == 0:
+        print("Every frame is empty: no Gaussian lies on the way; try --orbit_center focus.")

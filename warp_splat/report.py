@@ -6,6 +6,7 @@ Colours are those of Okabe and Ito (2008), which people with colour vision defic
 from __future__ import annotations
 
 import datetime
+import itertools
 import os
 import platform
 import re
@@ -30,43 +31,51 @@ DIFFERENCE_GAIN = 4  # a difference of a quarter of the range is white
 NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
 
 
-def contact_sheet(
-    path: str | Path, rows: Sequence[tuple[str, np.ndarray, np.ndarray, float]], columns: int = 1
-) -> None:
+Row = tuple[str, np.ndarray, np.ndarray, str]  # of a sheet: name, photograph, render, what to say of it
+
+
+def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], columns: int = 1) -> None:
     """Draw views as photograph, render and their absolute difference, 1600 pixels wide.
 
-    The last is headed "error x 4": the mean over the channels, amplified fourfold; black means equal.
+    The last is the mean over the channels, amplified fourfold; a bar at the head gives its scale in levels of 255.
 
     Args:
         path: the file to write, .png, or .jpg for a smaller one.
-        rows: for each view its name, photograph and render, [H, W, 3] uint8 of one size, and PSNR in dB.
+        sections: views under a heading each, which may be empty; of each view its name, photograph and render,
+            [H, W, 3] uint8 of one size, and what to say of it.
         columns: views side by side, at most 4; more than one suits portrait photographs.
 
     Raises:
         InputError: if there are no views, or a photograph and its render differ in size; if the file cannot be written.
     """
-    if not rows:
-        raise InputError("rows: expected at least one view, got none.")
-    views = [(name, photo, render, _difference(photo, render), psnr) for name, photo, render, psnr in rows]
-    lines = [views[start : start + columns] for start in range(0, len(views), columns)]
+    lines: list[tuple[str, Sequence[Row]]] = []  # a heading, or none, and the views below it, side by side
+    for title, rows in sections.items():
+        starts = range(0, len(rows), columns)
+        lines += [(title if start == 0 else "", rows[start : start + columns]) for start in starts]
+    if not lines:
+        raise InputError("sections: expected at least one view, got none.")
     margin, gap, text, heading = 0.1, 0.04, 0.22, 0.26  # inches
     cell = (WIDTH - 2 * margin - (columns - 1) * 2 * gap) / (3 * columns)
-    heights = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) * (cell - gap) for line in lines]
-    figure = new_figure(WIDTH, heading + sum(heights) + len(lines) * (text + gap) + margin)
-    top = figure.get_figheight() - heading
-    for line, height in zip(lines, heights, strict=True):
+    heights = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) * (cell - gap) for _, line in lines]
+    titles = [heading * (bool(title) or number == 0) for number, (title, _) in enumerate(lines)]
+    figure = new_figure(WIDTH, heading + sum(heights) + sum(titles) + len(lines) * (text + gap) + margin)
+    top = figure.get_figheight()
+    _draw_scale(figure, WIDTH - margin - gap, top - heading + 0.04)
+    lefts = [margin + column * (3 * cell + 2 * gap) for column in range(max(len(line) for _, line in lines))]
+    for number, ((title, line), height, extra) in enumerate(zip(lines, heights, titles, strict=True)):
+        top -= extra
+        _write(figure, margin, top + 0.04, title, weight="bold")
+        if number == 0:
+            top -= heading
+            for left, (place, head) in itertools.product(lefts, enumerate(("photo", "render", "error"))):
+                _write(figure, left + place * cell, top + 0.04, head, weight="bold")
         top -= text + height
-        for column, (name, photo, render, difference, psnr) in enumerate(line):
-            left = margin + column * (3 * cell + 2 * gap)
-            titles = (_shorten(name, cell), f"{psnr:.2f} dB", "")
-            for place, (picture, title) in enumerate(zip((photo, render, difference), titles, strict=True)):
-                _place_picture(figure, (left + place * cell, top, cell - gap, height), picture, title)
+        for left, (name, photo, render, said) in zip(lefts, line, strict=False):
+            captions = (_shorten(name, cell), said if cell > 2 else said.partition(",")[0], "")
+            pictures = (photo, render, _difference(photo, render))
+            for place, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
+                _place_picture(figure, (left + place * cell, top, cell - gap, height), picture, caption)
         top -= gap
-    for column in range(min(columns, len(views))):
-        for place, title in enumerate(("photo", "render", f"error x {DIFFERENCE_GAIN}")):
-            x = margin + column * (3 * cell + 2 * gap) + place * cell
-            y = figure.get_figheight() - heading + 0.04
-            figure.text(x / WIDTH, y / figure.get_figheight(), title, fontsize=9, fontweight="bold", color=INK)
     save_figure(figure, path)
 
 
@@ -201,14 +210,32 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         figure.savefig(temporary)
 
 
-def _place_picture(figure: Figure, box: tuple[float, float, float, float], picture: np.ndarray, title: str) -> None:
+def _place_picture(
+    figure: Figure, box: tuple[float, float, float, float], picture: np.ndarray, title: str, aspect: str = "equal"
+) -> None:
     """Show ``picture`` in ``box`` = (left, bottom, width, height) [inches], with a title above its left edge."""
     width, height = figure.get_size_inches()
     axes = figure.add_axes((box[0] / width, box[1] / height, box[2] / width, box[3] / height))
-    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255)
+    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, aspect=aspect)
     axes.set_anchor("NW")
     axes.set_axis_off()
     axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5)
+
+
+def _draw_scale(figure: Figure, right: float, bottom: float) -> None:
+    """What the colors of an error mean, ending at ``right`` [inches]."""
+    bar, words = 0.8, 0.62  # inches
+    start = right - words - bar
+    _write(figure, start - 0.06, bottom, "error, mean of the channels:  0", align="right")
+    _place_picture(figure, (start, bottom, bar, 0.1), np.linspace(0, 255, 256)[None].repeat(2, 0), "", aspect="auto")
+    _write(figure, start + bar + 0.06, bottom, f"{255 / DIFFERENCE_GAIN:.0f} of 255")
+
+
+def _write(figure: Figure, left: float, bottom: float, text: str, weight: str = "normal", align: str = "left") -> None:
+    """Text that begins, or ends, at a place in inches."""
+    size = 9 if weight == "bold" else 8
+    width, height = figure.get_size_inches()
+    figure.text(left / width, bottom / height, text, fontsize=size, fontweight=weight, color=INK, ha=align)
 
 
 def _shorten(name: str, inches: float) -> str:

@@ -17,13 +17,14 @@ from warp_splat import report
 from warp_splat.devices import peak_memory
 from warp_splat.distributed import Processes
 from warp_splat.errors import InputError
-from warp_splat.evaluate import evaluate_views
+from warp_splat.evaluate import describe, evaluate_views, show_views
+from warp_splat.events import EventLog
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
+from warp_splat.perceptual import choose_metrics
 from warp_splat.trainer import Trainer
 
-SHEET_VIEWS = 6
 RECORD = {"iteration": int, "loss": float, "psnr": float, "gaussians": int, "seconds": float}
 
 
@@ -42,6 +43,7 @@ class Run:
     kept_at: float = 0.0  # when that was written, on time.perf_counter
     stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
     dropped: dict[str, int] = field(default_factory=dict)  # see Quarantine
+    events: EventLog = field(default_factory=EventLog)
 
 
 def warn(error: Exception) -> None:
@@ -83,7 +85,7 @@ def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
         if run.losses:
             tensors["losses"] = torch.stack(run.losses)
         options = asdict(trainer.config)
-        del options["start_checkpoint"], options["model_path"]
+        del options["start_checkpoint"], options["model_path"], options["config"]
         facts |= {"options": options, "iteration": run.iteration, "history": run.history}
         facts |= {"seconds": run.seconds, "wall": time.perf_counter() - run.start}
         arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
@@ -144,14 +146,17 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         "peak_memory_mb": peak_memory(),
         "dropped": run.dropped,
     }
-    means, pictures = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra)
-    sheet, plot = run.folder / "contact_sheet.png", run.folder / "training.png"
-    chosen = pictures[:: -(-len(pictures) // SHEET_VIEWS)]
-    portrait = chosen[0][1].shape[0] > chosen[0][1].shape[1]
-    report.contact_sheet(sheet, chosen, columns=2 if portrait else 1)
+    metrics, absent = choose_metrics(trainer.config.lpips_weights)
+    for sentence in absent:
+        say(sentence)
+    means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics)
+    show_views(compared, run.folder, split, run.iteration, say)
+    run.events.write_means(run.iteration, split, means)
+    plot = run.folder / "training.png"
     report.plot_training(plot, run.history)
     write_json(run.folder / "history.json", run.history)
-    lines = [("pictures", sheet), ("curves", plot), ("numbers", run.folder / "results.json")]
+    names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
+    lines = [(what, run.folder / name) for what, name in names.items()]
     if run.stages:
         report.plot_profile(run.folder / "profile.png", run.stages)
         lines += [("profile", run.folder / "profile.png")]
@@ -161,7 +166,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     state = "Interrupted" if run.iteration < trainer.config.iterations else "Done"
     print(
         f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
-        f"{split} PSNR {means['PSNR']:.2f} dB, SSIM {means['SSIM']:.4f}, {len(trainer.model)} Gaussians"
+        f"{split} {describe(means)}, {len(trainer.model)} Gaussians"
     )
     for name, where in lines:
         print(f"  {name:9s} {where}")

@@ -18,11 +18,14 @@ from warp_splat.config import TrainConfig, check_train
 from warp_splat.devices import memory_explained
 from warp_splat.distributed import GroupError, Processes, join
 from warp_splat.errors import InputError
+from warp_splat.events import EventLog, check_available
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
+from warp_splat.formats.config_file import write_config
 from warp_splat.formats.ply import save_points
 from warp_splat.formats.png import save_png
 from warp_splat.interrupts import interruptible
+from warp_splat.perceptual import choose_metrics
 from warp_splat.run import Run, finish, how_to_continue, keep, restore, save_model, save_or_warn, warn
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene
@@ -53,6 +56,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     config.quiet |= not leads
     say = (lambda *_: None) if config.quiet else tqdm.write
     threads = config.threads or max(1, launch.get_threads() // processes.local_count)
+    choose_metrics(config.lpips_weights)  # what would be missed at the end is said now
+    if config.tensorboard:
+        check_available()
     checkpoint = load_checkpoint(config.start_checkpoint) if config.start_checkpoint else None
     begun = checkpoint.count("iteration") if checkpoint else 0
     if checkpoint and begun > config.iterations:  # at the end, what is written there is written again
@@ -102,6 +108,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
             del checkpoint  # its arrays take as much memory as the trainer's
         else:
             keep(trainer, run)
+        if leads and config.tensorboard:
+            run.events = EventLog.open(run.folder, run.iteration)
         if device.type == "cpu":
             say(forecast.describe(scene, config, len(trainer.model), processes.local_count))
         return _run(trainer, run, say)
@@ -153,6 +161,7 @@ def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
         folder,
         {**asdict(config), "model_path": str(folder), "depths": "", "train_test_exp": False},
     )
+    write_config(folder, config)
     model_folder.write_cameras(folder, scene.test, scene.train)
     remove_leftovers(folder)
     save_points(folder / "input.ply", scene.points, scene.colors)
@@ -232,14 +241,17 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     split, views = trainer.scene.evaluated
     if not whole:
         views = views[:: -(-len(views) // PROGRESS_VIEWS)]
+    values = torch.stack(losses).double().cpu().numpy()
     record = {
         "iteration": run.iteration,
-        "loss": float(np.mean(torch.stack(losses).double().cpu().numpy())),
+        "loss": float(np.mean(values)),
         "psnr": trainer.evaluate(views),
         "gaussians": len(trainer.model),
         "seconds": run.seconds,
     }
     run.history.append(record)
+    run.events.write_losses(run.iteration, values, trainer.processes.count)
+    run.events.write_record(record, split)
     text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
     bar.set_postfix_str(text, refresh=False)
     if time.perf_counter() - run.preview > PREVIEW_SECONDS:

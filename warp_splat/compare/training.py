@@ -25,10 +25,11 @@ import torch
 
 from warp_splat import report
 from warp_splat.binning import bin_tiles
-from warp_splat.config import EMBEDDED_DEFAULTS, TrainConfig
+from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.metrics import psnr, ssim
+from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.renderer import Dropped, Project, camera_view
 from warp_splat.scene import Scene, View
 from warp_splat.trainer import Trainer
@@ -296,4 +297,5 @@ def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Run]) -> None:
     index = int(np.argmax(losses))
     photo = views[index].image
     renders = {"no cap": of["manual"][index], **{k: of[k][index] for k in (cap, f"{cap}, rendering only")}}
-    report.contact_sheet(path, [(name, photo, render, psnr(render, photo)) for name, render in renders.items()])
+    rows = [(name, photo, render, f"{psnr(render, photo):.2f} dB") for name, render in renders.items()]
+    report.contact_sheet(path, {"": rows})

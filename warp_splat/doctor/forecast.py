@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import psutil
 
-from warp_splat.config import CORES, PRESETS, TrainConfig
+from warp_splat.config import CORES, TrainConfig
 from warp_splat.forecast import GIB, INSTANCES, expected_gaussians, step_memory
+from warp_splat.presets import PRESETS
 from warp_splat.scene.images import target_size
 
 BASE = 0.7 * GIB  # Python, torch, Warp and their kernels

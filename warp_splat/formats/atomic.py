@@ -46,14 +46,23 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         ) from error
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write UTF-8 text, whole or not at all.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")  # names of files may be any bytes
+
+
 def write_json(path: str | Path, value) -> None:
     """Write ``value`` as JSON, whole or not at all; numbers that are not finite, which JSON lacks, become ``null``.
 
     Raises:
         InputError: if the file cannot be written.
     """
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(_without_infinities(value), indent=1, allow_nan=False), encoding="utf-8")
+    write_text(path, json.dumps(_without_infinities(value), indent=1, allow_nan=False))
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping]) -> None:

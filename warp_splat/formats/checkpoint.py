@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from warp_splat import __version__
 from warp_splat.config import TrainConfig, check_train
 from warp_splat.errors import InputError
+from warp_splat.flags import fits
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, reading
 
@@ -142,9 +143,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
         for item in fields(TrainConfig):
             if item.name in found:
                 value = found.pop(item.name)
-                if not _is_like(value, getattr(config, item.name)) or value not in (
-                    item.metadata["choices"] or [value]
-                ):
+                if not fits(value, item, getattr(config, item.name)):
                     raise Unexpected(f"{value!r:.50} as its option {item.name}")
                 setattr(config, item.name, value)
         if found:
@@ -207,15 +206,6 @@ def _facts(file: Any) -> tuple[str, dict[str, Any]]:
     if found > FORMAT:
         raise Unexpected(f"one of format {found!r:.20} (this program knows up to {FORMAT}); install a newer version")
     return text, facts
-
-
-def _is_like(value: Any, default: Any) -> bool:
-    """Whether ``value`` can stand in the place of an option's default."""
-    if isinstance(default, list):
-        return type(value) is list and all(_is_like(item, 0) for item in value)
-    if type(default) is float:
-        return type(value) is float or _is_like(value, 0)
-    return type(value) is type(default) and (type(value) is not int or abs(value) < 2**63)
 
 
 def _checksum(text: str, arrays: Mapping[str, np.ndarray]) -> str:

@@ -1,0 +1,83 @@
+"""Options from a TOML file, the order in which they count, and the help that a newcomer reads first."""
+
+import re
+import tomllib
+from dataclasses import asdict, fields
+
+import pytest
+
+from warp_splat.cli import COMMANDS, main, make_parser, parse
+from warp_splat.config import TrainConfig
+from warp_splat.errors import InputError
+from warp_splat.formats.config_file import OF_ONE_RUN, read_config, write_config
+
+
+def test_flags_go_before_the_file_which_goes_before_presets(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text('preset = "fast"\nopacity_lr = 0.125\niterations = 77\nsource_path = "x"\n')
+    config = parse(["train", "--config", str(file), "--iterations", "88"])
+    assert (config.iterations, config.opacity_lr, config.coarse, config.source_path) == (88, 0.125, 4, "x")
+    assert config.sh_degree == TrainConfig().sh_degree
+
+
+def test_every_option_survives_the_file(tmp_path):
+    """Also texts that need escapes, and floats; read by the standard library alone."""
+    strange = TrainConfig(
+        source_path='a "quoted"\\path\n\x7f\x01 é 😀', opacity_lr=1.0 / 3.0, position_lr_final=1e-300, quiet=True
+    )
+    strange.checkpoint_iterations, strange.seed = [3, 5], 2**62
+    write_config(tmp_path, strange)
+    expected = {name: value for name, value in asdict(strange).items() if name not in OF_ONE_RUN}
+    assert tomllib.loads((tmp_path / "config.toml").read_text(encoding="utf-8")) == expected
+    assert read_config(tmp_path / "config.toml") == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("iteratons = 3", "iteratons: no such option; did you mean iterations?"),
+        ("xyzzy = 3", "xyzzy: no such option; warp-splat train --help"),
+        ('config = "a.toml"', "config: no such option"),
+        ('iterations = "3"', "iterations: expected a whole number, found '3'"),
+        ("iterations = true", "iterations: expected a whole number, found True"),
+        ("eval = 1", "eval: expected true or false, found 1"),
+        ("source_path = 1979-05-27", "source_path: expected a text"),
+        ("save_iterations = [1.5]", "save_iterations: expected a list of numbers"),
+        ('preset = "slow"', "preset: expected one of '', 'fast', found 'slow'"),
+        ("[train]\niterations = 3", "train: no such option"),
+        ("iterations = ", "expected a TOML file"),
+        ("a = " + "[" * 5000, "expected a TOML file"),
+        ("\udcff = 1", "expected a TOML file"),
+    ],
+)
+def test_files_that_are_wrong(tmp_path, capsys, text, sentence):
+    file = tmp_path / "a.toml"
+    file.write_text(text, errors="surrogateescape")
+    assert main(["train", "--config", str(file)]) == 1
+    message = capsys.readouterr().err
+    assert message.startswith(f"warp-splat: error: --config {file}: {sentence}") and message.count("\n") == 1
+
+
+def test_no_file():
+    with pytest.raises(InputError, match="No such file"):
+        read_config("none.toml")
+
+
+def test_help_begins_with_the_flags_that_matter(capsys):
+    with pytest.raises(SystemExit):
+        make_parser().parse_args(["train", "--help"])
+    first, *rest = re.split(r"\n\n(?=\S)", capsys.readouterr().out.split("options:\n", 1)[1])
+    flags = re.findall(r"^  (-.*?)(?:  |$)", first, re.MULTILINE)
+    names = {name for line in flags for name in re.findall(r"--(\w+)", line) if not name.startswith("no")}
+    expected = "help source_path model_path sfm eval resolution preset iterations max_gaussians resume start_checkpoint"
+    assert names == {*expected.split(), "quiet"}
+    listed = set(re.findall(r"^  (?:-\w[^-]*, )?--(\w+)", "\n".join(rest), re.MULTILINE))
+    others = {item.name for item in fields(TrainConfig) if item.metadata["group"]}
+    assert len(others) > 30 and others <= listed | names
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_each_command_is_short_at_its_head(command, capsys):
+    with pytest.raises(SystemExit):
+        make_parser().parse_args([command, "--help"])
+    assert capsys.readouterr().out.index("\n\n") < 80

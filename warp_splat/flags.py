@@ -1,0 +1,69 @@
+"""Command-line flags as fields of dataclasses, under the headings of ``--help``. Standard library only."""
+
+from __future__ import annotations
+
+from dataclasses import Field, field
+from functools import partial
+from typing import Any
+
+
+def flag(
+    default: Any, help: str, *names: str, choices: tuple | None = None, many: type | None = None, group: str = ""
+) -> Any:
+    """A dataclass field that is also a command-line flag: its default, its help, further names.
+
+    Without a ``group`` it is one of the few that ``--help`` lists first.
+    """
+    metadata = {"help": help, "names": names, "choices": choices, "many": many, "group": group, "positional": False}
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def argument(help: str) -> Any:
+    """A dataclass field that is also an argument of the command line without a flag: known by its place."""
+    return field(default="", metadata={"help": help, "positional": True})
+
+
+data = partial(flag, group="what is read")
+rendering = partial(flag, group="how Gaussians are rendered")
+learning = partial(flag, group="how they learn")
+growing = partial(flag, group="how many they become")
+reporting = partial(flag, group="what is kept and told")
+film = partial(flag, group="frames along a way")
+machinery = partial(flag, group="where it is computed")
+
+
+def fits(value: Any, item: Field, default: Any) -> bool:
+    """Whether ``value``, read from a file, can be that of an option with this field and this default."""
+    return _is_like(value, default) and (not item.metadata["choices"] or value in item.metadata["choices"])
+
+
+def _is_like(value: Any, default: Any) -> bool:
+    if isinstance(default, list):
+        return type(value) is list and all(_is_like(item, 0) for item in value)
+    if type(default) is float:
+        return type(value) is float or _is_like(value, 0)
+    return type(value) is type(default) and (type(value) is not int or abs(value) < 2**63)
+
+
+#: Flags of the reference that this program does not have, and what to say when somebody uses one.
+FOREIGN_FLAGS = {
+    "--depths": "depth regularization is not supported",
+    "--depth_l1_weight_init": "depth regularization is not supported",
+    "--depth_l1_weight_final": "depth regularization is not supported",
+    "--train_test_exp": "exposure compensation is not supported",
+    "--exposure_lr_init": "exposure compensation is not supported",
+    "--exposure_lr_final": "exposure compensation is not supported",
+    "--exposure_lr_delay_steps": "exposure compensation is not supported",
+    "--exposure_lr_delay_mult": "exposure compensation is not supported",
+    "--position_lr_delay_mult": "the delay of the means' rate has no effect in the reference and is left out",
+    "--convert_SHs_python": "colors are always computed by the kernels",
+    "--compute_cov3D_python": "covariances are always computed by the kernels",
+    "--ip": "there is no network viewer",
+    "--port": "there is no network viewer",
+    "--disable_viewer": "there is no network viewer",
+    "--debug": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
+    "--debug_from": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
+    "--detect_anomaly": "gradients that are not finite are always dropped and counted",
+}

@@ -1,0 +1,63 @@
+"""Training options as TOML: ``--config`` in, ``config.toml`` in the model folder out."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from warp_splat.config import TrainConfig
+from warp_splat.errors import InputError
+from warp_splat.flags import fits
+from warp_splat.formats.atomic import write_text
+
+NAME = "config.toml"
+OF_ONE_RUN = ("model_path", "start_checkpoint", "config")  # where it wrote, where it came from
+KINDS = {str: "a text", bool: "true or false", int: "a whole number", float: "a number", list: "a list of numbers"}
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """The options in a file, by name; those that it leaves out keep their defaults.
+
+    Raises:
+        InputError: if it cannot be read or is no TOML; for an unknown option, or a value that it cannot have.
+    """
+    try:
+        with open(path, "rb") as file:
+            found = tomllib.load(file)
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"--config {path}: expected a TOML file with options of training ({error}).") from error
+    defaults, options = TrainConfig(), {item.name: item for item in fields(TrainConfig) if item.name != "config"}
+    for name, value in found.items():
+        if name not in options:
+            near = difflib.get_close_matches(name, options, 1)
+            hint = f"did you mean {near[0]}?" if near else "warp-splat train --help lists them."
+            raise InputError(f"--config {path}: {name}: no such option; {hint}")
+        item, default = options[name], getattr(defaults, name)
+        if not fits(value, item, default):
+            choices = item.metadata["choices"]
+            expected = f"one of {', '.join(map(repr, choices))}" if choices else KINDS[type(default)]
+            raise InputError(f"--config {path}: {name}: expected {expected}, found {value!r:.60}; change it there.")
+    return found
+
+
+def write_config(folder: str | Path, config: TrainConfig) -> None:
+    """Write every option but those of this one run, under the headings of ``--help``, each with what it means.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    lines, group = ["# The options of this training; train.py --config with this file repeats it."], ""
+    for item in fields(config):
+        if item.name in OF_ONE_RUN:
+            continue
+        if item.metadata["group"] != group:
+            group = item.metadata["group"]
+            lines += ["", f"# {group}"]
+        # a text of JSON is one of TOML, but for the one character that JSON does not escape
+        value = json.dumps(getattr(config, item.name), ensure_ascii=False).replace("\x7f", "\\u007f")
+        lines.append(f"{item.name} = {value}  # {item.metadata['help']}")
+    write_text(Path(folder) / NAME, "\n".join([*lines, ""]))
