@@ -23,6 +23,7 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (o
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
 PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that follow
 EXTENTS = ("ellipse", "square")
+LOSS_SPACES = ("srgb", "log")
 EXP_DEGREES = (3, 4, 5, 6, None)
 
 
@@ -73,11 +74,18 @@ def argument(help: str) -> Any:
 class TrainConfig:
     """Training options; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
-    source_path: str = flag("", "scene folder (COLMAP or nerf-synthetic); without it, the embedded scene", "-s")
+    source_path: str = flag(
+        "", "scene folder (COLMAP, nerf-synthetic, transforms.json); without it, the embedded scene", "-s"
+    )
     model_path: str = flag("", "output folder; default: output/<random name>", "-m")
     images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
     resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
     white_background: bool = flag(False, "composite on white instead of black", "-w")
+    invert_masks: bool = flag(False, "of the masks in masks/, the dark part counts, not the bright one")
+    loss_space: str = flag(
+        "srgb", "photographs in linear light (EXR, HDR): the curve under which they are compared", choices=LOSS_SPACES
+    )
+    start_ply: str = flag("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
     sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
     start_checkpoint: str = flag(
@@ -223,7 +231,7 @@ class SfmConfig:
 class InspectConfig:
     """A scene to examine before anyone trains on it."""
 
-    scene: str = argument("scene folder (COLMAP or nerf-synthetic)")
+    scene: str = argument("scene folder (COLMAP, nerf-synthetic or transforms.json)")
     images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
     out: str = flag("", "the page to write; default: output/inspect/<name of the scene>.html", "-o")
 

@@ -14,17 +14,22 @@ from warp_splat.scene.types import View
 
 
 def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
-    """Write ``renders/00000.png`` and ``gt/00000.png`` ... in ``folder``; returns the renders.
+    """Write ``renders/00000.png``, ``gt/00000.png`` and, of views with one, ``masks/00000.png`` ... in ``folder``.
 
-    Surplus images of an earlier run are removed: metrics are taken over all that lie there.
+    Returns the renders. Surplus images of an earlier run are removed: metrics are taken over all that lie there.
     """
     renders = []
+    kept = set()
     for index, view in enumerate(views):
         renders.append(picture(view.camera))
-        save_png(folder / "renders" / f"{index:05d}.png", renders[-1])
-        save_png(folder / "gt" / f"{index:05d}.png", view.image)
-    for old in (*folder.glob("renders/*.png"), *folder.glob("gt/*.png")):
-        if old.stem.isdigit() and int(old.stem) >= len(views):
+        pictures = {"renders": renders[-1], "gt": view.picture}
+        if view.mask is not None:
+            pictures["masks"] = np.repeat(255 * view.mask[..., None], 3, axis=2)
+        for name, pixels in pictures.items():
+            save_png(folder / name / f"{index:05d}.png", pixels)
+            kept.add(folder / name / f"{index:05d}.png")
+    for old in [path for name in ("renders", "gt", "masks") for path in folder.glob(f"{name}/*.png")]:
+        if old.stem.isdigit() and old not in kept:
             old.unlink()
     return renders
 
@@ -50,4 +55,4 @@ def evaluate_views(
     means, per_view = evaluate_folder(folder)
     write_results(model_folder, iteration, means, per_view, extra)
     values = per_view["PSNR"].values()
-    return means, [(v.name, v.image, r, p) for v, r, p in zip(views, renders, values, strict=True)]
+    return means, [(v.name, v.picture, r, p) for v, r, p in zip(views, renders, values, strict=True)]

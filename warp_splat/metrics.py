@@ -24,41 +24,47 @@ WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 WINDOW /= WINDOW.sum()
 
 
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio in dB, over all pixels and channels at once; infinite for equal images.
 
     Args:
         image: [H, W, 3] uint8.
         reference: [H, W, 3] uint8.
+        mask: [H, W], not 0 for at least one pixel; those that are 0 do not count.
 
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
     image, reference = _unit_images(image, reference)
-    error = np.mean((image - reference) ** 2)
+    squares = (image - reference) ** 2
+    error = np.mean(squares if mask is None else squares[mask > 0])
     return float(-10 * np.log10(error)) if error > 0 else math.inf
 
 
-def ssim(image: np.ndarray, reference: np.ndarray) -> float:
+def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Structural similarity (Wang et al. 2004, eq. 13) with zeros outside the image; mean over pixels and channels.
 
     Args:
         image: [H, W, 3] uint8.
         reference: [H, W, 3] uint8.
+        mask: as for :func:`psnr`; both images are black where it is 0, and the mean is over the other pixels.
 
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
     x, y = _unit_images(image, reference)
+    if mask is not None:
+        x, y = x * (mask > 0)[..., None], y * (mask > 0)[..., None]
     mean_x, mean_y = _blur(x), _blur(y)
     var_x, var_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2
     covariance = _blur(x * y) - mean_x * mean_y
     similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    return float(np.mean(similarity / ((mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2))))
+    similarity /= (mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2)
+    return float(np.mean(similarity if mask is None else similarity[mask > 0]))
 
 
 def evaluate_folder(folder_split: Path) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Compare ``renders/*.png`` with ``gt/*.png`` of the same name.
+    """Compare ``renders/*.png`` with ``gt/*.png`` of the same name, where ``masks/*.png`` is not black if there is one.
 
     Args:
         folder_split: such as ``<model>/test/ours_30000``.
@@ -85,8 +91,9 @@ def evaluate_folder(folder_split: Path) -> tuple[dict[str, float], dict[str, dic
                 f"{folder_split / 'renders' / name}: expected the size of gt/{name}, "
                 f"{reference.shape[1]}x{reference.shape[0]}, found {image.shape[1]}x{image.shape[0]}."
             )
-        per_view["SSIM"][name] = ssim(image, reference)
-        per_view["PSNR"][name] = psnr(image, reference)
+        mask = load_png(folder_split / "masks" / name)[..., 0] if (folder_split / "masks" / name).is_file() else None
+        per_view["SSIM"][name] = ssim(image, reference, mask)
+        per_view["PSNR"][name] = psnr(image, reference, mask)
     return {metric: sum(values.values()) / len(values) for metric, values in per_view.items()}, per_view
 
 
