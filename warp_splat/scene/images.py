@@ -24,6 +24,7 @@ AUTO_WIDTH = 1600  # `-r -1` shrinks wider images to this width (graphdeco, util
 PIXELS_MOST = 200_000_000  # of a file: more than any camera has, and 2.4 GB once decoded
 CHANNELS_MOST = 32  # likewise: OpenImageIO decodes all of them
 FLOATS = (oiio.BASETYPE.HALF, oiio.BASETYPE.FLOAT, oiio.BASETYPE.DOUBLE)
+RATIO_MOST = 2**14  # of decoded to stored bytes: a black mask of one bit per pixel has half of it
 WARP_PAD = 4  # px repeated around the source: OpenImageIO's warp sees black outside of it, and its filter reaches there
 
 
@@ -206,7 +207,8 @@ def _open(path: Path) -> oiio.ImageInput:
     if file is None:
         raise _unreadable(path, oiio.geterror())
     spec = file.spec()
-    if spec.width * spec.height > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1:
+    pixels, least = spec.width * spec.height, spec.image_bytes() // RATIO_MOST
+    if pixels > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1 or least > path.stat().st_size:
         raise _unreadable(path, f"{spec.width} x {spec.height} x {spec.depth} pixels of {spec.nchannels} channels")
     return file
 

@@ -182,7 +182,7 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
         world_from_camera = np.empty(0)
     if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
         raise InputError(
-            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix)}; "
+            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix):.100}; "
             "correct the file."
         )
     u, scales, vt = np.linalg.svd(world_from_camera[:3, :3])  # u @ vt is the nearest rotation, without the scale
