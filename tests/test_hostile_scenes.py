@@ -156,6 +156,16 @@ def test_lies_about_counts_are_refused_at_once(tmp_path, name, count):
         load(tmp_path)
 
 
+def test_bytes_in_a_file_that_are_no_text(tmp_path):
+    """OpenImageIO names the attribute that it refuses."""
+    (path,) = with_image(tmp_path, "a.exr")
+    data = path.read_bytes()
+    assert b"channels\0chlist" in data
+    path.write_bytes(data.replace(b"channels\0chlist", b"chann\x80ls\0chlist"))
+    with pytest.raises(InputError, match=r"a\.exr: expected a complete image file"):
+        load(tmp_path)
+
+
 def test_a_png_that_lies_about_its_size_allocates_nothing(tmp_path):
     """A header of 14,000 x 14,000 pixels on a file of some kilobytes."""
     (path,) = with_image(tmp_path, "a.png")

@@ -90,7 +90,7 @@ def read_lens(path: Path) -> tuple[int, int, str, float]:
     """
     spec = _open(path).spec()
     focal = spec.get_float_attribute("Exif:FocalLength")
-    return spec.width, spec.height, spec.get_string_attribute("Model"), focal
+    return spec.width, spec.height, _text(spec.get_string_attribute, "Model"), focal
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
@@ -112,13 +112,13 @@ def read_pixels(path: Path, background: float) -> Pixels:
     file = _open(path)
     spec = file.spec()
     pixels = file.read_image(oiio.FLOAT)
-    error = file.geterror()  # a JPEG that is cut short still gives pixels: gray ones
+    error = _text(file.geterror)  # a JPEG that is cut short still gives pixels: gray ones
     if pixels is None or error:
         raise _unreadable(path, error)
     if not np.isfinite(pixels).all():
         raise _unreadable(path, "pixels that are NaN or infinite")
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    linear = spec.format.basetype in FLOATS or spec.get_string_attribute("oiio:ColorSpace").startswith("lin")
+    linear = spec.format.basetype in FLOATS or _text(spec.get_string_attribute, "oiio:ColorSpace").startswith("lin")
     if spec.alpha_channel < 0:
         return Pixels(color, None, linear)
     alpha = pixels[..., spec.alpha_channel]
@@ -205,12 +205,20 @@ def _open(path: Path) -> oiio.ImageInput:
     straight.attribute("oiio:UnassociatedAlpha", 1)  # else OpenImageIO multiplies by alpha, in the file's 8 bit
     file = oiio.ImageInput.open(str(path), straight)
     if file is None:
-        raise _unreadable(path, oiio.geterror())
+        raise _unreadable(path, _text(oiio.geterror))
     spec = file.spec()
     pixels, least = spec.width * spec.height, spec.image_bytes() // RATIO_MOST
     if pixels > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1 or least > path.stat().st_size:
         raise _unreadable(path, f"{spec.width} x {spec.height} x {spec.depth} pixels of {spec.nchannels} channels")
     return file
+
+
+def _text(get: Callable[..., str], *arguments: str) -> str:
+    """What ``get`` returns; damaged files hold bytes that are no text."""
+    try:
+        return get(*arguments)
+    except UnicodeDecodeError:
+        return "text that is damaged"
 
 
 def _unreadable(path: Path, error: str) -> InputError:
