@@ -87,10 +87,18 @@ def turn_all(model, turn):
 FLIP = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag((1.0, -1.0, -1.0))), np.zeros(3))
 DAMAGE = {
     "missing": (lambda s: (s / "images" / "view_003.png").unlink(), ("error", "files"), "view_003.png"),
-    "other ending": (
-        lambda s: (s / "images" / "view_003.png").rename(s / "images" / "view_003.tif"),
+    "two of one stem": (
+        lambda s: (
+            [shutil.copy(s / "images" / "view_003.png", s / "images" / f"view_003.{e}") for e in ("tif", "jpg")]
+            and (s / "images" / "view_003.png").unlink()
+        ),
         ("error", "files"),
-        "view_003.tif has the same stem",
+        "several of this stem (view_003.jpg, view_003.tif)",
+    ),
+    "no points": (
+        lambda s: change_model(s, lambda model: [model.delete_point3D(n) for n in list(model.points3D)]),
+        ("warning", "points"),
+        "random ones",
     ),
     "size": (
         lambda s: write_image(s / "images" / "view_003.png", texture(200, 264)),

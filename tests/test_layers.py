@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "warp_splat"
 LAYERS = [
-    {"errors", "config", "flags", "presets"},
+    {"errors", "config", "flags", "presets", "color"},
     {"kernels"},
     {"camera", "devices", "launch", "distributed", "formats", "interrupts", "scene.types"},
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},

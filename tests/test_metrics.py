@@ -198,6 +198,15 @@ def test_flip_of_pictures():
     assert flip(*images(1, 1)) > 0
 
 
+def test_flip_sees_nothing_under_a_mask():
+    image, reference = images(40, 30, 20)
+    mask = np.ones(image.shape[:2], np.uint8)
+    assert flip(image, reference, mask) == flip(image, reference)
+    mask[:, 15:] = 0
+    other = np.where(mask[..., None] > 0, image, 255 - image)
+    assert flip(other, reference, mask) == flip(image, reference, mask) != flip(image, reference)
+
+
 def test_flip_that_is_not_installed_is_named(monkeypatch):
     monkeypatch.setattr("warp_splat.perceptual.find_spec", lambda _: None)
     metrics, absent = choose_metrics("")

@@ -111,13 +111,12 @@ BAD = {
     "source-is-file": (source_is_file, ["scene.txt", "found a file"]),
     "plain-photos": (
         plain_photos,
-        ["model (sparse/) or transforms_train.json", "1 photographs alone", "warp-splat sfm"],
+        ["model (sparse/), transforms_train.json or transforms.json", "1 photographs alone", "warp-splat sfm"],
     ),
     "resolution-0": (colmap_case(lambda root: None, resolution=0), ["resolution", "got 0"]),
     "resolution-negative": (colmap_case(lambda root: None, resolution=-2), ["resolution", "got -2"]),
     "eval-one-image": (no_test_left, ["at least 2 images", "found 1", "--eval"]),
     "empty-sparse": (lambda root: ((root / "sparse").mkdir() or root, {}), ["sparse", "found none"]),
-    "no-points": (model_case("points3D.txt", lambda path: path.write_text("# none\n")), ["sparse/0", "3D points"]),
     "no-images": (model_case("images.txt", image_only), ["sparse/0", "registered images"]),
     "missing-file": (model_case("points3D.bin", Path.unlink, binary=True), ["sparse/0", "pycolmap cannot read"]),
     "missing-images": (
@@ -141,7 +140,7 @@ BAD = {
     "empty-points": (model_case("points3D.bin", lambda path: cut(path, 0), binary=True), ["points3D.bin", "0 bytes"]),
     "cut-images": (model_case("images.bin", lambda path: cut(path, 0.7), binary=True), ["images.bin", "cut short"]),
     "cut-cameras": (model_case("cameras.bin", lambda path: cut(path, 0.7), binary=True), ["cameras.bin", "cut short"]),
-    "cut-frames": (model_case("frames.bin", lambda path: cut(path, 0.7), binary=True), ["sparse/0", "cannot read it"]),
+    "cut-frames": (model_case("frames.bin", lambda path: cut(path, 0.7), binary=True), ["frames.bin", "cut short"]),
     "garbage-points": (
         model_case("points3D.bin", lambda path: path.write_bytes(texture().tobytes()), binary=True),
         ["points3D.bin", "damaged"],
@@ -163,7 +162,7 @@ BAD = {
     ),
     "json-list": (
         lambda root: ((root / "transforms_train.json").write_text("[1]") and root, {}),
-        ["transforms_train.json", "key camera_angle_x"],
+        ["transforms_train.json", "key frames"],
     ),
     "angle-missing": (blender_case(lambda content: content.pop("camera_angle_x")), ["train.json", "camera_angle_x"]),
     "angle": (blender_case(lambda content: content.update(camera_angle_x=0)), ["train.json", "between 0 and pi"]),
@@ -171,7 +170,7 @@ BAD = {
     "frames-empty": (blender_case(lambda content: content.update(frames=[])), ["train.json", "at least one frame"]),
     "path-missing": (blender_case(lambda content: content["frames"][1].pop("file_path")), ["frame 1", "file_path"]),
     "path-number": (frame_case(file_path=3), ["frame 1", "string as file_path"]),
-    "path-nowhere": (frame_case(file_path="train/r_9"), ["train.json", "1 of them cannot", "'train/r_9.png'"]),
+    "path-nowhere": (frame_case(file_path="train/r_9"), ["train.json", "1 of them cannot", "'train/r_9'"]),
     "matrix-missing": (
         blender_case(lambda content: content["frames"][0].pop("transform_matrix")),
         ["train.json", "frame 0", "transform_matrix"],

@@ -24,6 +24,7 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (o
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
 PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that follow
 EXTENTS = ("ellipse", "square")
+LOSS_SPACES = ("srgb", "log")
 EXP_DEGREES = (3, 4, 5, 6, None)
 VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.ways
 
@@ -64,7 +65,9 @@ class RasterOptions:
 class TrainConfig:
     """Training options; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
-    source_path: str = flag("", "scene folder (COLMAP or nerf-synthetic); without it, the embedded scene", "-s")
+    source_path: str = flag(
+        "", "scene folder (COLMAP, nerf-synthetic, transforms.json); without it, the embedded scene", "-s"
+    )
     model_path: str = flag("", "output folder; default: output/<random name>", "-m")
     sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
@@ -82,6 +85,11 @@ class TrainConfig:
 
     images: str = data("images", "folder of the photographs inside a COLMAP scene", "-i")
     white_background: bool = data(False, "composite on white instead of black", "-w")
+    invert_masks: bool = data(False, "of the masks in masks/, the dark part counts, not the bright one")
+    loss_space: str = data(
+        "srgb", "photographs in linear light (EXR, HDR): the curve under which they are compared", choices=LOSS_SPACES
+    )
+    start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags that are given go before")
 
     sh_degree: int = rendering(3, "highest degree of the view-dependent color", choices=(0, 1, 2, 3))
@@ -205,7 +213,7 @@ class SfmConfig:
 class InspectConfig:
     """A scene to examine before anyone trains on it."""
 
-    scene: str = argument("scene folder (COLMAP or nerf-synthetic)")
+    scene: str = argument("scene folder (COLMAP, nerf-synthetic or transforms.json)")
     images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
     out: str = flag("", "the page to write; default: output/inspect/<name of the scene>.html", "-o")
 

@@ -19,17 +19,22 @@ TOLD = 10  # views, at most, in the table that is printed
 
 
 def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
-    """Write ``renders/00000.png`` and ``gt/00000.png`` ... in ``folder``; returns the renders.
+    """Write ``renders/00000.png``, ``gt/00000.png`` and, of views with one, ``masks/00000.png`` ... in ``folder``.
 
-    Surplus images of an earlier run are removed: metrics are taken over all that lie there.
+    Returns the renders. Surplus images of an earlier run are removed: metrics are taken over all that lie there.
     """
     renders = []
+    kept = set()
     for index, view in enumerate(views):
         renders.append(picture(view.camera))
-        save_png(folder / "renders" / f"{index:05d}.png", renders[-1])
-        save_png(folder / "gt" / f"{index:05d}.png", view.image)
-    for old in (*folder.glob("renders/*.png"), *folder.glob("gt/*.png")):
-        if old.stem.isdigit() and int(old.stem) >= len(views):
+        pictures = {"renders": renders[-1], "gt": view.picture}
+        if view.mask is not None:
+            pictures["masks"] = np.repeat(255 * view.mask[..., None], 3, axis=2)
+        for name, pixels in pictures.items():
+            save_png(folder / name / f"{index:05d}.png", pixels)
+            kept.add(folder / name / f"{index:05d}.png")
+    for old in [path for name in ("renders", "gt", "masks") for path in folder.glob(f"{name}/*.png")]:
+        if old.stem.isdigit() and old not in kept:
             old.unlink()
     return renders
 
@@ -67,7 +72,7 @@ def evaluate_views(
     values = [
         dict(zip(per_view, row, strict=True)) for row in zip(*(v.values() for v in per_view.values()), strict=True)
     ]
-    return means, [Comparison(v.name, v.image, r, row) for v, r, row in zip(views, renders, values, strict=True)]
+    return means, [Comparison(v.name, v.picture, r, row) for v, r, row in zip(views, renders, values, strict=True)]
 
 
 def show_views(

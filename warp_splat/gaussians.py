@@ -100,8 +100,12 @@ class GaussianModel:
         return cls.from_splats(load_gaussians(path).splats)
 
     @classmethod
-    def from_splats(cls, splats: SplatArrays) -> GaussianModel:
-        """Start from Gaussians of a file."""
+    def from_splats(cls, splats: SplatArrays, sh_degree: int | None = None) -> GaussianModel:
+        """Start from Gaussians of a file; with ``sh_degree``, coefficients beyond it are left out, missing ones 0."""
+        if sh_degree is not None:
+            coefficients = (sh_degree + 1) ** 2
+            sh = splats.sh[:, :coefficients]
+            splats = splats._replace(sh=np.pad(sh, ((0, 0), (0, coefficients - sh.shape[1]), (0, 0))))
         means, sh, opacities, scales, quats = (torch.from_numpy(np.ascontiguousarray(array)) for array in splats)
         parameters = {"means": means, "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
         return cls({**parameters, "opacities": opacities, "scales": scales, "quats": quats})

@@ -19,17 +19,26 @@ SMALLEST_SLICE = 16  # rows
 FAR_APART = 10.0  # in units of an image's usual range
 
 
-def image_loss(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 0.2) -> torch.Tensor:
+def image_loss(
+    image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 0.2, mask: torch.Tensor | None = None
+) -> torch.Tensor:
     """(1 - lambda) mean |image - target| + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), a scalar.
+
+    With a mask, both images are black where it is 0: nothing there has an influence or a gradient, and windows of SSIM
+    across its border compare what counts alone. The means stay those over all pixels, so that a pixel weighs the same
+    however many are masked, and thresholds of gradients keep their meaning.
 
     Args:
         image: [H, W, 3] float32, differentiable.
         target: [H, W, 3] float32, or uint8 to be divided by 255.
         lambda_dssim: share of the structural term, 0..1.
+        mask: [H, W, 1] uint8, 1 for pixels that count, 0 for others.
 
     Raises:
         InputError: if the shapes differ or are not [H, W, 3].
     """
+    if mask is not None:
+        image, target = image * mask, target * mask
     if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS:
         raise InputError(
             f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."

@@ -24,47 +24,51 @@ WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 WINDOW /= WINDOW.sum()
 
 
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio in dB, over all pixels and channels at once; infinite for equal images.
 
     Args:
         image: [H, W, 3] uint8.
         reference: [H, W, 3] uint8.
+        mask: [H, W], not 0 for at least one pixel; those that are 0 do not count.
 
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
     image, reference = unit_images(image, reference)
-    error = np.mean((image - reference) ** 2)
+    squares = (image - reference) ** 2
+    error = np.mean(squares if mask is None else squares[mask > 0])
     return float(-10 * np.log10(error)) if error > 0 else math.inf
 
 
-def ssim(image: np.ndarray, reference: np.ndarray) -> float:
+def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Structural similarity (Wang et al. 2004, eq. 13) with zeros outside the image; mean over pixels and channels.
 
     Args:
         image: [H, W, 3] uint8.
         reference: [H, W, 3] uint8.
+        mask: as for :func:`psnr`; both images are black where it is 0, and the mean is over the other pixels.
 
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
-    x, y = unit_images(image, reference)
+    x, y = masked(mask, *unit_images(image, reference))
     mean_x, mean_y = _blur(x), _blur(y)
     var_x, var_y = _blur(x * x) - mean_x**2, _blur(y * y) - mean_y**2
     covariance = _blur(x * y) - mean_x * mean_y
     similarity = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
-    return float(np.mean(similarity / ((mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2))))
+    similarity /= (mean_x**2 + mean_y**2 + C1) * (var_x + var_y + C2)
+    return float(np.mean(similarity if mask is None else similarity[mask > 0]))
 
 
-Metric = Callable[[np.ndarray, np.ndarray], float]  # of an image and its reference, [H, W, 3] uint8
+Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]  # of an image, its reference, a mask as for psnr
 METRICS: dict[str, Metric] = {"SSIM": ssim, "PSNR": psnr}  # those that need nothing but this file
 
 
 def evaluate_folder(
     folder_split: Path, metrics: Mapping[str, Metric] = METRICS
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Compare ``renders/*.png`` with ``gt/*.png`` of the same name.
+    """Compare ``renders/*.png`` with ``gt/*.png`` of the same name, where ``masks/*.png`` is not black if there is one.
 
     Args:
         folder_split: such as ``<model>/test/ours_30000``.
@@ -92,8 +96,9 @@ def evaluate_folder(
                 f"{folder_split / 'renders' / name}: expected the size of gt/{name}, "
                 f"{reference.shape[1]}x{reference.shape[0]}, found {image.shape[1]}x{image.shape[0]}."
             )
+        mask = load_png(folder_split / "masks" / name)[..., 0] if (folder_split / "masks" / name).is_file() else None
         for metric, measure in metrics.items():
-            per_view[metric][name] = measure(image, reference)
+            per_view[metric][name] = measure(image, reference, mask)
     return {metric: sum(values.values()) / len(values) for metric, values in per_view.items()}, per_view
 
 
@@ -156,3 +161,8 @@ def unit_images(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, n
     if image.shape != reference.shape:
         raise InputError(f"image: expected the shape of the reference, {reference.shape}, got {image.shape}.")
     return image / 255.0, reference / 255.0
+
+
+def masked(mask: np.ndarray | None, *images: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The images, black where the mask is 0."""
+    return images if mask is None else tuple(image * (mask > 0)[..., None] for image in images)

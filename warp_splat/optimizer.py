@@ -136,17 +136,18 @@ class Optimizer:
         arrays, count = checkpoint.arrays, len(checkpoint.array("parameters.means", (-1, 3)))
         for name, old in self.model.parameters.items():
             shape = (count, *old.shape[1:])
+            moments = MOMENTS if any(f"{moment}.{name}" in arrays for moment in MOMENTS) else ()
+            gradients = ("gradients",) if f"gradients.{name}" in arrays else ()
             tables = {
                 kind: torch.empty(shape, device=old.device).copy_(
                     torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape))
                 )
-                for kind in ("parameters", "gradients", *MOMENTS)
-                if kind == "parameters" or f"{kind}.{name}" in arrays
+                for kind in ("parameters", *gradients, *moments)
             }
             self._swap(name, tables["parameters"])
             leaf = self.model.parameters[name]
             leaf.grad = tables.get("gradients")
-            if MOMENTS[0] in tables:
+            if moments:
                 images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
                 step = torch.tensor(float(images / self.batch), device=leaf.device)
                 self.adam.state[leaf] = {"step": step, **{moment: tables[moment] for moment in MOMENTS}}

@@ -17,7 +17,7 @@ import torch
 
 from warp_splat.errors import InputError
 from warp_splat.formats.reading import Unexpected, reading
-from warp_splat.metrics import METRICS, Metric, unit_images
+from warp_splat.metrics import METRICS, Metric, masked, unit_images
 
 SMALLEST = 32  # px; the networks halve what they see too often for less
 WEIGHTS = "torchvision's weights of VGG16 or AlexNet, such as vgg16-397923af.pth"
@@ -26,21 +26,22 @@ WEIGHTS = "torchvision's weights of VGG16 or AlexNet, such as vgg16-397923af.pth
 NETWORKS = {"vgg": ("LPIPS", "features.28.weight", False), "alex": ("LPIPS_ALEX", "features.10.weight", True)}
 
 
-def flip(image: np.ndarray, reference: np.ndarray) -> float:
+def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """FLIP of images as seen on a screen, 0 (equal) to 1: the mean of its map at 67 pixels per degree.
 
     Args:
         image: [H, W, 3] uint8.
         reference: [H, W, 3] uint8.
+        mask: as for :func:`warp_splat.metrics.ssim`.
 
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
     import flip_evaluator  # noqa: PLC0415 - not on every platform
 
-    image, reference = (array.astype(np.float32) for array in unit_images(image, reference))
+    image, reference = (array.astype(np.float32) for array in masked(mask, *unit_images(image, reference)))
     error, _, _ = flip_evaluator.evaluate(reference, image, "LDR", applyMagma=False, computeMeanError=False)
-    return float(np.mean(error, dtype=np.float64))  # its own mean adds up in single precision
+    return float(np.mean(error if mask is None else error[mask > 0], dtype=np.float64))
 
 
 def choose_metrics(lpips_weights: str) -> tuple[dict[str, Metric], list[str]]:
@@ -89,12 +90,11 @@ def _load_lpips(path: str) -> tuple[str, Metric]:
             raise Unexpected("others") from error
     name, _, signed = NETWORKS[network]
 
-    def measure(image: np.ndarray, reference: np.ndarray) -> float:
+    def measure(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
         if min(image.shape[:2]) < SMALLEST:
             return math.nan
-        pair = [
-            torch.from_numpy(array.astype(np.float32)).permute(2, 0, 1)[None] for array in unit_images(image, reference)
-        ]
+        arrays = masked(mask, *unit_images(image, reference))
+        pair = [torch.from_numpy(array.astype(np.float32)).permute(2, 0, 1)[None] for array in arrays]
         with torch.no_grad():
             return float(model(*pair, normalize=signed))
 

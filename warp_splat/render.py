@@ -45,14 +45,15 @@ def render(config: RenderConfig) -> int:
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     folder, iteration, gaussians, trained = _open(config)
     model = GaussianModel.from_splats(gaussians.splats)
+    scene = _load(config, trained, say) if _needs_scene(config) else None
+    linear = scene.linear if scene else bool(trained.get("linear_light"))
     options = RasterOptions(
         antialiasing=bool(trained.get("antialiasing")),
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
-    scene = _load(config, trained, say) if _needs_scene(config) else None
     with _memory_explained(device, model, None if config.orbit else scene):
-        picture = make_picture(model.to(device), bool(trained.get("white_background")), options)
+        picture = make_picture(model.to(device), bool(trained.get("white_background")), options, linear)
         if config.orbit or config.video:
             output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
             _film(picture, _cameras(config, scene), output, config)
@@ -135,21 +136,22 @@ def _load(config: RenderConfig, trained: dict, say) -> Scene:
         resolution=resolution,
         white_background=bool(trained.get("white_background")),
         eval=bool(trained.get("eval")),
+        invert_masks=bool(trained.get("invert_masks")),
         report=say,
     )
 
 
 def make_picture(
-    model: GaussianModel, white_background: bool, options: RasterOptions
+    model: GaussianModel, white_background: bool, options: RasterOptions, linear: bool = False
 ) -> Callable[[Camera], np.ndarray]:
-    """A function from a camera to the model's image, [H, W, 3] uint8."""
+    """A function from a camera to the model's image, [H, W, 3] uint8; ``linear``: its colors are in linear light."""
     background = torch.full((3,), float(white_background), device=model.device)
     with torch.no_grad():
         gaussians = model.activated()
 
     def picture(camera: Camera) -> np.ndarray:
         with torch.no_grad():
-            return to_bytes(render_gaussians(gaussians, camera, background, options).image)
+            return to_bytes(render_gaussians(gaussians, camera, background, options).image, linear)
 
     return picture
 

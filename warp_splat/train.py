@@ -85,6 +85,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         resolution=config.resolution,
         white_background=config.white_background,
         eval=config.eval,
+        invert_masks=config.invert_masks,
+        start="" if checkpoint else config.start_ply,
         report=say,
     )
     run = Run(Path(processes.first(str(folder))), started)
@@ -94,6 +96,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
         f"{len(scene.points)} points; {together}{launch.get_threads()} threads; output in {run.folder}"
     )
+    if scene.start and scene.start.antialiased != config.antialiasing:
+        which = "with" if scene.start.antialiased else "without"
+        say(f"Warning: {config.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
     trainer = Trainer(scene, config, processes)
     if leads:
         _write_inputs(model_folder.prepare(run.folder), config, scene)
@@ -159,7 +164,13 @@ def embedded_scene() -> Path:
 def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
     model_folder.write_cfg_args(
         folder,
-        {**asdict(config), "model_path": str(folder), "depths": "", "train_test_exp": False},
+        {
+            **asdict(config),
+            "model_path": str(folder),
+            "depths": "",
+            "train_test_exp": False,
+            "linear_light": scene.linear,
+        },
     )
     write_config(folder, config)
     model_folder.write_cameras(folder, scene.test, scene.train)
@@ -258,6 +269,6 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         run.preview = time.perf_counter()
         view = views[len(views) // 2]
         try:
-            save_png(run.folder / "preview.png", np.concatenate([view.image, trainer.picture(view.camera)], 1))
+            save_png(run.folder / "preview.png", np.concatenate([view.picture, trainer.picture(view.camera)], 1))
         except InputError as error:
             warn(error)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch.nn import functional
 
 from warp_splat.camera import Camera
+from warp_splat.color import to_srgb
 from warp_splat.config import TILE, RasterOptions, TrainConfig
 from warp_splat.densify import Densifier
 from warp_splat.devices import choose_device
@@ -25,6 +26,8 @@ from warp_splat.metrics import psnr
 from warp_splat.optimizer import Optimizer
 from warp_splat.renderer import render
 from warp_splat.scene.types import Scene, View
+
+LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
 
 
 @dataclass
@@ -44,6 +47,14 @@ class Quarantine:
         return dict(zip(names, [*counts.tolist(), self.prunings], strict=True))
 
 
+class Photograph(NamedTuple):
+    """A photograph on a device, at the size of this iteration."""
+
+    image: torch.Tensor  # [H, W, 3], as in View
+    alpha: torch.Tensor | None  # [H, W, 1] uint8, if it is needed
+    mask: torch.Tensor | None  # [H, W, 1] uint8
+
+
 class Trainer:
     """The reference's training (Kerbl et al. 2023) on one scene.
 
@@ -53,7 +64,8 @@ class Trainer:
         processes: those that train together; each takes a view of its own in every step.
 
     Raises:
-        InputError: if the device cannot be used, or there are more processes than training views.
+        InputError: if the device cannot be used, there are more processes than training views, or options do not fit
+            the scene.
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, processes: Processes = ALONE):
@@ -62,10 +74,19 @@ class Trainer:
                 f"--nproc-per-node: expected at most one process for each of {len(scene.train)} training views, got "
                 f"{processes.count}; start fewer."
             )
+        if config.loss_space != "srgb" and not scene.linear:
+            raise InputError(
+                f"--loss_space {config.loss_space}: expected photographs in linear light (EXR, HDR, TIFF of floats), "
+                f"found {scene.train[0].name}, which is as a screen shows it; leave this flag out."
+            )
         self.scene, self.config, self.device = scene, config, choose_device(config.device)
         self.processes = processes
         extent = scene.extent
-        self.model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree).to(self.device)
+        if scene.start:
+            model = GaussianModel.from_splats(scene.start.splats, config.sh_degree)
+        else:
+            model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
+        self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, config, extent, processes.count)
         self.densifier = Densifier(self.model, self.optimizer, config, extent, processes)
         self.quarantine = Quarantine()
@@ -76,7 +97,7 @@ class Trainer:
         self._background_random = torch.Generator().manual_seed(config.seed)
         self._deck: list[View] = []
         self._shrink = 1  # of the images in this step
-        self._photographs: dict[View, torch.Tensor] = {}  # those that were used, [H, W, 3] uint8, at that size
+        self._photographs: dict[View, Photograph] = {}  # those that were used, at that size
         self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
 
     def differentiate(self, iteration: int) -> torch.Tensor:
@@ -97,8 +118,15 @@ class Trainer:
             background = drawn[self.processes.rank].to(self.device)
         out = self._render(camera, background)
         out.means2d.retain_grad()
-        # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
-        loss = image_loss(out.image.clamp(0.0, 1.0), photograph, config.lambda_dssim)
+        image, target = out.image, photograph.image
+        if photograph.alpha is not None:  # put there what it was not loaded with
+            values = target / 255.0 if target.dtype == torch.uint8 else target
+            target = values + (1.0 - photograph.alpha / 255.0) * (background - self.background)
+        if self.scene.linear:
+            image, target = (LOSS_CURVES[config.loss_space](picture) for picture in (image, target))
+        else:  # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
+            image = image.clamp(0.0, 1.0)
+        loss = image_loss(image, target, config.lambda_dssim, photograph.mask)
         loss.backward()
         if iteration < config.densify_until_iter:
             with stage("densify"):
@@ -202,7 +230,7 @@ class Trainer:
                 dealt.append(self._deck.pop(index))
         return dealt[self.processes.rank]
 
-    def _at_size(self, view: View, iteration: int) -> tuple[Camera, torch.Tensor]:
+    def _at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
         """Camera and photograph of ``view`` at this iteration's size: coarse to fine, if so configured."""
         config = self.config
         doublings = (config.coarse.bit_length() - 1) * iteration // config.coarse_until_iter
@@ -214,20 +242,24 @@ class Trainer:
         camera = view.camera if shrink == 1 else view.camera.resized(width, height)
         return camera, self._photograph(view, height, width)
 
-    def _photograph(self, view: View, height: int, width: int) -> torch.Tensor:
+    def _photograph(self, view: View, height: int, width: int) -> Photograph:
         """The photograph of ``view`` on the device; for a GPU, it waits there or in page-locked memory of the host."""
         kept = self._photographs.get(view)
         if kept is None:
             with stage("photographs"):
-                kept = torch.from_numpy(view.image).to(self.config.data_device)
-                if kept.shape[:2] != (height, width):
-                    planes = kept.permute(2, 0, 1)[None].float()
-                    means = functional.interpolate(planes, (height, width), mode="area")
-                    kept = means[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
-                if kept.device.type != self.device.type:
-                    kept = kept.pin_memory()
+                alpha = view.alpha if self.config.random_background else None
+                planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
+                kept = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
             self._photographs[view] = kept
-        return kept.to(self.device, non_blocking=True)
+        return Photograph(*(None if p is None else p.to(self.device, non_blocking=True) for p in kept))
+
+    def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
+        kept = torch.from_numpy(pixels).to(self.config.data_device)
+        if kept.shape[:2] != (height, width):
+            planes = kept.permute(2, 0, 1)[None].float()
+            means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
+            kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
+        return kept if kept.device.type == self.device.type else kept.pin_memory()
 
     def _render(self, camera: Camera, background: torch.Tensor):
         options = replace(self.options, sh_degree=self.degree)
@@ -238,13 +270,25 @@ class Trainer:
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""
         with torch.no_grad():
-            return to_bytes(self._render(camera, self.background).image)
+            return to_bytes(self._render(camera, self.background).image, self.scene.linear)
 
     def evaluate(self, views: list[View]) -> float:
-        """Mean PSNR [dB] of 8-bit renders against the photographs."""
-        return float(np.mean([psnr(self.picture(view.camera), view.image) for view in views]))
+        """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
+        return float(np.mean([psnr(self.picture(view.camera), view.picture, view.mask) for view in views]))
 
 
-def to_bytes(image: torch.Tensor) -> np.ndarray:
-    """[H, W, 3] float image, clamped to 0..1, as uint8."""
-    return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+def to_bytes(image: torch.Tensor, linear: bool = False) -> np.ndarray:
+    """[H, W, 3] float image, clamped to 0..1, as uint8 for a screen; ``linear``: it is in linear light."""
+    image = image.detach().clamp(0.0, 1.0)
+    return ((to_srgb(image, torch.where) if linear else image) * 255.0).round().to(torch.uint8).cpu().numpy()
+
+
+def _log_curve(linear: torch.Tensor) -> torch.Tensor:
+    return torch.log1p(linear / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR)
+
+
+#: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.
+LOSS_CURVES = {
+    "srgb": lambda linear: to_srgb(linear.clamp_min(0.0), torch.where),
+    "log": lambda linear: _log_curve(linear.clamp_min(0.0)),
+}

@@ -194,7 +194,7 @@ def _judge(trainer: Trainer, result: Run) -> None:
     views = _views(trainer.scene)
     pictures = [trainer.picture(view.camera) for view in views]
     for measure in (psnr, ssim):
-        values = [measure(picture, view.image) for picture, view in zip(pictures, views, strict=True)]
+        values = [measure(picture, view.picture, view.mask) for picture, view in zip(pictures, views, strict=True)]
         setattr(result, measure.__name__, float(np.mean(values)))
     lists, cap = np.concatenate([_list_lengths(trainer, view) for view in views]), trainer.options.max_steps
     result.gaussians, result.longest_list = len(trainer.model), int(lists.max())
@@ -293,9 +293,9 @@ def plot_modes(path: Path, runs: Sequence[Run], modes: Sequence[str]) -> None:
 def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Run]) -> None:
     """Draw the view that the smallest cap hurts most: photograph, render and error without the cap and with it."""
     cap, of = f"cap {CAPS[-1]}", {r.variant: r.pictures for r in runs if r.pictures}
-    losses = [psnr(a, v.image) - psnr(b, v.image) for a, b, v in zip(of["manual"], of[cap], views, strict=True)]
+    losses = [psnr(a, v.picture) - psnr(b, v.picture) for a, b, v in zip(of["manual"], of[cap], views, strict=True)]
     index = int(np.argmax(losses))
-    photo = views[index].image
+    photo = views[index].picture
     renders = {"no cap": of["manual"][index], **{k: of[k][index] for k in (cap, f"{cap}, rendering only")}}
     rows = [(name, photo, render, f"{psnr(render, photo):.2f} dB") for name, render in renders.items()]
     report.contact_sheet(path, {"": rows})

@@ -11,8 +11,8 @@ import numpy as np
 from warp_splat.doctor.forecast import forecast
 from warp_splat.doctor.subject import Finding, Subject, few
 from warp_splat.errors import InputError
-from warp_splat.scene import read_photos, require_visible
-from warp_splat.scene.photos import PHOTOS, find_files
+from warp_splat.scene import MASKS, read_photos, require_visible
+from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, find_mask
 
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
@@ -89,14 +89,13 @@ def check_masks(subject: Subject) -> list[Finding]:
     """Alpha channels, and a folder of masks."""
     findings = []
     if subject.alpha:
-        text = f"{len(subject.alpha)} of {len(subject.photos)} images have alpha, composited on black, with -w on white"
+        text = f"{len(subject.alpha)} of {len(subject.photos)} images have alpha: black behind them, with -w white"
         level = "warning" if 0 < len(subject.alpha) < len(subject.photos) else "note"
         findings.append(Finding("alpha", level, f"{text}."))
-    masks = subject.source / "masks"
-    if masks.is_dir():
-        found = {name.lower() for name in find_files(masks, PHOTOS)}
+    if (subject.source / MASKS).is_dir():
+        masks = ImageFinder(subject.source / MASKS)
         names = [photo.name for photo in subject.photos]
-        without = [n for n in names if not {f"{n}.png".lower(), f"{Path(n).with_suffix('')}.png".lower()} & found]
+        without = [name for name in names if find_mask(masks, name) is None]
         text = f"masks/ has masks for {len(names) - len(without)} of {len(names)} images"
         if without:
             findings.append(Finding("masks", "warning", f"{text}; none for {few(without)}."))
@@ -108,13 +107,18 @@ def check_masks(subject: Subject) -> list[Finding]:
 def check_loading(subject: Subject, folder: str) -> list[Finding]:
     """What training itself would say of this scene before its first step."""
     notes: list[str] = []
+    missing: list[Finding] = []
     try:
         train, _, points, _ = read_photos(subject.source, folder, notes.append)
-        require_visible(train, points, subject.source)
+        if len(points):
+            require_visible(train, points, subject.source)
+        else:
+            text = "there are none to start from; training takes random ones, which gives worse results."
+            missing = [Finding("points", "warning", text)]
     except InputError as error:
         return [Finding("loading", "error", f"training would refuse this scene: {error}")]
     accepted = Finding("loading", "ok", "training would accept this scene.")
-    return [accepted, *(Finding("loading", "note", note) for note in notes)]
+    return [accepted, *missing, *(Finding("loading", "note", note) for note in notes)]
 
 
 def check_cost(subject: Subject) -> list[Finding]:

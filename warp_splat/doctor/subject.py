@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -13,9 +12,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 
+from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
-from warp_splat.scene import blender, colmap, images
+from warp_splat.scene import colmap, images, transforms
 from warp_splat.scene.images import Photo
+from warp_splat.scene.lenses import make_photo, make_sampling
+from warp_splat.scene.photos import ImageFinder
 
 Level = Literal["ok", "note", "warning", "error"]
 NAMED = 3  # things that a finding names
@@ -57,9 +59,10 @@ def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     if (source / "sparse").is_dir():
         subject, findings = _read_colmap(source, source / folder)
     else:
-        subject, findings = Subject(source, source, random_points=True), []
+        subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []
         try:
-            train, test, subject.points, _ = blender.read(source)
+            lines: list[str] = []
+            train, test, subject.points, _ = transforms.read(source, lines.append)
             subject.photos = train + test
         except InputError as error:
             findings.append(Finding("transforms", "error", str(error)))
@@ -104,26 +107,27 @@ def _match_files(subject: Subject) -> list[Finding]:
     if not registered:
         return [Finding("files", "error", "the model has no registered images; run the mapper again.")]
     findings, missing, scaled = [], [], []
-    sampling = functools.lru_cache(maxsize=images.THREADS)(colmap.sampling_of)
+    finder, sampling = ImageFinder(subject.root), make_sampling()
     for image in registered:
-        path = subject.root / image.name
-        if not path.is_file():
-            missing.append(image.name)
-            continue
         try:
+            path = finder.find(image.name)
+            if path is None:
+                missing.append(image.name)
+                continue
             size = images.read_size(path)
         except InputError as error:
             findings.append(Finding("files", "error", str(error)))
             continue
         try:
-            subject.photos.append(colmap.make_photo(image, path, size, sampling))
+            subject.photos.append(make_photo(image.name, path, image.camera, colmap.pose_of(image), size, sampling))
         except InputError as error:
             findings.append(Finding("sizes", "error", str(error)))
         if size != (image.camera.width, image.camera.height):
             scaled.append(image.name)
     if missing:
-        text = f"{len(missing)} of {len(registered)} images are missing in {subject.root}: {few(missing)}"
-        findings.append(Finding("files", "error", f"{text}; {_missing_hint(subject.root, missing)}."))
+        hint = "copy them there" if subject.root.is_dir() else "there is no such folder; name another with --images"
+        text = f"{len(missing)} of {len(registered)} images are missing in {subject.root}: {few(missing)}; {hint}."
+        findings.append(Finding("files", "error", text))
     wrong = any(finding.check == "sizes" for finding in findings)
     if scaled and not wrong:
         text = f"{len(scaled)} images have another size than their cameras ({few(scaled)}); the cameras are scaled."
@@ -133,26 +137,19 @@ def _match_files(subject: Subject) -> list[Finding]:
     return findings
 
 
-def _missing_hint(root: Path, missing: list[str]) -> str:
-    if not root.is_dir():
-        return "there is no such folder; name another with --images"
-    stems = {path.stem: path.name for path in root.iterdir()}
-    other = next((stems[Path(name).stem] for name in missing if Path(name).stem in stems), None)
-    return f"{other} has the same stem, but not the same ending" if other else "copy them there"
-
-
 def _decode(subject: Subject) -> list[Finding]:
     """Read every image to its end; fills the thumbnails."""
 
     def read(photo: Photo) -> tuple[np.ndarray, bool] | str:
         try:
-            image = images.read_rgb(photo.path, 0.0)
+            image, alpha, linear = images.read_pixels(photo.path, 0.0)
+            image = to_srgb(image.clip(0), np.where) if linear else image
             scale = THUMBNAIL / max(image.shape[:2])
             size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
             roi = oiio.ROI(0, size[0], 0, size[1], 0, 1, 0, 3)
             small = oiio.ImageBufAlgo.resample(oiio.ImageBuf(np.ascontiguousarray(image)), roi=roi, nthreads=1)
             pixels = np.asarray(small.get_pixels(oiio.FLOAT))
-            return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), images.has_alpha(photo.path)
+            return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), alpha is not None
         except InputError as error:
             return str(error)
 

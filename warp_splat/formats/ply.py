@@ -28,6 +28,7 @@ F_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLOR = ("red", "green", "blue")
+GRAY = 127  # of points without colours
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
 
 EXPECTED = "a PLY file with an element 'vertex'"
@@ -103,6 +104,32 @@ def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> Non
     for axis in range(3):
         rows[POSITION[axis]], rows[COLOR[axis]] = points[:, axis], colors[:, axis]
     _write(path, rows, ())
+
+
+def load_points(path: str | Path, report: Callable[[str], None] = print) -> tuple[np.ndarray, np.ndarray]:
+    """Read a point cloud: x y z and, if there are any, red green blue (0..255, or 0..1 as floats; gray otherwise).
+
+    Returns:
+        Positions [P, 3] float32, finite; colours [P, 3] uint8.
+
+    Raises:
+        InputError: if the file is missing, damaged, or has no positions.
+    """
+    vertex = _read_vertices(path)
+    names = vertex.dtype.names or ()
+    if not set(POSITION) <= set(names):
+        raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {', '.join(names):.200}.")
+    with np.errstate(over="ignore", invalid="ignore"):  # as in load_ply; colours that are not finite are any
+        points = np.stack([vertex[name].astype(np.float32) for name in POSITION], axis=1)
+        colors = np.full(points.shape, GRAY, np.uint8)
+        if set(COLOR) <= set(names):
+            unit = [255 if vertex.dtype[name].kind == "f" else 1 for name in COLOR]
+            values = np.stack([vertex[name] * np.float64(u) for name, u in zip(COLOR, unit, strict=True)], axis=1)
+            colors = np.nan_to_num(values).clip(0, 255).round().astype(np.uint8)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        report(f"{path}: left out {np.count_nonzero(~finite)} of {len(points)} points that are not finite.")
+    return points[finite], colors[finite]
 
 
 def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatArrays:

@@ -1,15 +1,17 @@
-"""Scenes on disk, COLMAP models and nerf-synthetic folders: cameras, photographs and points to start from."""
+"""Scenes on disk, COLMAP models and cameras in JSON: cameras, photographs, masks and points to start from."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
-from warp_splat.scene.photos import PHOTOS, find_files, is_video, photo_root, sfm_hint
+from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, find_mask, is_video, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, visible
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
+MASKS = "masks"  # the folder beside the images' or, for cameras in JSON, in the scene
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
 
 
@@ -27,9 +30,11 @@ def load_scene(
     resolution: int = -1,
     white_background: bool = False,
     eval: bool = False,
+    invert_masks: bool = False,
+    start: str = "",
     report: Callable[[str], object] = print,
 ) -> Scene:
-    """Load a folder with a COLMAP model (sparse/) or a nerf-synthetic scene (transforms_train.json).
+    """Load a folder with a COLMAP model (sparse/), a nerf-synthetic scene (transforms_train.json) or transforms.json.
 
     Args:
         source: the scene's folder.
@@ -38,11 +43,15 @@ def load_scene(
             -1 shrinks images wider than 1600 px to that (the reference's ``-r``).
         white_background: composite images with alpha on white instead of black.
         eval: hold out a test set: every 8th image by name, or transforms_test.json. Otherwise all images train.
+        invert_masks: of the masks in ``source``/masks, the dark part counts, not the bright one.
+        start: a file of Gaussians to start from instead of the scene's points.
         report: called with a line for each thing that the user should know: undistortion, a choice of models, ...
 
     Returns:
         The scene, in the frame of its files (x_camera = rotation @ x_world + translation; x right, y down, z forward),
-        with the photographs as [H, W, 3] uint8 and points [P, 3] float32.
+        with the photographs as [H, W, 3] uint8, or float32 if they are in linear light, and points [P, 3] float32:
+        the scene's own, those of ``start``, or random ones if there are none. Photographs without a pixel that counts
+        are left out.
 
     Raises:
         InputError: if an argument is out of range, or a file is missing, unreadable, or disagrees with another.
@@ -57,12 +66,48 @@ def load_scene(
     elif not test:
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
-    require_visible(train, points, source)
-
     from warp_splat.scene.images import load_views  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
 
-    views = load_views(train + test, resolution, white_background)
-    return Scene(views[: len(train)], views[len(train) :], points, colors)
+    file = None
+    if start:
+        file, points, colors = load_start(start, report)
+    elif not len(points):
+        points, colors = random_points([photo.camera for photo in train])
+        report(f"Warning: {source} has no points to start from; taking {len(points)} random ones, which trains worse.")
+    require_visible(train, points, start or source)
+    views = load_views(train + test, resolution, white_background, invert_masks)
+    train_views, test_views = views[: len(train)], views[len(train) :]
+    if any(view.mask is not None for view in views):
+        train_views, test_views = _drop_masked(train_views, source, report), _drop_masked(test_views, source, report)
+    if views[0].linear and not start:
+        colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
+    _require_one_kind(train_views + test_views, source)
+    return Scene(train_views, test_views, points, colors, file)
+
+
+def _drop_masked(views: list[View], source: str | Path, report: Callable[[str], object]) -> list[View]:
+    """The views with a pixel that counts."""
+    kept = [view for view in views if view.mask is None or view.mask.any()]
+    if views and not kept:
+        raise InputError(
+            f"{source}: expected masks that leave something to train on or test with, but those of all {len(views)} "
+            "images are black; use --invert_masks, or remove the folder masks."
+        )
+    if len(kept) < len(views):
+        report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")
+    return kept
+
+
+def _require_one_kind(views: list[View], source: str | Path) -> None:
+    odd = [view.name for view in views if view.linear != views[0].linear]
+    if odd:
+        kinds = ("in linear light", "as a screen shows it")
+        here, there = kinds if views[0].linear else kinds[::-1]
+        raise InputError(
+            f"{source}: expected photographs of one kind, but {views[0].name} is {here} and {odd[0]} {there}; convert "
+            "one kind."
+        )
 
 
 def read_photos(
@@ -73,7 +118,7 @@ def read_photos(
     Returns:
         Training and test photos as the files have them, points [P, 3], colors [P, 3].
     """
-    from warp_splat.scene import blender, colmap  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene import colmap, transforms  # noqa: PLC0415  keeps `import warp_splat` light
 
     source = Path(source)
     if is_video(source):
@@ -85,10 +130,11 @@ def read_photos(
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
     if (source / "sparse").is_dir():
         photos, points, colors = colmap.read(source, folder, report)
-        return photos, [], points, colors
-    if (source / blender.TRAIN).is_file():
-        return blender.read(source)
-    expected = f"expected a scene with cameras, a COLMAP model (sparse/) or {blender.TRAIN}"
+        return _masked(photos, source, report), [], points, colors
+    if transforms.has_transforms(source):
+        train, test, points, colors = transforms.read(source, report)
+        return _masked(train, source, report), _masked(test, source, report), points, colors
+    expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
     photographs = find_files(photo_root(source), PHOTOS)
     if photographs:
         raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
@@ -97,9 +143,20 @@ def read_photos(
 
 def has_cameras(source: str | Path) -> bool:
     """Whether ``source`` looks like a scene that :func:`load_scene` reads, not like photographs alone."""
-    from warp_splat.scene import blender  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene import transforms  # noqa: PLC0415  keeps `import warp_splat` light
 
-    return (Path(source) / "sparse").is_dir() or (Path(source) / blender.TRAIN).is_file()
+    return (Path(source) / "sparse").is_dir() or transforms.has_transforms(Path(source))
+
+
+def _masked(photos: list[Photo], source: Path, report: Callable[[str], object]) -> list[Photo]:
+    """The photos with the masks that lie in the scene's folder, besides those that they have."""
+    if photos and (source / MASKS).is_dir():
+        masks = ImageFinder(source / MASKS)
+        photos = [photo if photo.mask else replace(photo, mask=find_mask(masks, photo.name)) for photo in photos]
+        without = [photo.name for photo in photos if not photo.mask]
+        rest = f"; {without[0]} and {len(without) - 1} others are used whole" if without else ""
+        report(f"Masks for {len(photos) - len(without)} of {len(photos)} images{rest}.")
+    return photos
 
 
 def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], list[Photo]]:
@@ -120,5 +177,5 @@ def require_visible(photos: list[Photo], points: np.ndarray, source: str | Path)
     raise InputError(
         f"{source}: expected points in front of the cameras, but none of the {len(photos)} training cameras sees any "
         f"of the {len(points)} points; the poses' axes are probably mixed up: COLMAP has world to camera in OpenCV "
-        "axes, transforms_train.json camera to world in OpenGL axes."
+        "axes, transforms.json camera to world in OpenGL axes."
     )

@@ -1,9 +1,5 @@
-"""COLMAP models, binary or text, through pycolmap; lenses with distortion become pinholes.
+"""COLMAP models, binary or text, through pycolmap. COLMAP's poses are world to camera, as ours."""
 
-COLMAP's poses are world to camera, as ours, and its pixel centers are at +0.5.
-"""
-
-import functools
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -12,12 +8,14 @@ import numpy as np
 import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
 import pycolmap
 
-from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.scene import images
 from warp_splat.scene.images import Photo
+from warp_splat.scene.lenses import make_photo, make_sampling
+from warp_splat.scene.photos import ImageFinder
 
-UINT64 = struct.Struct("<Q")
+UINT32, UINT32_PAIR, UINT64 = struct.Struct("<I"), struct.Struct("<II"), struct.Struct("<Q")
+SENSOR, POSE = 8, 56  # bytes: its kind and number; quaternion and translation
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
 KNOWN_MODELS = {int(model): model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0}
 IMAGE_HEAD = 64  # bytes of id, quaternion, translation, camera id; then the name, the number of keypoints, these
@@ -33,10 +31,10 @@ def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[li
         report: called with a line for each thing that the user should know.
 
     Returns:
-        Photos sorted by name; points [P, 3] float32; colors [P, 3] uint8.
+        Photos sorted by name; points [P, 3] float32, maybe none; colors [P, 3] uint8.
 
     Raises:
-        InputError: if the model cannot be read, lacks images or points, or disagrees with the image files.
+        InputError: if the model cannot be read, lacks images, or disagrees with the image files.
     """
     where, model = _largest_model(source / "sparse", report)
     registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
@@ -44,7 +42,7 @@ def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[li
         raise InputError(
             f"{where}: expected a COLMAP model with registered images, found none; run COLMAP's mapper again."
         )
-    points, colors = _points(where, model, report)
+    points, colors = _points(model, report)
     return _photos(where, registered, source / folder, report), points, colors
 
 
@@ -76,13 +74,15 @@ def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path,
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read the model in ``folder``, binary or text. Raises InputError if it is cut short, damaged or unknown."""
-    for name, end in (("cameras.bin", _cameras_end), ("images.bin", _images_end), ("points3D.bin", _points_end)):
+    for name, end in ENDS.items():
         if (folder / name).is_file():
             _check_length(folder / name, end)
     try:
         model = pycolmap.Reconstruction(folder)
         if not (folder / "images.bin").is_file():
             _restore_names(model, folder / "images.txt")
+        for image in model.images.values():
+            _ = image.name  # from binary files, pycolmap decodes it only now
         return model
     except Exception as error:  # pycolmap raises many types, IndexError and ValueError among them
         reason = " ".join(str(error).split()).rstrip(".")
@@ -107,7 +107,7 @@ def _check_length(path: Path, end: Callable[[bytes], int]) -> None:
     data = path.read_bytes()
     try:
         expected = end(data)
-    except (struct.error, OverflowError, ValueError):
+    except (struct.error, OverflowError, ValueError, IndexError):
         expected = None
     if expected != len(data):
         raise InputError(
@@ -144,35 +144,60 @@ def _points_end(data: bytes) -> int:
     return end
 
 
-def _points(
-    where: Path, model: pycolmap.Reconstruction, report: Callable[[str], object]
-) -> tuple[np.ndarray, np.ndarray]:
+def _rigs_end(data: bytes) -> int:
+    (count,), end = UINT64.unpack_from(data), UINT64.size
+    for _ in range(count):
+        _, sensors = UINT32_PAIR.unpack_from(data, end)
+        end += UINT32_PAIR.size + (SENSOR if sensors else 0)
+        for _ in range(sensors - 1):
+            has_pose = data[end + SENSOR]
+            end += SENSOR + 1 + (POSE if has_pose else 0)
+    return end
+
+
+def _frames_end(data: bytes) -> int:
+    (count,), end = UINT64.unpack_from(data), UINT64.size
+    for _ in range(count):
+        (images,) = UINT32.unpack_from(data, end + UINT32_PAIR.size + POSE)
+        end += UINT32_PAIR.size + POSE + UINT32.size + (SENSOR + 8) * images
+    return end
+
+
+#: Where the last record of a file ends, for those whose records have lengths of their own.
+ENDS = {
+    "rigs.bin": _rigs_end,
+    "cameras.bin": _cameras_end,
+    "frames.bin": _frames_end,
+    "images.bin": _images_end,
+    "points3D.bin": _points_end,
+}
+
+
+def _points(model: pycolmap.Reconstruction, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
     records = [point for _, point in sorted(model.points3D.items(), key=lambda item: item[0])]
     points = np.array([point.xyz for point in records], np.float32).reshape(-1, 3)
     colors = np.array([point.color for point in records], np.uint8).reshape(-1, 3)
     finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
-        raise InputError(
-            f"{where}: expected a COLMAP model with 3D points to start from, found none that is finite; triangulate "
-            "them with COLMAP's point_triangulator."
-        )
     if not finite.all():
         report(f"Dropping {np.count_nonzero(~finite)} of {len(points)} points that are not finite.")
     return points[finite], colors[finite]
 
 
 def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: Callable[[str], object]) -> list[Photo]:
-    missing = [image.name for image in registered if not (root / image.name).is_file()]
+    finder = ImageFinder(root)
+    paths = {image.name: finder.find(image.name) for image in registered}
+    missing = [name for name, path in paths.items() if path is None]
     if missing:
         raise InputError(
             f"{root}: expected the {len(registered)} images of {where}, but {len(missing)} of them cannot be found, "
             f"the first is {missing[0]!r}; copy them there or choose another folder with --images."
         )
-    sampling = functools.lru_cache(maxsize=images.THREADS)(sampling_of)  # lives as long as the photos
+    finder.describe(len(registered), report)
+    sampling = make_sampling()  # lives as long as the photos
     photos, scaled, distorted = [], 0, []
     for image in registered:
-        size = images.read_size(root / image.name)
-        photos.append(make_photo(image, root / image.name, size, sampling))
+        size = images.read_size(paths[image.name])
+        photos.append(make_photo(image.name, paths[image.name], image.camera, pose_of(image), size, sampling))
         scaled += size != (image.camera.width, image.camera.height)
         distorted += [] if photos[-1].sampling is None else [image.camera.model_name]
     if scaled:
@@ -183,60 +208,7 @@ def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: C
     return photos
 
 
-def make_photo(image: pycolmap.Image, path: Path, size: tuple[int, int], sampling: Callable[..., np.ndarray]) -> Photo:
-    """The photo of a registered image whose file has ``size`` = (width, height) pixels.
-
-    Raises:
-        InputError: if the size does not fit the model's camera, or its lens cannot become a pinhole.
-    """
-    lens = image.camera
-    # The same factor for both sides, up to the rounding of either to whole pixels.
-    if abs(size[0] * lens.height - size[1] * lens.width) >= lens.width + lens.height:
-        raise InputError(
-            f"{path}: expected {lens.width} x {lens.height} pixels as its COLMAP camera has, or both scaled by one "
-            f"factor, got {size[0]} x {size[1]}; use the images that COLMAP saw."
-        )
-    if lens.is_spherical() or not np.isfinite(lens.params).all():
-        raise InputError(
-            f"{path}: expected a camera model that can be undistorted to a pinhole, with finite parameters, got "
-            f"{lens.model_name} {lens.params.tolist()}; correct the model or leave this image out."
-        )
+def pose_of(image: pycolmap.Image) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and translation [3] of camera_from_world."""
     pose = image.cam_from_world()
-    with images.named(str(path)):
-        if lens.is_undistorted():
-            return Photo(image.name, path, _pinhole(lens, pose).resized(*size))
-        key = (lens.model_name, lens.width, lens.height, tuple(lens.params), size)
-        return Photo(image.name, path, _pinhole(_undistorted(_lens(*key)), pose), functools.partial(sampling, *key))
-
-
-def _pinhole(lens: pycolmap.Camera, pose: pycolmap.Rigid3d) -> Camera:
-    k = lens.calibration_matrix()
-    return Camera(lens.width, lens.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], pose.rotation.matrix(), pose.translation)
-
-
-def _lens(model: str, width: int, height: int, params: tuple[float, ...], size: tuple[int, int]) -> pycolmap.Camera:
-    lens = pycolmap.Camera(model=model, width=width, height=height, params=params)
-    lens.rescale(*size)
-    return lens
-
-
-def _undistorted(lens: pycolmap.Camera) -> pycolmap.Camera:
-    """The pinhole that COLMAP's image_undistorter gives ``lens``, without blank pixels."""
-    try:
-        return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
-    except Exception as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"expected a lens that can be undistorted, pycolmap refuses {lens.model_name} {lens.params.tolist()} "
-            f"({reason}); correct the model or leave this image out."
-        ) from error
-
-
-def sampling_of(*key: object) -> np.ndarray:
-    """Where in the distorted image each pixel of the undistorted one lies, for :func:`images.undistort`."""
-    lens = _lens(*key)
-    pinhole = _undistorted(lens)
-    y, x = np.mgrid[-1 : pinhole.height + 1, -1 : pinhole.width + 1] + 0.5
-    rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
-    pixels = lens.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-    return pixels.astype(np.float32).reshape(*x.shape, 2)
+    return pose.rotation.matrix(), pose.translation

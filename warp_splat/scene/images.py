@@ -1,7 +1,8 @@
 """Photographs through OpenImageIO: read, composite on the background, undistort, resize, quantize to 8 bit.
 
-Pixels stay float32 until the last step, so 16-bit files keep their precision through the filters. The orientation tag
-of EXIF is ignored: structure from motion saw the pixels as stored.
+Pixels stay float32 until the last step, so 16-bit files keep their precision through the filters. Files of floats, and
+those that say so, are in linear light and are not quantized. The orientation tag of EXIF is ignored: structure from
+motion saw the pixels as stored.
 """
 
 from collections.abc import Callable, Iterator
@@ -9,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -19,6 +21,10 @@ from warp_splat.scene.types import View
 
 THREADS = 2  # OpenImageIO releases the GIL; more threads hold more decoded photographs in memory
 AUTO_WIDTH = 1600  # `-r -1` shrinks wider images to this width (graphdeco, utils/camera_utils.py)
+PIXELS_MOST = 200_000_000  # of a file: more than any camera has, and 2.4 GB once decoded
+CHANNELS_MOST = 32  # likewise: OpenImageIO decodes all of them
+FLOATS = (oiio.BASETYPE.HALF, oiio.BASETYPE.FLOAT, oiio.BASETYPE.DOUBLE)
+RATIO_MOST = 2**14  # of decoded to stored bytes: a black mask of one bit per pixel has half of it
 WARP_PAD = 4  # px repeated around the source: OpenImageIO's warp sees black outside of it, and its filter reaches there
 
 
@@ -30,6 +36,15 @@ class Photo:
     path: Path
     camera: Camera  # after undistortion, before the resize of `-r`
     sampling: Callable[[], np.ndarray] | None = None  # makes the map of `undistort`; None: the file is undistorted
+    mask: Path | None = None  # an image of what counts
+
+
+class Pixels(NamedTuple):
+    """A decoded file."""
+
+    color: np.ndarray  # [H, W, 3] float32, on the background
+    alpha: np.ndarray | None  # [H, W] float32, 0..1; None if the file has none, or is opaque all over
+    linear: bool  # in linear light, rather than as a screen shows it
 
 
 @contextmanager
@@ -75,55 +90,86 @@ def read_lens(path: Path) -> tuple[int, int, str, float]:
     """
     spec = _open(path).spec()
     focal = spec.get_float_attribute("Exif:FocalLength")
-    return spec.width, spec.height, spec.get_string_attribute("Model"), focal
+    return spec.width, spec.height, _text(spec.get_string_attribute, "Model"), focal
 
 
-def has_alpha(path: Path) -> bool:
-    """Whether the image has an alpha channel. Raises InputError as :func:`read_size` does."""
-    return _open(path).spec().alpha_channel >= 0
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether one size is the other times a factor, up to the rounding of either side to whole pixels."""
+    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
 
 
 def read_rgb(path: Path, background: float) -> np.ndarray:
-    """Read an image as [H, W, 3] float32, 0..1; gray becomes RGB, alpha is composited on ``background``.
+    """The colors of :func:`read_pixels`."""
+    return read_pixels(path, background).color
+
+
+def read_pixels(path: Path, background: float) -> Pixels:
+    """Read an image, 0..1 or in linear light; gray becomes RGB, alpha is composited on ``background``.
 
     Raises:
-        InputError: if the file is not an image that OpenImageIO reads, or is cut short.
+        InputError: if the file is not an image that OpenImageIO reads, is cut short, or is absurdly large.
     """
     file = _open(path)
+    spec = file.spec()
     pixels = file.read_image(oiio.FLOAT)
-    error = file.geterror()  # a JPEG that is cut short still gives pixels: gray ones
+    error = _text(file.geterror)  # a JPEG that is cut short still gives pixels: gray ones
     if pixels is None or error:
         raise _unreadable(path, error)
     if not np.isfinite(pixels).all():
         raise _unreadable(path, "pixels that are NaN or infinite")
-    spec = file.spec()
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+    linear = spec.format.basetype in FLOATS or _text(spec.get_string_attribute, "oiio:ColorSpace").startswith("lin")
     if spec.alpha_channel < 0:
-        return color
-    alpha = pixels[..., spec.alpha_channel, None]
+        return Pixels(color, None, linear)
+    alpha = pixels[..., spec.alpha_channel]
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha")
-    return (color * alpha if straight else color) + (1 - alpha) * np.float32(background)
+    color = (color * alpha[..., None] if straight else color) + (1 - alpha[..., None]) * np.float32(background)
+    return Pixels(color, alpha if alpha.min() < 1 else None, linear)
+
+
+def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
+    """What counts of a photograph of ``size`` = (width, height), [H, W] float32 of 0 and 1: the mask's brighter half.
+
+    Brighter than half its brightest pixel: some tools write 0 and 1 of 255. Transparent is black.
+
+    Args:
+        path: the mask, of the photograph's size or of that times one factor.
+        size: of the photograph [px].
+        invert: the darker half counts instead.
+
+    Raises:
+        InputError: if the file cannot be read, or has another shape.
+    """
+    brightness = read_rgb(path, 0.0).max(axis=2)
+    found = brightness.shape[1], brightness.shape[0]
+    if not same_shape(found, size):
+        raise InputError(
+            f"{path}: expected a mask of {size[0]} x {size[1]} pixels as its photograph has, or scaled by one factor, "
+            f"got {found[0]} x {found[1]}; draw it on the photograph, or remove it."
+        )
+    bright = ((brightness > 0.5 * brightness.max()) != invert).astype(np.float32)
+    return bright if found == size else _resize(bright[..., None], *size)[..., 0]
 
 
 def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
-    """Resample ``image`` [H, W, 3] float32 at the positions ``sampling``.
+    """Resample ``image`` [H, W, C] float32 at the positions ``sampling``.
 
     Args:
-        image: the image with its distortion, [H, W, 3].
+        image: the image with its distortion, [H, W, C].
         sampling: where in ``image`` [px, x then y] each pixel of the result lies, [h + 2, w + 2, 2]: with a margin of
             one pixel, because OpenImageIO takes the filter's size from differences between neighbors.
 
     Returns:
-        The resampled image, [h, w, 3] float32.
+        The resampled image, [h, w, C] float32.
     """
     padded = np.pad(image, ((WARP_PAD, WARP_PAD), (WARP_PAD, WARP_PAD), (0, 0)), "edge")
     st = (sampling + WARP_PAD) / (padded.shape[1], padded.shape[0])
-    roi = _roi(st.shape[1], st.shape[0])  # without it the result has the size of the source
+    roi = _roi(st.shape[1], st.shape[0], image.shape[2])  # without it the result has the size of the source
     warped = oiio.ImageBufAlgo.st_warp(_buffer(padded), _buffer(st), "catmull-rom", roi=roi, nthreads=1)
     return _pixels(warped)[1:-1, 1:-1]
 
 
-def load_views(photos: list[Photo], resolution: int, white_background: bool) -> list[View]:
+def load_views(photos: list[Photo], resolution: int, white_background: bool, invert_masks: bool = False) -> list[View]:
     """Decode ``photos`` at the size that ``resolution`` asks for (see :func:`target_size`), in their order.
 
     Raises:
@@ -131,18 +177,27 @@ def load_views(photos: list[Photo], resolution: int, white_background: bool) -> 
     """
 
     def load(photo: Photo) -> View:
-        image = read_rgb(photo.path, float(white_background))
+        pixels = read_pixels(photo.path, float(white_background))
+        height, width = pixels.color.shape[:2]
+        mask = None if photo.mask is None else read_mask(photo.mask, (width, height), invert_masks)
+        planes = [plane[..., None] for plane in (pixels.alpha, mask) if plane is not None]
+        image = np.concatenate([pixels.color, *planes], axis=2) if planes else pixels.color
         if photo.sampling is not None:
             image = undistort(image, photo.sampling())
         camera = photo.camera.resized(*target_size(photo.camera.width, photo.camera.height, resolution))
         if (camera.height, camera.width) != image.shape[:2]:
-            roi = _roi(camera.width, camera.height)
-            image = _pixels(oiio.ImageBufAlgo.resize(_buffer(image), roi=roi, nthreads=1))
-        quantized = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)  # the filters overshoot
-        return View(photo.name, camera, quantized, photo.camera)
+            image = _resize(image, camera.width, camera.height)
+        color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
+        alpha = None if pixels.alpha is None else _quantized(image[..., 3])
+        mask = None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8)
+        return View(photo.name, camera, color, photo.camera, alpha, mask)
 
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(load, photos))
+
+
+def _quantized(image: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)  # the filters overshoot
 
 
 def _open(path: Path) -> oiio.ImageInput:
@@ -150,8 +205,20 @@ def _open(path: Path) -> oiio.ImageInput:
     straight.attribute("oiio:UnassociatedAlpha", 1)  # else OpenImageIO multiplies by alpha, in the file's 8 bit
     file = oiio.ImageInput.open(str(path), straight)
     if file is None:
-        raise _unreadable(path, oiio.geterror())
+        raise _unreadable(path, _text(oiio.geterror))
+    spec = file.spec()
+    pixels, least = spec.width * spec.height, spec.image_bytes() // RATIO_MOST
+    if pixels > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1 or least > path.stat().st_size:
+        raise _unreadable(path, f"{spec.width} x {spec.height} x {spec.depth} pixels of {spec.nchannels} channels")
     return file
+
+
+def _text(get: Callable[..., str], *arguments: str) -> str:
+    """What ``get`` returns; damaged files hold bytes that are no text."""
+    try:
+        return get(*arguments)
+    except UnicodeDecodeError:
+        return "text that is damaged"
 
 
 def _unreadable(path: Path, error: str) -> InputError:
@@ -163,8 +230,13 @@ def _buffer(array: np.ndarray) -> oiio.ImageBuf:
     return oiio.ImageBuf(np.ascontiguousarray(array, np.float32))  # refuses arrays in Fortran's order
 
 
-def _roi(width: int, height: int) -> oiio.ROI:
-    return oiio.ROI(0, width, 0, height, 0, 1, 0, 3)
+def _roi(width: int, height: int, channels: int) -> oiio.ROI:
+    return oiio.ROI(0, width, 0, height, 0, 1, 0, channels)
+
+
+def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    roi = _roi(width, height, image.shape[2])
+    return _pixels(oiio.ImageBufAlgo.resize(_buffer(image), roi=roi, nthreads=1))
 
 
 def _pixels(buffer: oiio.ImageBuf) -> np.ndarray:

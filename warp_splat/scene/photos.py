@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+from collections.abc import Callable
 from pathlib import Path
+
+from warp_splat.errors import InputError
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")  # what both pycolmap and the loader read, in sRGB
 OTHER_PHOTOS = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
+READABLE = (*PHOTOS, ".exr", ".hdr", ".webp")  # what the loader reads, in sRGB or in linear light
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp")
 
 
@@ -43,3 +48,70 @@ def sfm_hint(source: Path) -> str:
     """The end of a sentence on ``source`` without cameras: the command that computes them."""
     command = shlex.join(["warp-splat", "sfm", str(source), str(scene_of(source))])
     return f"compute the cameras with `{command}` and train on the new folder, or add --sfm, which does both."
+
+
+class ImageFinder:
+    """The files of images that a scene names: of exactly this name, or else of this stem.
+
+    Attributes:
+        renamed: names that were found with another ending, and the file names.
+    """
+
+    def __init__(self, root: Path):
+        self.root = root
+        self.renamed: dict[str, str] = {}
+        self._folders: dict[Path, frozenset[str]] = {}
+
+    def find(self, name: str) -> Path | None:
+        """The file, or None.
+
+        Raises:
+            InputError: if the name leads out of the folder, or several files have its stem.
+        """
+        path = Path(name)
+        if path.is_absolute() or ".." in path.parts:
+            raise InputError(f"{self.root}: expected names of files in this folder, found {name!r:.200}; rename it.")
+        if self.has(path):
+            return self.root / path
+        files = self._files(path.parent)
+        alike = [file for file in (f"{path.name}{ending}" for ending in PHOTOS) if file in files][:1]  # no ending given
+        alike = alike or sorted(
+            file for file in files if Path(file).stem == path.stem and file.lower().endswith(READABLE)
+        )
+        if len(alike) > 1:
+            raise InputError(
+                f"{self.root / path}: no such file, but several of this stem ({', '.join(alike[:3])}); keep one."
+            )
+        if not alike:
+            return None
+        if path.suffix:
+            self.renamed[name] = alike[0]
+        return self.root / path.with_name(alike[0])
+
+    def has(self, path: Path) -> bool:
+        """Whether there is a file of exactly this name in the folder."""
+        return path.name in self._files(path.parent)
+
+    def describe(self, count: int, report: Callable[[str], object]) -> None:
+        """Say how many of ``count`` images were found under other endings."""
+        if self.renamed:
+            name, file = next(iter(self.renamed.items()))
+            report(f"Taking {len(self.renamed)} of {count} images by their stems: {file} for {name}, ...")
+
+    def _files(self, folder: Path) -> frozenset[str]:
+        if folder not in self._folders:
+            try:
+                files = frozenset(entry.name for entry in os.scandir(self.root / folder) if entry.is_file())
+            except (OSError, ValueError):  # there is no such folder, or no such name can be
+                files = frozenset()
+            self._folders[folder] = files
+        return self._folders[folder]
+
+
+def find_mask(masks: ImageFinder, name: str) -> Path | None:
+    """The mask of the photograph ``name`` in the folder of ``masks``: name.jpg.png or name.png."""
+    path = Path(name)
+    for candidate in (path.with_name(f"{path.name}.png"), path.with_suffix(".png")):
+        if masks.has(candidate):
+            return masks.root / candidate
+    return None

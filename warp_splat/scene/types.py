@@ -1,10 +1,13 @@
-"""What a loaded scene is: cameras with their photographs, and sparse points."""
+"""What a loaded scene is: cameras with their photographs, and what training starts from."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from warp_splat.camera import Camera
+from warp_splat.color import to_srgb
+from warp_splat.formats.splats import SplatFile
 
 
 def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -21,8 +24,20 @@ class View:
 
     name: str  # as in the scene's files, with sub-folder and extension
     camera: Camera  # scaled to `image`
-    image: np.ndarray  # [H, W, 3] uint8, alpha already composited on the background
+    image: np.ndarray  # [H, W, 3] on the background: uint8 as a screen shows it, or float32 in linear light
     original: Camera  # before the resize of `-r` (after undistortion)
+    alpha: np.ndarray | None = None  # [H, W] uint8, where the photograph says it; for other backgrounds
+    mask: np.ndarray | None = None  # [H, W] uint8, 1 where the photograph counts; None: everywhere
+
+    @property
+    def linear(self) -> bool:
+        """Whether ``image`` is in linear light."""
+        return self.image.dtype != np.uint8
+
+    @cached_property
+    def picture(self) -> np.ndarray:
+        """``image`` as a screen shows it, [H, W, 3] uint8."""
+        return np.rint(255 * to_srgb(self.image.clip(0, 1), np.where)).astype(np.uint8) if self.linear else self.image
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +48,12 @@ class Scene:
     test: list[View]
     points: np.ndarray  # [P, 3] float32, world coordinates
     colors: np.ndarray  # [P, 3] uint8
+    start: SplatFile | None = None  # Gaussians to start from instead; the points are their centers
+
+    @property
+    def linear(self) -> bool:
+        """Whether the photographs, and so the Gaussians' colors, are in linear light."""
+        return self.train[0].linear
 
     @property
     def evaluated(self) -> tuple[str, list[View]]:

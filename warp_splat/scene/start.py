@@ -1,0 +1,71 @@
+"""What training starts from where a scene has no points: random ones, or Gaussians of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from warp_splat.camera import Camera
+from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.ply import GRAY
+from warp_splat.formats.splats import SH_C0, SplatFile
+from warp_splat.scene.types import visible
+
+COUNT = 50_000
+DEPTHS = 0.2, 8.0  # of the cameras' extent: from near the middle of an orbit to far behind what a walk shows
+ROUNDS = 20  # of drawing; a pair of cameras with one place to look at needs a few
+
+
+def random_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Points in what at least two cameras see, more of them near by; the same for the same cameras.
+
+    Each is drawn along a random ray of a random camera, its depth log-uniform between DEPTHS times the largest distance
+    of a camera from their mean (1 if all stand at one place). Where no two cameras see the same, one is enough.
+
+    Returns:
+        Points [P, 3] float32, P = 50,000; gray colors [P, 3] uint8.
+    """
+    random = np.random.default_rng(0)
+    centers = np.stack([camera.center for camera in cameras])
+    extent = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    if extent < 1e-6 * np.abs(centers).max() or extent == 0:
+        extent = 1.0
+    kept: list[np.ndarray] = []
+    for _ in range(ROUNDS):
+        drawn = _along_rays(cameras, extent, random)
+        if len(cameras) > 1:
+            seen = sum(visible(camera, drawn).astype(int) for camera in cameras)
+            drawn = drawn[seen >= 2]
+        kept.append(drawn)
+        if sum(map(len, kept)) >= COUNT:
+            break
+    found = np.concatenate(kept)
+    if len(found) < COUNT:
+        found = np.concatenate([found, _along_rays(cameras, extent, random)])
+    return found[:COUNT].astype(np.float32), np.full((COUNT, 3), GRAY, np.uint8)
+
+
+def _along_rays(cameras: list[Camera], extent: float, random: np.random.Generator) -> np.ndarray:
+    """COUNT points [COUNT, 3], as many in front of each camera up to one."""
+    depths = extent * np.exp(random.uniform(*np.log(DEPTHS), COUNT))
+    pixels, points = random.uniform(size=(COUNT, 2)), np.empty((COUNT, 3))
+    for index, camera in enumerate(cameras):
+        mine = slice(index, None, len(cameras))
+        x = (pixels[mine, 0] * camera.width - camera.cx) / camera.fx
+        y = (pixels[mine, 1] * camera.height - camera.cy) / camera.fy
+        points[mine] = (
+            np.stack([x, y, np.ones_like(x)], 1) * depths[mine, None] - camera.translation
+        ) @ camera.rotation
+    return points
+
+
+def load_start(path: str, report: Callable[[str], None]) -> tuple[SplatFile, np.ndarray, np.ndarray]:
+    """Gaussians of a file, their centers [N, 3] float32 and colors [N, 3] uint8, seen from nowhere in particular.
+
+    Raises:
+        InputError: if it is missing or not a file of Gaussians.
+    """
+    file = load_gaussians(path, report)
+    colors = (255 * (SH_C0 * file.splats.sh[:, 0].astype(np.float64) + 0.5)).clip(0, 255).round().astype(np.uint8)
+    return file, file.splats.means, colors

@@ -1,0 +1,204 @@
+"""Scenes whose cameras are in JSON: nerf-synthetic (Mildenhall et al. 2020), nerfstudio and instant-ngp.
+
+Poses are camera-to-world in OpenGL axes (x right, y up, z backward), in the frame of the points: ``applied_transform``,
+which tells how nerfstudio came there from COLMAP's frame, is ignored, so that coordinates stay those of the file.
+"""
+
+import json
+import reprlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from warp_splat.errors import InputError
+from warp_splat.formats.ply import GRAY, load_points
+from warp_splat.formats.reading import reading
+from warp_splat.scene import images
+from warp_splat.scene.images import Photo
+from warp_splat.scene.lenses import Sampling, make_photo, make_sampling
+from warp_splat.scene.photos import ImageFinder
+
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
+ALL = "transforms.json"  # nerfstudio, instant-ngp
+POINTS, HALF_WIDTH = 100_000, 1.3  # graphdeco, scene/dataset_readers.py: "inside the bounds of the synthetic scenes"
+TOLERANCE = 1e-3  # of a pose's axes, for files that round their numbers
+JSON_BYTES = 2**24  # of 20,000 frames; no more than a gigabyte once parsed, whatever is in it
+LARGEST = 1e9  # of a number that describes a lens
+PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
+FISHEYE = "OPENCV_FISHEYE"
+
+
+def has_transforms(source: Path) -> bool:
+    """Whether the folder holds a file of cameras that :func:`read` knows."""
+    return any((source / name).is_file() for name in (TRAIN, ALL))
+
+
+def read(source: Path, report: Callable[[str], object]) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
+    """Read the cameras in ``source``, and its points or, for nerf-synthetic, random ones.
+
+    Returns:
+        Photos of the training set; those of the test set, empty without transforms_test.json; points [P, 3] float32,
+        for nerf-synthetic 100,000, uniform in [-1.3, 1.3]^3, always the same, for others maybe none; colors [P, 3]
+        uint8.
+
+    Raises:
+        InputError: if a file is missing, cannot be parsed, lacks a key, holds a matrix that is not a pose or a lens
+            that cannot be undistorted.
+    """
+    if not (source / TRAIN).is_file():
+        content = _parse(source / ALL)
+        return _read_photos(source / ALL, content, report), [], *_points(source, content.get("ply_file_path"), report)
+    train, test = (
+        _read_photos(path, _parse(path), report) if path.is_file() else [] for path in (source / TRAIN, source / TEST)
+    )
+    points = np.random.default_rng(0).uniform(-HALF_WIDTH, HALF_WIDTH, (POINTS, 3)).astype(np.float32)
+    return train, test, points, np.full((POINTS, 3), GRAY, np.uint8)
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    with reading(path, "a JSON object"):
+        size = path.stat().st_size
+        if size > JSON_BYTES:
+            raise InputError(f"{path}: expected at most {JSON_BYTES} bytes of JSON, found {size}; leave out frames.")
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as error:  # of the syntax, of the encoding, or of the depth
+            raise InputError(
+                f"{path}: expected JSON, but it cannot be parsed ({error!s:.200}); correct the file."
+            ) from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected a JSON object with the key frames, found another value; correct the file.")
+    return content
+
+
+def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], object]) -> list[Photo]:
+    frames = _value(content, "frames", path)
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: expected a list of at least one frame under the key frames; correct the file.")
+    places = [f"{path}, frame {index}" for index in range(len(frames))]
+    finder = ImageFinder(path.parent)
+    names = [_path(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
+    paths = [finder.find(name) for name in names]
+    missing = [name for name, found in zip(names, paths, strict=True) if found is None]
+    if missing:
+        raise InputError(
+            f"{path}: expected the images of its {len(frames)} frames, but {len(missing)} of them cannot be found, "
+            f"the first is {missing[0]!r:.200}; copy them there."
+        )
+    finder.describe(len(frames), report)
+    sampling = make_sampling()
+    photos = [
+        _photo({**content, **frame}, found, finder, sampling, where)
+        for frame, found, where in zip(frames, paths, places, strict=True)
+    ]
+    distorted = sum(photo.sampling is not None for photo in photos)
+    if distorted:
+        report(f"Undistorting {distorted} of {len(photos)} images to pinhole cameras.")
+    return photos
+
+
+def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sampling, where: str) -> Photo:
+    """The photo of a frame; ``values`` are its own and, where it has none, those of the file."""
+    size = images.read_size(path)
+    pose = _pose(_value(values, "transform_matrix", where), where)
+    name = path.relative_to(finder.root).as_posix()
+    with images.named(where):
+        photo = make_photo(name, path, _lens(values, size, where), pose, size, sampling)
+    if values.get("mask_path") is None:
+        return photo
+    mask = finder.find(_path(values, "mask_path", where))
+    if mask is None:
+        raise InputError(f"{where}: expected the mask {values['mask_path']!r:.200}, found no such file; copy it there.")
+    return Photo(name, path, photo.camera, photo.sampling, mask)
+
+
+def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> pycolmap.Camera:
+    """The lens that a frame describes in the manner of nerfstudio, or by camera_angle_x as nerf-synthetic does."""
+
+    def number(key: str, default: float = 0.0) -> float:
+        value = values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, float | int) or not abs(value) < LARGEST:
+            raise InputError(f"{where}: expected {key} as a number, got {reprlib.repr(value)}; correct the file.")
+        return float(value)
+
+    width, height = number("w", size[0]), number("h", size[1])
+    if not (width.is_integer() and height.is_integer() and min(width, height) >= 1):
+        raise InputError(f"{where}: expected w and h as numbers of pixels, got {width} and {height}; correct the file.")
+    if "fl_x" in values:
+        fx = number("fl_x")
+    else:
+        angle = _value(values, "camera_angle_x", where)
+        if not 0 < number("camera_angle_x") < np.pi:
+            raise InputError(
+                f"{where}: expected camera_angle_x between 0 and pi radians, got {reprlib.repr(angle)}; correct it."
+            )
+        fx = 0.5 * width / np.tan(0.5 * angle)
+    focal = (fx, number("fl_y", fx), number("cx", width / 2), number("cy", height / 2))
+    k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    model = values.get("camera_model", FISHEYE if values.get("is_fisheye") is True else "OPENCV")
+    if model == FISHEYE and not (p1 or p2):
+        params = (*focal, k1, k2, k3, k4)
+    elif model in PERSPECTIVE and not k4:
+        model = "FULL_OPENCV" if k3 else "OPENCV" if k1 or k2 or p1 or p2 else "PINHOLE"
+        params = {"PINHOLE": focal, "OPENCV": (*focal, k1, k2, p1, p2)}.get(
+            model, (*focal, k1, k2, p1, p2, k3, 0, 0, 0)
+        )
+    else:
+        raise InputError(
+            f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2 or {FISHEYE} with k1 to k4, got "
+            f"{reprlib.repr(model)} with k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs first."
+        )
+    return pycolmap.Camera(model=model, width=int(width), height=int(height), params=params)
+
+
+def _points(source: Path, name: Any, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
+    """The points of nerfstudio's ``ply_file_path``; none without."""
+    if name is None:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    path = ImageFinder(source).find(_path({"ply_file_path": name}, "ply_file_path", source / ALL))
+    if path is None:
+        raise InputError(
+            f"{source / ALL}: expected the points {name!r:.200}, found no such file; copy it there, or remove the key "
+            "ply_file_path to start from random points."
+        )
+    return load_points(path, report)
+
+
+def _path(values: Any, key: str, where: str | Path) -> str:
+    name = _value(values, key, where)
+    if not isinstance(name, str):
+        raise InputError(f"{where}: expected a string as {key}, got {reprlib.repr(name)}; correct the file.")
+    return Path(name).as_posix()
+
+
+def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and translation [3] of camera_from_world from world_from_camera in OpenGL axes, [4, 4]."""
+    try:
+        world_from_camera = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        world_from_camera = np.empty(0)
+    if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
+        raise InputError(
+            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix):.100}; "
+            "correct the file."
+        )
+    u, scales, vt = np.linalg.svd(world_from_camera[:3, :3])  # u @ vt is the nearest rotation, without the scale
+    is_scaled_rotation = np.linalg.det(u @ vt) > 0 and scales[2] > 0 and scales[0] - scales[2] <= TOLERANCE * scales[0]
+    if not is_scaled_rotation or not np.allclose(world_from_camera[3], (0, 0, 0, 1)):
+        raise InputError(
+            f"{where}: expected transform_matrix to be a rotation and a translation (camera to world), but its axes "
+            "are sheared, mirrored or scaled unequally, or its last row is not 0 0 0 1; correct the file."
+        )
+    rotation = (u @ vt * (1, -1, -1)).T  # OpenGL's y and z axes point the other way
+    return rotation, -rotation @ world_from_camera[:3, 3]
+
+
+def _value(content: Any, key: str, where: str | Path) -> Any:
+    if not isinstance(content, dict) or key not in content:
+        raise InputError(
+            f"{where}: expected the key {key} (as nerf-synthetic or nerfstudio has), found none; correct the file."
+        )
+    return content[key]
