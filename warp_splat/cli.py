@@ -16,6 +16,7 @@ from warp_splat.config import (
     PRESETS,
     CompareConfig,
     ConvertConfig,
+    ExportHtmlConfig,
     InspectConfig,
     RenderConfig,
     SfmConfig,
@@ -23,13 +24,14 @@ from warp_splat.config import (
 )
 from warp_splat.errors import InputError
 
-Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | CompareConfig
+Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | ExportHtmlConfig | CompareConfig
 COMMANDS = {
     "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
     "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
+    "export-html": (ExportHtmlConfig, "write a page that shows a model in any browser, without a server or a network"),
     "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
 }
 
@@ -127,6 +129,8 @@ def main(arguments: list[str] | None = None) -> int:
             from warp_splat.doctor.run import inspect as run  # noqa: PLC0415
         elif isinstance(config, ConvertConfig):
             from warp_splat.convert import convert as run  # noqa: PLC0415
+        elif isinstance(config, ExportHtmlConfig):
+            from warp_splat.page.export import export_html as run  # noqa: PLC0415
         elif isinstance(config, CompareConfig):
             from warp_splat.compare.run import compare as run  # noqa: PLC0415
         else:
