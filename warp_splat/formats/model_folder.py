@@ -163,7 +163,10 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     if not path.exists():
         return []
     with reading(path, "a list of cameras as training writes it"):
-        entries = json.loads(path.read_text(encoding="utf-8"))
+        try:
+            entries = json.loads(path.read_text(encoding="utf-8"))
+        except RecursionError as error:
+            raise Unexpected("lists in lists without end") from error
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise Unexpected("other JSON")
         try:
@@ -179,4 +182,5 @@ def _camera(entry: dict) -> Camera:
     position = np.array(entry["position"], np.float64)
     middle = {"cx": 0.5 * entry["width"], "cy": 0.5 * entry["height"]}
     numbers = {name: entry.get(name, middle.get(name)) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return Camera(**numbers, rotation=rotation, translation=-rotation @ position)
+    with np.errstate(invalid="ignore"):  # what is not finite, the camera refuses
+        return Camera(**numbers, rotation=rotation, translation=-rotation @ position)

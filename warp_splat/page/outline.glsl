@@ -1,5 +1,5 @@
 // A parallelogram around the ellipse where a 2D Gaussian reaches ALPHA_MIN: a square in the coordinates of its root.
-// Two triangles each; software renderers take a millisecond for fifty instances, which would be the other way to do it.
+// Four vertices each, not an instance: software renderers take a millisecond for fifty of these.
 uniform highp usampler2D order; // which Gaussian, nearest first
 uniform highp usampler2D meanAndRoot, rootAndColor; // of project.glsl
 uniform vec2 size; // px
@@ -12,7 +12,7 @@ ivec2 placeOf(int index) {
 }
 
 void main() {
-  ivec2 place = placeOf(int(texelFetch(order, placeOf(gl_VertexID / 6), 0).x));
+  ivec2 place = placeOf(int(texelFetch(order, placeOf(gl_VertexID / 4), 0).x));
   uvec4 first = texelFetch(meanAndRoot, place, 0), second = texelFetch(rootAndColor, place, 0);
   mean = uintBitsToFloat(first.xy);
   root = uintBitsToFloat(uvec3(first.zw, second.x));
@@ -20,8 +20,7 @@ void main() {
   gl_Position = vec4(2, 2, 2, 1); // outside
   if (color.a < ALPHA_MIN) return;
   float reach = sqrt(max(log2(color.a / ALPHA_MIN), 1e-6));
-  int vertex = gl_VertexID % 6 < 3 ? gl_VertexID % 6 : gl_VertexID % 6 - 2; // of the square: 0 1 2, 1 2 3
-  vec2 corner = reach * (2.0 * vec2(vertex & 1, vertex >> 1) - 1.0);
+  vec2 corner = reach * (2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) - 1.0);
   float dy = corner.y / root.z;
   float dx = (corner.x - root.y * dy) / root.x;
   gl_Position = vec4(2.0 * (mean + vec2(dx, dy)) / size - 1.0, 0, 1);

@@ -84,7 +84,7 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 def _steps(values: np.ndarray, steps: int) -> np.ndarray:
     """The nearest multiples of 1 / ``steps`` that int16 holds."""
-    return np.clip(np.round(values * np.float32(steps)), -32768, 32767)
+    return np.clip(np.round(values.astype(np.float64) * steps), -32768, 32767)
 
 
 def _harmonics(sh: np.ndarray, groups_of_five: int) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 const source = (name) => document.getElementById(name).textContent;
 
+const LEAST_DETAIL = 0.2;
+
 class Renderer {
   constructor(canvas, scene, packed) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
@@ -27,6 +29,11 @@ class Renderer {
     };
     this.order = this.texture(gl.R32UI, this.width, this.rows);
     this.visible = 0;
+    const corners = new Uint32Array(6 * scene.count); // two triangles of each four vertices
+    for (let i = 0; i < corners.length; i++) corners[i] = 4 * Math.floor(i / 6) + [0, 1, 2, 1, 3, 2][i % 6];
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    [this.detail, this.frameTime, this.fence] = [1, 0, null];
     // blended in float32 where the card can, in float16, or in the last resort in 8 bits
     this.imageFormat = gl.getExtension("EXT_color_buffer_float")
       ? gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F
@@ -94,6 +101,27 @@ class Renderer {
     this.project(camera, size);
     this.blend(size);
     this.resolve(detail);
+    this.detail = detail;
+    this.started = performance.now();
+    this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.gl.flush();
+  }
+
+  // Whether the last frame is done; then `frameTime` says how long it took.
+  get ready() {
+    const { gl } = this;
+    if (!this.fence) return true;
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost()) return false;
+    this.frameTime = performance.now() - this.started;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    return true;
+  }
+
+  // The detail at which a frame should take as long, judged by the last one [ms].
+  detailFor(milliseconds) {
+    const factor = Math.sqrt(milliseconds / Math.max(1, this.frameTime));
+    return Math.min(1, Math.max(LEAST_DETAIL, this.detail * Math.min(1.1, factor)));
   }
 
   project(camera, size) {
@@ -122,7 +150,7 @@ class Renderer {
     gl.useProgram(handle);
     this.bind([this.order, ...this.projected], handle, ["order", "meanAndRoot", "rootAndColor"]);
     gl.uniform2fv(at("size"), size);
-    gl.drawArrays(gl.TRIANGLES, 0, 6 * this.visible);
+    gl.drawElements(gl.TRIANGLES, 6 * this.visible, gl.UNSIGNED_INT, 0);
   }
 
   resolve(detail) {

@@ -1,8 +1,7 @@
 // The page: unpacks the Gaussians, sorts and draws them as the camera moves, follows mouse, fingers and keys.
 
 const MOVING = 200; // ms after the last input until the image is drawn in full detail
-const FRAME = 50; // ms: while moving, the detail is chosen so that a frame takes about as long
-const LEAST_DETAIL = 0.2;
+const FRAME = 50; // ms that a frame should take while moving; its detail is chosen so
 const element = (id) => document.getElementById(id);
 const say = (text) => { element("message").textContent = text; };
 
@@ -39,10 +38,8 @@ class Viewer {
     this.worker.onerror = () => say("The Gaussians could not be sorted: this browser refuses workers.");
     this.version = this.sortedVersion = 0; // of the camera
     this.sorting = this.requested = false;
-    this.detail = 1;
-    this.lastInput = this.lastFrame = -Infinity;
+    this.lastInput = -Infinity;
     this.waiting = [];
-    this.times = { sort: 0 }; // ms
     new ResizeObserver(() => this.request()).observe(this.canvas);
   }
 
@@ -79,7 +76,7 @@ class Viewer {
     this.renderer.setOrder(order, visible);
     this.sorting = false;
     this.sortedVersion = version;
-    this.times.sort = milliseconds;
+    this.sortTime = milliseconds;
     if (version !== this.version) this.sort();
     this.request();
   }
@@ -91,27 +88,25 @@ class Viewer {
 
   frame(now) {
     this.requested = false;
+    if (!this.renderer.ready) return this.request(); // nothing piles up before a slow card
     const { canvas } = this, ratio = window.devicePixelRatio;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((size) => Math.max(1, Math.round(size * ratio)));
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    const detail = this.chooseDetail(now);
-    const camera = fitted(this.camera, Math.ceil(width * detail), Math.ceil(height * detail));
-    this.renderer.draw(camera, detail);
-    if (detail === 1 && this.sortedVersion === this.version) {
-      for (const resolve of this.waiting.splice(0)) resolve();
+    const rest = this.lastInput + MOVING - now;
+    if (rest <= 0 && this.sortedVersion !== this.version) return; // the sort's end draws it
+    if (rest > 0) {
+      clearTimeout(this.sharpen);
+      this.sharpen = setTimeout(() => this.request(), rest + 1);
     }
+    const detail = rest > 0 ? this.renderer.detailFor(FRAME) : 1;
+    this.renderer.draw(fitted(this.camera, Math.ceil(width * detail), Math.ceil(height * detail)), detail);
+    if (rest <= 0) for (const resolve of this.waiting.splice(0)) resolve();
   }
 
-  // The share of the canvas's pixels in a row to draw: all at rest; while moving as many as the last frames allow.
-  chooseDetail(now) {
-    const passed = now - this.lastFrame;
-    this.lastFrame = now;
-    const rest = this.lastInput + MOVING - performance.now();
-    if (rest <= 0) return 1;
-    clearTimeout(this.sharpen);
-    this.sharpen = setTimeout(() => this.request(), rest + 1);
-    if (passed < 10 * MOVING) this.detail *= Math.min(1.1, Math.max(0.7, Math.sqrt(FRAME / passed)));
-    return this.detail = Math.min(1, Math.max(LEAST_DETAIL, this.detail));
+  // Of the last sort and of the last frame [ms], and the share of the canvas's pixels in a row that it had.
+  get times() {
+    const { frameTime, detail } = this.renderer;
+    return { sort: this.sortTime, frame: frameTime, detail };
   }
 
   // What the hand does: `dx`, `dy` in px of the page.
@@ -178,13 +173,14 @@ function follow(viewer) {
 try {
   const scene = JSON.parse(source("scene"));
   const viewer = new Viewer(scene, ...(await unpack(scene)));
+  element("gaussians").remove(); // megabytes of text
   follow(viewer);
   element("bar").hidden = false;
   element("previous").hidden = element("next").hidden = scene.cameras.length < 2;
   element("count").textContent = `${scene.count.toLocaleString("en")} Gaussians`;
   await viewer.step(0);
   window.warpSplat = {
-    cameras: scene.cameras, setCamera: (camera) => viewer.setCamera(camera), times: viewer.times,
+    cameras: scene.cameras, setCamera: (camera) => viewer.setCamera(camera), get times() { return viewer.times; },
   };
   say(scene.count ? "" : "This model holds no Gaussians.");
 } catch (error) {
