@@ -1,36 +1,45 @@
-"""Makes the pictures of the documentation that show a program: uv run python docs/make_pictures.py -m output/abc123"""
+"""The pictures of the documentation that no benchmark makes: ``python docs/make_pictures.py page -m output/abc123``.
+
+Needs playwright and a Chromium (see tests/browser.py).
+"""
 
 import argparse
 import sys
 import tempfile
 from pathlib import Path
 
-from warp_splat.cli import main
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent / "tests"))
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
 from browser import browser_page  # noqa: E402
 
-LARGEST = 150_000  # bytes of a picture
+from warp_splat.cli import main  # noqa: E402
 
 
-def page(model: Path, target: Path) -> None:
-    """What export-html's page of ``model`` shows after a drag, as a JPEG file."""
+def page(model: str) -> Path:
+    """The page of ``warp-splat export-html`` at its first camera, after a drag."""
     with tempfile.TemporaryDirectory() as folder, browser_page(960, 640) as (browser, errors):
-        path = Path(folder) / "page.html"
-        main(["export-html", str(model), str(path)])
-        browser.goto(path.as_uri())
+        exported = Path(folder) / "page.html"
+        assert main(["export-html", model, str(exported)]) == 0
+        browser.goto(exported.as_uri())
         browser.wait_for_selector("#message:empty", state="attached")
         browser.mouse.move(480, 300)
         browser.mouse.down()
         browser.mouse.move(560, 290, steps=4)
         browser.mouse.up()
-        browser.wait_for_timeout(2000)
-        browser.screenshot(path=target, type="jpeg", quality=80)
-        assert not errors and target.stat().st_size < LARGEST
+        browser.wait_for_timeout(3000)  # until it is sharp
+        path = DOCS / "images" / "page.jpg"
+        browser.screenshot(path=path, type="jpeg", quality=80)
+        assert not errors, errors
+    return path
+
+
+PICTURES = {"page": page}
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-m", "--model", type=Path, required=True, help="a model trained on the embedded scene")
-    page(parser.parse_args().model, ROOT / "docs" / "images" / "page.jpg")
+    parser.add_argument("picture", choices=PICTURES)
+    parser.add_argument("-m", dest="model", required=True, help="folder of a trained model")
+    chosen = parser.parse_args()
+    print(PICTURES[chosen.picture](chosen.model))
