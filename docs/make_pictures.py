@@ -1,17 +1,30 @@
-"""The pictures of the documentation that no benchmark makes: `python docs/make_pictures.py sheet -m output/abc123`."""
+"""The pictures of the documentation that no benchmark makes: ``python docs/make_pictures.py page -m output/abc123``.
+
+The model is one that was trained on the embedded scene. ``page`` and ``viewer`` need playwright and a Chromium (see
+tests/browser.py).
+"""
 
 import argparse
+import re
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from warp_splat.cli import main
-from warp_splat.formats.model_folder import find_iteration
-from warp_splat.formats.png import load_png
-from warp_splat.report import new_figure, save_figure
+DOCS = Path(__file__).parent
+IMAGES = DOCS / "images"
+sys.path.insert(0, str(DOCS.parent / "tests"))
 
-IMAGES = Path(__file__).parent / "images"
+from browser import browser_page  # noqa: E402
+
+from warp_splat.cli import main  # noqa: E402
+from warp_splat.formats.model_folder import find_iteration  # noqa: E402
+from warp_splat.formats.png import load_png  # noqa: E402
+from warp_splat.report import new_figure, save_figure  # noqa: E402
+
+PATIENCE = 180_000  # ms, on a machine without a GPU that is busy
 SHOWN = 6  # frames of each video
 
 
@@ -34,6 +47,46 @@ def videos(model: str) -> Path:
     return _save(np.concatenate(rows), "videos.jpg")
 
 
+def page(model: str) -> Path:
+    """The page of ``warp-splat export-html`` at its first camera, after a drag."""
+    with tempfile.TemporaryDirectory() as folder, browser_page(960, 640) as (browser, errors):
+        exported = Path(folder) / "page.html"
+        assert main(["export-html", model, str(exported)]) == 0
+        browser.goto(exported.as_uri())
+        browser.wait_for_selector("#message:empty", state="attached")
+        browser.mouse.move(480, 300)
+        browser.mouse.down()
+        browser.mouse.move(560, 290, steps=4)
+        browser.mouse.up()
+        browser.wait_for_timeout(3000)  # until it is sharp
+        path = IMAGES / "page.jpg"
+        browser.screenshot(path=path, type="jpeg", quality=80)
+        assert not errors, errors
+    return path
+
+
+def viewer(model: str) -> Path:
+    """The page of ``warp-splat view``, at the camera of the third photograph."""
+    command = [sys.executable, "-m", "warp_splat", "view", model]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            address = next(found[0] for line in server.stdout if (found := re.search(r"http://[\d.:]+", line)))
+            with browser_page(1200, 675) as (page, errors):
+                page.goto(f"{address}/?fixedDpr=1")
+                page.get_by_text("px in").wait_for(timeout=PATIENCE)
+                for _ in range(3):
+                    page.get_by_role("button", name="next").click()
+                page.locator(".mantine-Notification-closeButton").click()  # that WebGL runs in software here
+                page.mouse.move(600, 600)
+                page.wait_for_timeout(8000)  # until it is sharp
+                path = IMAGES / "viewer.jpg"
+                page.screenshot(path=path, type="jpeg", quality=85)
+                assert not errors, errors
+        finally:
+            server.terminate()
+    return path
+
+
 def _save(picture: np.ndarray, name: str) -> Path:
     """As a JPEG file of about the width of a page."""
     height, width, _ = picture.shape
@@ -44,9 +97,12 @@ def _save(picture: np.ndarray, name: str) -> Path:
     return IMAGES / name
 
 
+PICTURES = {"sheet": sheet, "videos": videos, "page": page, "viewer": viewer}
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("picture", choices=("sheet", "videos"))
-    parser.add_argument("-m", "--model", required=True, help="a model trained on the embedded scene")
-    arguments = parser.parse_args()
-    print({"sheet": sheet, "videos": videos}[arguments.picture](arguments.model))
+    parser.add_argument("picture", choices=PICTURES)
+    parser.add_argument("-m", dest="model", required=True, help="folder of a trained model")
+    chosen = parser.parse_args()
+    print(PICTURES[chosen.picture](chosen.model))

@@ -91,13 +91,68 @@ def test_cameras_test_first_at_original_size(tmp_path):
     entries = json.loads((tmp_path / "cameras.json").read_text())
     assert [(entry["id"], entry["img_name"]) for entry in entries] == [(0, "a/1.jpg"), (1, "2.jpg"), (2, "3.jpg")]
     for entry, expected in zip(entries, test + train, strict=True):
-        assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
+        assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx", "cx", "cy"]
         assert (entry["width"], entry["height"], entry["fx"], entry["fy"]) == (800, 600, 700, 710)
         camera_from_world = np.eye(4)
         camera_from_world[:3, :3], camera_from_world[:3, 3] = expected.original.rotation, expected.original.translation
         world_from_camera = np.linalg.inv(camera_from_world)
         np.testing.assert_allclose(entry["rotation"], world_from_camera[:3, :3], atol=1e-12)
         np.testing.assert_allclose(entry["position"], world_from_camera[:3, 3], atol=1e-12)
+
+
+def test_cameras_come_back(tmp_path):
+    assert model_folder.read_cameras(tmp_path) == []
+    views = [view("a/1.jpg", 1), view("2.jpg", 2)]
+    model_folder.write_cameras(tmp_path, [], views)
+    for (name, camera), expected in zip(model_folder.read_cameras(tmp_path), views, strict=True):
+        assert name == expected.name
+        for field in ("width", "height", "fx", "fy", "cx", "cy"):
+            assert getattr(camera, field) == getattr(expected.original, field)
+        np.testing.assert_allclose(camera.rotation, expected.original.rotation, atol=1e-12)
+        np.testing.assert_allclose(camera.translation, expected.original.translation, atol=1e-12)
+
+
+def test_cameras_without_a_principal_point_have_it_in_the_middle(tmp_path):
+    model_folder.write_cameras(tmp_path, [], [view("1.jpg", 1)])
+    entries = json.loads((tmp_path / "cameras.json").read_text())
+    del entries[0]["cx"], entries[0]["cy"]  # as the reference writes it
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    [(_, camera)] = model_folder.read_cameras(tmp_path)
+    assert (camera.cx, camera.cy) == (400, 300)
+
+
+ENTRY = {
+    "img_name": "1",
+    "width": 4,
+    "height": 3,
+    "fx": 2,
+    "fy": 2,
+    "position": [0, 0, 0],
+    "rotation": np.eye(3).tolist(),
+}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "{}",
+        "[1]",
+        "[{}]",
+        "[" * 100_000,
+        json.dumps([{**ENTRY, "width": "wide"}]),
+        json.dumps([{**ENTRY, "width": None}]),
+        json.dumps([{**ENTRY, "rotation": [[1]]}]),
+        json.dumps([{**ENTRY, "rotation": [[[]]]}]),
+        json.dumps([{**ENTRY, "position": [0, 0, 1e400]}]),
+        json.dumps([{**ENTRY, "position": {"x": 0}}]),
+        json.dumps([{**ENTRY, "fx": 0}]),
+    ],
+)
+def test_damaged_cameras_are_refused_by_a_sentence(tmp_path, text):
+    (tmp_path / "cameras.json").write_text(text)
+    with pytest.raises(InputError, match=r"cameras\.json"):
+        model_folder.read_cameras(tmp_path)
 
 
 def test_find_iteration_takes_the_largest_number(tmp_path):

@@ -13,6 +13,7 @@ from warp_splat.config import (
     FIXED_OPTIONS,
     CompareConfig,
     ConvertConfig,
+    ExportHtmlConfig,
     InspectConfig,
     RenderConfig,
     SfmConfig,
@@ -22,13 +23,14 @@ from warp_splat.errors import InputError
 from warp_splat.flags import FOREIGN_FLAGS
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
-Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | CompareConfig
+Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | ExportHtmlConfig | CompareConfig
 COMMANDS = {
     "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
     "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model with their metrics, or a video"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
+    "export-html": (ExportHtmlConfig, "write a page that shows a model in any browser, without a server or a network"),
     "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
 }
 
@@ -140,6 +142,8 @@ def main(arguments: list[str] | None = None) -> int:
             from warp_splat.doctor.run import inspect as run  # noqa: PLC0415
         elif isinstance(config, ConvertConfig):
             from warp_splat.convert import convert as run  # noqa: PLC0415
+        elif isinstance(config, ExportHtmlConfig):
+            from warp_splat.page.export import export_html as run  # noqa: PLC0415
         elif isinstance(config, CompareConfig):
             from warp_splat.compare.run import compare as run  # noqa: PLC0415
         else:

@@ -16,6 +16,7 @@ NEAR = 0.2  # world units along the optical axis; Gaussians whose centre is near
 BLUR = 0.3  # px^2, added to both variances of the projected Gaussian (low-pass)
 OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline the projection "ellipsoid" takes
 OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard deviations reach the plane of the camera
+COMPENSATION_MIN = 2.5e-5  # floor of the share of its area that antialiasing leaves a Gaussian, squared
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
 
@@ -224,6 +225,15 @@ class ConvertConfig:
 
     source: str = argument("the file to read")
     target: str = argument("the file to write; its ending says in which format")
+
+
+@dataclass
+class ExportHtmlConfig:
+    """A model as a page that shows it."""
+
+    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
+    page: str = argument("the page to write, *.html")
+    max_gaussians: int = flag(0, "keep only so many, by opacity and size; 0: all that can be seen")
 
 
 @dataclass

@@ -13,8 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.reading import Unexpected, reading
 
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
@@ -130,14 +134,53 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
 
 
 def _camera_entry(index: int, view: View) -> dict[str, object]:
-    camera = view.original
+    return {"id": index, "img_name": view.name, **camera_entry(view.original)}
+
+
+def camera_entry(camera: Camera) -> dict[str, object]:
+    """A camera as ``cameras.json`` has it, with the principal point, which the reference's lacks."""
     return {
-        "id": index,
-        "img_name": view.name,
         "width": camera.width,
         "height": camera.height,
         "position": camera.center.tolist(),
         "rotation": camera.rotation.T.tolist(),
         "fy": camera.fy,
         "fx": camera.fx,
+        "cx": camera.cx,
+        "cy": camera.cy,
     }
+
+
+def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
+    """The names and cameras of ``cameras.json``, none if there is no such file.
+
+    Where the file has no principal point, as the reference's, it is the middle of the image.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    path = Path(folder) / "cameras.json"
+    if not path.exists():
+        return []
+    with reading(path, "a list of cameras as training writes it"):
+        try:
+            entries = json.loads(path.read_text(encoding="utf-8"))
+        except RecursionError as error:
+            raise Unexpected("lists in lists without end") from error
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise Unexpected("other JSON")
+        try:
+            return [(str(entry["img_name"]), _camera(entry)) for entry in entries]
+        except KeyError as error:
+            raise Unexpected(f"a camera without {error}") from error
+        except (TypeError, ValueError, InputError) as error:
+            raise Unexpected(f"a camera with other values ({error!s:.200})") from error
+
+
+def _camera(entry: dict) -> Camera:
+    rotation = np.array(entry["rotation"], np.float64).T
+    position = np.array(entry["position"], np.float64)
+    middle = {"cx": 0.5 * entry["width"], "cy": 0.5 * entry["height"]}
+    numbers = {name: entry.get(name, middle.get(name)) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    with np.errstate(invalid="ignore"):  # what is not finite, the camera refuses
+        return Camera(**numbers, rotation=rotation, translation=-rotation @ position)

@@ -19,7 +19,7 @@ to 6.
 
 import warp as wp
 
-from warp_splat.config import BLUR, NEAR, OUTLINE, OUTLINE_REACH
+from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR, OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.blend import reach_of
 from warp_splat.kernels.build import DIFFERENTIABLE
 from warp_splat.kernels.harmonics import evaluate_sh
@@ -29,7 +29,6 @@ wp.set_module_options(DIFFERENTIABLE)
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
 INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
-COMPENSATION_MIN = wp.constant(2.5e-5)  # floor of det / det with blur, as in the reference
 
 
 @wp.struct

@@ -1,0 +1,27 @@
+// A parallelogram around the ellipse where a 2D Gaussian reaches ALPHA_MIN: a square in the coordinates of its root.
+// Four vertices each, not an instance: software renderers take a millisecond for fifty of these.
+uniform highp usampler2D order; // which Gaussian, nearest first
+uniform highp usampler2D meanAndRoot, rootAndColor; // of project.glsl
+uniform vec2 size; // px
+flat out vec2 mean;
+flat out vec3 root;
+flat out vec4 color; // and opacity
+
+ivec2 placeOf(int index) {
+  return ivec2(index % WIDTH, index / WIDTH);
+}
+
+void main() {
+  ivec2 place = placeOf(int(texelFetch(order, placeOf(gl_VertexID / 4), 0).x));
+  uvec4 first = texelFetch(meanAndRoot, place, 0), second = texelFetch(rootAndColor, place, 0);
+  mean = uintBitsToFloat(first.xy);
+  root = uintBitsToFloat(uvec3(first.zw, second.x));
+  color = vec4(unpackHalf2x16(second.y), unpackHalf2x16(second.z).x, uintBitsToFloat(second.w));
+  gl_Position = vec4(2, 2, 2, 1); // outside
+  if (color.a < ALPHA_MIN) return;
+  float reach = sqrt(max(log2(color.a / ALPHA_MIN), 1e-6));
+  vec2 corner = reach * (2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) - 1.0);
+  float dy = corner.y / root.z;
+  float dx = (corner.x - root.y * dy) / root.x;
+  gl_Position = vec4(2.0 * (mean + vec2(dx, dy)) / size - 1.0, 0, 1);
+}

@@ -1,0 +1,177 @@
+// Draws the Gaussians in three passes: project each to 2D, blend them front to back, resolve the image to the canvas.
+
+const source = (name) => document.getElementById(name).textContent;
+
+const LEAST_DETAIL = 0.2;
+
+class Renderer {
+  constructor(canvas, scene, packed) {
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
+    if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks or has switched off.");
+    this.gl = gl;
+    this.count = scene.count;
+    this.width = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));
+    this.rows = Math.max(1, Math.ceil(scene.count / this.width));
+    const rows = Math.max(1, Math.ceil((scene.count * scene.stride) / this.width));
+    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+      throw new Error(`${scene.count} Gaussians are more than this graphics card takes; export fewer.`);
+    }
+    this.gaussians = this.texture(gl.RGBA32UI, this.width, rows);
+    const texels = new Uint32Array(4 * this.width * rows);
+    texels.set(new Uint32Array(packed.buffer));
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.width, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, texels);
+    this.projected = [0, 1].map(() => this.texture(gl.RGBA32UI, this.width, this.rows));
+    this.projectTarget = this.framebuffer(this.projected);
+    this.programs = {
+      project: this.program("screen.glsl", "project.glsl"),
+      blend: this.program("outline.glsl", "blend.glsl"),
+      resolve: this.program("screen.glsl", "resolve.glsl"),
+    };
+    this.order = this.texture(gl.R32UI, this.width, this.rows);
+    this.visible = 0;
+    const corners = new Uint32Array(6 * scene.count); // two triangles of each four vertices
+    for (let i = 0; i < corners.length; i++) corners[i] = 4 * Math.floor(i / 6) + [0, 1, 2, 1, 3, 2][i % 6];
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    [this.detail, this.frameTime, this.fence] = [1, 0, null];
+    // blended in float32 where the card can (software renderers need half the time of float16), in float16, which costs
+    // 4 dB, or in the last resort in 8 bits, which costs 20
+    this.imageFormat = gl.getExtension("EXT_color_buffer_float")
+      ? gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F
+      : gl.getExtension("EXT_color_buffer_half_float") ? gl.RGBA16F : gl.RGBA8;
+  }
+
+  texture(format, width, height) {
+    const { gl } = this, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+    return texture;
+  }
+
+  framebuffer(textures) {
+    const { gl } = this, framebuffer = gl.createFramebuffer();
+    const points = textures.map((_, index) => gl.COLOR_ATTACHMENT0 + index);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    textures.forEach((texture, index) => {
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, points[index], gl.TEXTURE_2D, texture, 0);
+    });
+    gl.drawBuffers(points);
+    return framebuffer;
+  }
+
+  program(...names) {
+    const { gl } = this, handle = gl.createProgram();
+    names.forEach((name, index) => {
+      const shader = gl.createShader(index ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER);
+      const head = `#version 300 es\nprecision highp float;\nprecision highp int;\nconst int WIDTH = ${this.width};\n`;
+      gl.shaderSource(shader, head + source("constants.glsl") + source(name));
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`${name}: ${gl.getShaderInfoLog(shader)}`);
+      gl.attachShader(handle, shader);
+    });
+    gl.linkProgram(handle);
+    if (!gl.getProgramParameter(handle, gl.LINK_STATUS)) throw new Error(`${names}: ${gl.getProgramInfoLog(handle)}`);
+    return { handle, at: (name) => gl.getUniformLocation(handle, name) };
+  }
+
+  // A target for images of this size; the old one is dropped.
+  resize(width, height) {
+    const { gl } = this;
+    gl.deleteTexture(this.image);
+    gl.deleteFramebuffer(this.blendTarget);
+    this.image = this.texture(this.imageFormat, width, height);
+    this.blendTarget = this.framebuffer([this.image]);
+    this.size = [width, height];
+  }
+
+  // The Gaussians to draw, nearest first: the first `visible` of `order`, which fills rows of the texture.
+  setOrder(order, visible) {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D, this.order);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.width, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    this.visible = visible;
+  }
+
+  // Draws what `camera` sees; its size is that of the canvas times `detail`.
+  draw(camera, detail) {
+    const size = [camera.width, camera.height];
+    if (this.size?.[0] !== this.gl.canvas.width || this.size?.[1] !== this.gl.canvas.height) {
+      this.resize(this.gl.canvas.width, this.gl.canvas.height);
+    }
+    this.project(camera, size);
+    this.blend(size);
+    this.resolve(detail);
+    this.detail = detail;
+    this.started = performance.now();
+    this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.gl.flush();
+  }
+
+  // Whether the last frame is done; then `frameTime` says how long it took.
+  get ready() {
+    const { gl } = this;
+    if (!this.fence) return true;
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost()) return false;
+    this.frameTime = performance.now() - this.started;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    return true;
+  }
+
+  // The detail at which a frame should take as long, judged by the last one [ms].
+  detailFor(milliseconds) {
+    const factor = Math.sqrt(milliseconds / Math.max(1, this.frameTime));
+    return Math.min(1, Math.max(LEAST_DETAIL, this.detail * Math.min(1.1, factor)));
+  }
+
+  project(camera, size) {
+    const { gl } = this, { handle, at } = this.programs.project;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.projectTarget);
+    gl.viewport(0, 0, this.width, this.rows);
+    gl.disable(gl.BLEND);
+    gl.useProgram(handle);
+    this.bind([this.gaussians], handle, ["gaussians"]);
+    gl.uniform1i(at("count"), this.count);
+    gl.uniformMatrix3fv(at("rotation"), false, camera.rotation.flat());
+    gl.uniform3fv(at("center"), camera.position);
+    gl.uniform2f(at("focal"), camera.fx, camera.fy);
+    gl.uniform2f(at("principal"), camera.cx, camera.cy);
+    gl.uniform2fv(at("size"), size);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  blend(size) {
+    const { gl } = this, { handle, at } = this.programs.blend;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
+    gl.viewport(0, 0, ...size);
+    gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 1]);
+    gl.enable(gl.BLEND);
+    gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
+    gl.useProgram(handle);
+    this.bind([this.order, ...this.projected], handle, ["order", "meanAndRoot", "rootAndColor"]);
+    gl.uniform2fv(at("size"), size);
+    gl.drawElements(gl.TRIANGLES, 6 * this.visible, gl.UNSIGNED_INT, 0);
+  }
+
+  resolve(detail) {
+    const { gl } = this, { handle, at } = this.programs.resolve;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, ...this.size);
+    gl.disable(gl.BLEND);
+    gl.useProgram(handle);
+    this.bind([this.image], handle, ["image"]);
+    gl.uniform2fv(at("size"), this.size);
+    gl.uniform1f(at("detail"), detail);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  bind(textures, program, names) {
+    const { gl } = this;
+    textures.forEach((texture, unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.uniform1i(gl.getUniformLocation(program, names[unit]), unit);
+    });
+  }
+}

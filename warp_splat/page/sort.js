@@ -1,0 +1,43 @@
+// Runs in a worker. Sorts the Gaussians by depth, nearest first: a counting sort by 16 bits of the depth's float32
+// number, which for positive numbers grows as they do and divides each factor of two alike.
+"use strict";
+let means, depths, bits, near, room;
+const starts = new Uint32Array(1 << 16);
+
+function sort([x, y, z], [fx, fy, fz]) {
+  const count = depths.length;
+  let least = Infinity, most = 0, seen = 0;
+  for (let i = 0; i < count; i++) {
+    depths[i] = (means[3 * i] - x) * fx + (means[3 * i + 1] - y) * fy + (means[3 * i + 2] - z) * fz;
+    const depth = depths[i];
+    if (depth > near) {
+      seen++;
+      if (depth < least) least = depth;
+      if (depth > most) most = depth;
+    }
+  }
+  const [low, high] = new Uint32Array(new Float32Array([least, most]).buffer);
+  const shift = Math.max(0, 16 - Math.clz32(high - low));
+  starts.fill(0);
+  for (let i = 0; i < count; i++) if (depths[i] > near) starts[(bits[i] - low) >>> shift]++;
+  for (let key = 0, sum = 0; key < starts.length; key++) {
+    const size = starts[key];
+    starts[key] = sum;
+    sum += size;
+  }
+  const order = new Uint32Array(room);
+  for (let i = 0; i < count; i++) if (depths[i] > near) order[starts[(bits[i] - low) >>> shift]++] = i;
+  return [order, seen];
+}
+
+onmessage = ({ data }) => {
+  if (data.means) {
+    ({ means, near, room } = data);
+    depths = new Float32Array(means.length / 3);
+    bits = new Uint32Array(depths.buffer);
+    return;
+  }
+  const start = performance.now();
+  const [order, visible] = sort(data.position, data.forward);
+  postMessage({ order, visible, version: data.version, milliseconds: performance.now() - start }, [order.buffer]);
+};
