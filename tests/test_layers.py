@@ -13,7 +13,7 @@ LAYERS = [
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify", "forecast"},
     {"trainer", "selftest", "report", "evaluate", "gradcheck", "differences"},
-    {"run", "train", "render", "convert", "sfm", "doctor"},
+    {"run", "train", "render", "convert", "sfm", "doctor", "viewer"},
     {"compare"},
     {"cli", "__init__", "__main__"},
 ]

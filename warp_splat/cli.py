@@ -20,15 +20,17 @@ from warp_splat.config import (
     RenderConfig,
     SfmConfig,
     TrainConfig,
+    ViewConfig,
 )
 from warp_splat.errors import InputError
 
-Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | CompareConfig
+Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ViewConfig | ConvertConfig | CompareConfig
 COMMANDS = {
     "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
     "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model, or an orbit around it"),
+    "view": (ViewConfig, "look at a trained model in a browser"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
     "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
 }
@@ -125,6 +127,8 @@ def main(arguments: list[str] | None = None) -> int:
             from warp_splat.sfm.run import sfm as run  # noqa: PLC0415
         elif isinstance(config, InspectConfig):
             from warp_splat.doctor.run import inspect as run  # noqa: PLC0415
+        elif isinstance(config, ViewConfig):
+            from warp_splat.viewer.run import view as run  # noqa: PLC0415
         elif isinstance(config, ConvertConfig):
             from warp_splat.convert import convert as run  # noqa: PLC0415
         elif isinstance(config, CompareConfig):

@@ -18,6 +18,9 @@ OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard devi
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
 
+PORT = 8080  # of the viewer
+PORT_HELP = "of the viewer; if it is busy, the next free one"
+
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
 
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
@@ -92,6 +95,8 @@ class TrainConfig:
     quiet: bool = flag(False, "print only the summary")
     preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
     profile: int = flag(0, "time the stages of the last N iterations, as a table and a plot")
+    viewer: bool = flag(False, "show the training in a browser, with pause and continue")
+    port: int = flag(PORT, PORT_HELP)
 
     iterations: int = flag(
         30_000,
@@ -202,6 +207,18 @@ class RenderConfig:
 
 
 @dataclass
+class ViewConfig:
+    """A model to look at in a browser."""
+
+    model: str = argument("folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
+    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
+    iteration: int = flag(-1, "which saved model; -1: the last")
+    port: int = flag(PORT, PORT_HELP)
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores")
+
+
+@dataclass
 class SfmConfig:
     """From photographs to a scene: structure from motion."""
 
@@ -263,9 +280,8 @@ FOREIGN_FLAGS = {
     "--position_lr_delay_mult": "the delay of the means' rate has no effect in the reference and is left out",
     "--convert_SHs_python": "colors are always computed by the kernels",
     "--compute_cov3D_python": "covariances are always computed by the kernels",
-    "--ip": "there is no network viewer",
-    "--port": "there is no network viewer",
-    "--disable_viewer": "there is no network viewer",
+    "--ip": "the viewer (--viewer) is served to this machine only",
+    "--disable_viewer": "there is no viewer unless --viewer asks for it",
     "--debug": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
     "--debug_from": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
     "--detect_anomaly": "gradients that are not finite are always dropped and counted",
@@ -289,6 +305,8 @@ def check_train(config: TrainConfig) -> str | None:
     for name, low in at_least.items():
         if getattr(config, name) < low:
             return f"--{name}: expected at least {low}, got {getattr(config, name)}."
+    if not 1 <= config.port <= 65535:
+        return f"--port: expected 1 to 65535, got {config.port}."
     if not 0 <= config.seed < 2**63:
         return f"--seed: expected 0 to 2^63 - 1, got {config.seed}."
     for item in fields(config):
