@@ -60,13 +60,19 @@ class TrainingViewer:
                 self.viewer.wait(IDLE)
 
     @launch.profile(False)
+    def show_end(self) -> None:
+        """Show the model as it was saved; evaluating it takes a while."""
+        self._button.disabled = True
+        self._tell()
+        self.viewer.refresh()
+        while self.viewer.draw():
+            pass
+
+    @launch.profile(False)
     def linger(self, interrupted: list[int]) -> None:
         """After the training, stay until the last browser has left, or Ctrl-C."""
         if self.viewer.deserted:
             return
-        self._bar.value, self._button.disabled = 100.0, True
-        self._tell()
-        self.viewer.refresh()
         print(f"The viewer stays at {self.viewer.address} until its page is closed, or Ctrl-C.", flush=True)
         while not interrupted and not self.viewer.deserted:
             if not self._draw():
