@@ -13,7 +13,7 @@ LAYERS = [
     {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify", "forecast", "perceptual", "ways"},
     {"trainer", "selftest", "report", "evaluate", "events", "gradcheck", "differences"},
-    {"run", "train", "render", "convert", "page", "sfm", "doctor"},
+    {"run", "train", "render", "convert", "page", "sfm", "doctor", "viewer"},
     {"compare"},
     {"cli", "__init__", "__main__"},
 ]

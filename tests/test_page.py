@@ -26,8 +26,9 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.metrics import psnr
 from warp_splat.page.export import make_page
 from warp_splat.page.pack import pack, shown
-from warp_splat.render import make_picture, orbit_cameras
+from warp_splat.render import make_picture
 from warp_splat.scene.types import View
+from warp_splat.ways import orbit_cameras
 
 EVIL = "</script><script>window.evil = 1</script><img src=x onerror='window.evil = 1'>\u2028.jpg"
 OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "BACKGROUND": 0.0}

@@ -18,17 +18,28 @@ from warp_splat.config import (
     RenderConfig,
     SfmConfig,
     TrainConfig,
+    ViewConfig,
 )
 from warp_splat.errors import InputError
 from warp_splat.flags import FOREIGN_FLAGS
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
-Config = SfmConfig | InspectConfig | TrainConfig | RenderConfig | ConvertConfig | ExportHtmlConfig | CompareConfig
+Config = (
+    SfmConfig
+    | InspectConfig
+    | TrainConfig
+    | RenderConfig
+    | ViewConfig
+    | ConvertConfig
+    | ExportHtmlConfig
+    | CompareConfig
+)
 COMMANDS = {
     "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
     "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
     "train": (TrainConfig, "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "render the views of a trained model with their metrics, or a video"),
+    "view": (ViewConfig, "look at a trained model in a browser"),
     "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
     "export-html": (ExportHtmlConfig, "write a page that shows a model in any browser, without a server or a network"),
     "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
@@ -140,6 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
             from warp_splat.sfm.run import sfm as run  # noqa: PLC0415
         elif isinstance(config, InspectConfig):
             from warp_splat.doctor.run import inspect as run  # noqa: PLC0415
+        elif isinstance(config, ViewConfig):
+            from warp_splat.viewer.run import view as run  # noqa: PLC0415
         elif isinstance(config, ConvertConfig):
             from warp_splat.convert import convert as run  # noqa: PLC0415
         elif isinstance(config, ExportHtmlConfig):

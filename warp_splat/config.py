@@ -20,6 +20,9 @@ COMPENSATION_MIN = 2.5e-5  # floor of the share of its area that antialiasing le
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
 
+PORT = 8080  # of the viewer
+PORT_HELP = "of the viewer; if it is busy, the next free one"
+
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
 
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
@@ -137,6 +140,8 @@ class TrainConfig:
     )
     lpips_weights: str = reporting("", LPIPS_HELP)
     tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
+    viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
+    port: int = reporting(PORT, PORT_HELP)
     profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot")
 
     device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
@@ -190,6 +195,18 @@ class RenderConfig:
 
     device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = machinery(0, "CPU threads; 0: all cores (results do not depend on it)")
+
+
+@dataclass
+class ViewConfig:
+    """A model to look at in a browser."""
+
+    model: str = argument("folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
+    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
+    iteration: int = flag(-1, "which saved model; -1: the last")
+    port: int = flag(PORT, PORT_HELP)
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores")
 
 
 @dataclass
@@ -267,6 +284,8 @@ def check_train(config: TrainConfig) -> str | None:
     for name, low in at_least.items():
         if getattr(config, name) < low:
             return f"--{name}: expected at least {low}, got {getattr(config, name)}."
+    if not 1 <= config.port <= 65535:
+        return f"--port: expected 1 to 65535, got {config.port}."
     if not 0 <= config.seed < 2**63:
         return f"--seed: expected 0 to 2^63 - 1, got {config.seed}."
     for item in fields(config):

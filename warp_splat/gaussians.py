@@ -27,7 +27,10 @@ class GaussianModel:
     NAMES = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
 
     def __init__(self, parameters: dict[str, torch.Tensor]):
-        self.parameters = {name: parameters[name].detach().clone().requires_grad_() for name in self.NAMES}
+        dense = torch.contiguous_format  # of no Gaussians, too, for which arrays have strides of their own
+        self.parameters = {
+            name: parameters[name].detach().clone(memory_format=dense).requires_grad_() for name in self.NAMES
+        }
 
     def __len__(self) -> int:
         return len(self.parameters["means"])

@@ -45,12 +45,11 @@ def render(config: RenderConfig) -> int:
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     folder, iteration, gaussians, trained = _open(config)
     model = GaussianModel.from_splats(gaussians.splats)
-    scene = _load(config, trained, say) if _needs_scene(config) else None
+    scene = None
+    if _needs_scene(config):
+        scene = load_trained_scene(config.model_path, config.source_path, trained, say)
     linear = scene.linear if scene else bool(trained.get("linear_light"))
-    options = RasterOptions(
-        antialiasing=bool(trained.get("antialiasing")),
-        projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
-    )
+    options = options_of(trained)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = make_picture(model.to(device), bool(trained.get("white_background")), options, linear)
@@ -116,22 +115,60 @@ def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
     if not config.model_path:
         raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
     path = Path(config.model_path)
-    if path.is_dir() or path.suffix.lower() not in FORMATS:
-        iteration = model_folder.find_iteration(path, config.iteration)
-        trained = model_folder.read_cfg_args(path) if (path / "cfg_args").exists() or not config.orbit else {}
-        return path, iteration, load_gaussians(model_folder.ply_path(path, iteration)), trained
-    if not config.source_path and _needs_scene(config):
+    if is_file_of_gaussians(path) and not config.source_path and _needs_scene(config):
         raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
-    gaussians = load_gaussians(path)
-    return Path(f"{path}.renders"), 0, gaussians, {"eval": True, "antialiasing": gaussians.antialiased}
+    iteration, gaussians, trained = open_model(path, config.iteration)
+    if not trained and not config.orbit:
+        model_folder.read_cfg_args(path)  # says what is missing
+    return Path(f"{path}.renders") if is_file_of_gaussians(path) else path, iteration, gaussians, trained
 
 
-def _load(config: RenderConfig, trained: dict, say) -> Scene:
-    source, resolution = config.source_path or str(trained.get("source_path", "")), trained.get("resolution", -1)
+def is_file_of_gaussians(path: Path) -> bool:
+    """Whether this names a file of Gaussians, not the folder of a model."""
+    return not path.is_dir() and path.suffix.lower() in FORMATS
+
+
+def open_model(path: Path, iteration: int = -1) -> tuple[int, SplatFile, dict]:
+    """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
+
+    Of a file, the iteration is 0 and the options are those that it tells; of a folder without cfg_args there are none.
+
+    Raises:
+        InputError: if there is no such model, or it cannot be read.
+    """
+    if is_file_of_gaussians(path):
+        gaussians = load_gaussians(path)
+        return 0, gaussians, {"eval": True, "antialiasing": gaussians.antialiased}
+    iteration = model_folder.find_iteration(path, iteration)
+    trained = model_folder.read_cfg_args(path) if (path / "cfg_args").exists() else {}
+    return iteration, load_gaussians(model_folder.ply_path(path, iteration)), trained
+
+
+def options_of(trained: dict) -> RasterOptions:
+    """How a model is rendered that was trained with these options."""
+    return RasterOptions(
+        antialiasing=bool(trained.get("antialiasing")),
+        projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
+    )
+
+
+def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Callable[[str], object]) -> Scene:
+    """The scene that a model was trained on, as it was loaded then.
+
+    Args:
+        model_path: the model, for messages.
+        source_path: where the scene is now; empty: where it was.
+        trained: options of the training.
+        say: receives what there is to say.
+
+    Raises:
+        InputError: as :func:`load_scene`.
+    """
+    resolution = trained.get("resolution", -1)
     if not isinstance(resolution, int):
-        raise InputError(f"{config.model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
+        raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
     return load_scene(
-        source,
+        source_path or str(trained.get("source_path", "")),
         images=str(trained.get("images", "images")),
         resolution=resolution,
         white_background=bool(trained.get("white_background")),

@@ -6,8 +6,10 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -32,6 +34,9 @@ from warp_splat.scene.types import Scene
 from warp_splat.selftest import settle_device
 from warp_splat.trainer import Trainer
 
+if TYPE_CHECKING:
+    from warp_splat.viewer.training import TrainingViewer
+
 EVALUATIONS = 20  # over the run, besides --test_iterations
 PROGRESS_VIEWS = 8  # at most, in the evaluations while training
 PREVIEW_SECONDS = 5.0
@@ -48,6 +53,8 @@ def train(config: TrainConfig) -> int:
     if problem:
         raise InputError(problem)
     with join(config.device) as processes:
+        if config.viewer and processes.count > 1:
+            raise InputError("--viewer: expected one process, since others would wait for it; leave it out.")
         return _train(config, processes)
 
 
@@ -123,9 +130,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
 def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
     """Train, save, and tell; returns the process's exit code."""
     processes, end = trainer.processes, trainer.config.iterations
-    with interruptible() as interrupted:
+    with interruptible() as interrupted, _watched(trainer, run) as viewer:
         try:
-            _loop(trainer, run, interrupted)
+            _loop(trainer, run, interrupted, viewer)
         except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
             tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
             return 1
@@ -137,6 +144,15 @@ def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
     if processes.rank == 0:
         finish(trainer, run, say)
     return 130 if run.iteration < end else 0
+
+
+def _watched(trainer: Trainer, run: Run) -> AbstractContextManager[TrainingViewer | None]:
+    """The viewer, if one is asked for."""
+    if not trainer.config.viewer:
+        return nullcontext()
+    from warp_splat.viewer.training import watched  # noqa: PLC0415 - viser takes half a second to load
+
+    return watched(trainer, run)
 
 
 def _choose_folder(config: TrainConfig, checkpoint: Checkpoint | None) -> Path:
@@ -187,7 +203,7 @@ def _memory_explained(trainer: Trainer):
     return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
 
 
-def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
+def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
     config, processes = trainer.config, trainer.processes
     checks = {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
     whole_checks = {*config.test_iterations, config.iterations}
@@ -230,6 +246,8 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int]) -> None:
             bar.update(processes.count)
             if stop:
                 break
+            if viewer:
+                viewer.between_steps(interrupted)
     run.dropped = trainer.quarantine.read(processes)
     steps = -(-(run.iteration - profiled) // processes.count)
     if config.profile and steps > 0:

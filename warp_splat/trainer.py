@@ -24,7 +24,7 @@ from warp_splat.launch import stage
 from warp_splat.losses import image_loss
 from warp_splat.metrics import psnr
 from warp_splat.optimizer import Optimizer
-from warp_splat.renderer import render
+from warp_splat.renderer import RenderOutput, render
 from warp_splat.scene.types import Scene, View
 
 LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
@@ -261,16 +261,20 @@ class Trainer:
             kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
         return kept if kept.device.type == self.device.type else kept.pin_memory()
 
-    def _render(self, camera: Camera, background: torch.Tensor):
-        options = replace(self.options, sh_degree=self.degree)
+    def _render(self, camera: Camera, background: torch.Tensor, depth: bool = False) -> RenderOutput:
+        options = replace(self.options, sh_degree=self.degree, depth=depth)
         with stage("project"):
             gaussians = self.model.activated(self.degree)
         return render(gaussians, camera, background, options, self.config.adjoint)
 
+    def look(self, camera: Camera, depth: bool = False) -> RenderOutput:
+        """The present model seen by ``camera``, without gradients; nothing of the training changes."""
+        with torch.no_grad():
+            return self._render(camera, self.background, depth)
+
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""
-        with torch.no_grad():
-            return to_bytes(self._render(camera, self.background).image, self.scene.linear)
+        return to_bytes(self.look(camera).image, self.scene.linear)
 
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""

@@ -1,0 +1,111 @@
+"""From the camera of a browser to ours, and from a photograph's camera to the browser's window."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warp_splat.camera import Camera
+from warp_splat.errors import InputError
+
+SAME_ANGLE = 0.002  # rad; closer to a photograph's camera than this, and this share of the distance to what one looks
+SAME_PLACE = 0.002  # at, counts as being there: a pixel of an image that is 500 px wide
+USUAL_WINDOW = (16, 9)
+VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
+
+
+class Look(NamedTuple):
+    """A place to look from, in world coordinates, as a browser's controls want it."""
+
+    position: np.ndarray  # [3]
+    target: np.ndarray  # [3], what they orbit
+    up: np.ndarray  # [3], unit length
+    fov: float  # vertical field of view, rad
+
+
+class Box(NamedTuple):
+    """A rectangle of pixels in a window."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def browser_camera(wxyz, position, fov: float, width: int, height: int) -> Camera:
+    """The camera of a browser's window: square pixels, the principal point in the middle.
+
+    Args:
+        wxyz: quaternion, camera to world, in the axes that both sides share (x right, y down, z forward).
+        position: the camera's centre, [3], world.
+        fov: vertical field of view, rad.
+        width: of the window, px.
+        height: of the window, px.
+
+    Raises:
+        InputError: if that is no camera: a window without pixels, a value that is not finite.
+    """
+    wxyz, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
+    if not (0 < fov < np.pi and np.isfinite([*wxyz, *position]).all() and np.linalg.norm(wxyz) > 0):
+        raise InputError(f"camera of the browser: expected a pose and an angle, got {wxyz}, {position} and {fov}.")
+    rotation = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix().T
+    focal = 0.5 * height / np.tan(0.5 * fov)
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ position)
+
+
+def sized(camera: Camera, pixels: float) -> Camera:
+    """The same view with at most ``pixels`` of them, and no more than it has."""
+    shrink = min(1.0, (pixels / (camera.width * camera.height)) ** 0.5)
+    return camera.resized(max(int(camera.width * shrink), 1), max(int(camera.height * shrink), 1))
+
+
+def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
+    """A photograph's camera for a window of ``width`` x ``height`` px, and where the photograph lies in it.
+
+    The photograph is as large as fits, in the middle; around it the camera sees on.
+    """
+    scale = min(width / camera.width, height / camera.height)
+    inner = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
+    left, top = (width - inner.width) // 2, (height - inner.height) // 2
+    wide = replace(inner, width=width, height=height, cx=inner.cx + left, cy=inner.cy + top)
+    return wide, Box(left, top, inner.width, inner.height)
+
+
+def is_at(camera: Camera, other: Camera, distance: float) -> bool:
+    """Whether ``camera`` stands where ``other`` does, as far as one sees; ``distance`` is that to the subject."""
+    cosine = 0.5 * (np.trace(camera.rotation @ other.rotation.T) - 1.0)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return bool(angle < SAME_ANGLE and np.linalg.norm(camera.center - other.center) < SAME_PLACE * max(distance, 1e-12))
+
+
+def fitting_fov(camera: Camera, width: int, height: int) -> float:
+    """The vertical field of view, rad, with which a window shows all that a photograph's camera saw."""
+    return 2.0 * float(np.arctan(0.5 * height / framed(camera, width, height)[0].fy))
+
+
+def pivot(camera: Camera, subject: np.ndarray) -> np.ndarray:
+    """What to orbit from a photograph's camera, [3]: on its axis, as far as ``subject`` is; before it in any case."""
+    apart = float(np.linalg.norm(subject - camera.center))
+    ahead = float((subject - camera.center) @ camera.forward)
+    return camera.center + (ahead if ahead > 0.1 * apart > 0 else max(apart, 1.0)) * camera.forward
+
+
+def look_from(camera: Camera, subject: np.ndarray, up: np.ndarray) -> Look:
+    """Where a photograph's camera stood, upright; in a window of unknown shape."""
+    return Look(camera.center, pivot(camera, subject), up, fitting_fov(camera, *USUAL_WINDOW))
+
+
+def look_at_all(means: np.ndarray) -> Look:
+    """How to stand before Gaussians of which no camera is known: most of them in view, world y pointing down.
+
+    Args:
+        means: [N, 3]; none or wherever they are.
+    """
+    target, reach = np.zeros(3), 1.0
+    if len(means):
+        low, middle, high = np.percentile(means.astype(np.float64), [10, 50, 90], axis=0)
+        target, reach = middle, max(float(np.linalg.norm(high - low)), 1e-3)
+    return Look(target + np.array([0.0, -0.3, -1.4]) * reach, target, np.array([0.0, -1.0, 0.0]), VIEW_ANGLE)

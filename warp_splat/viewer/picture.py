@@ -1,0 +1,92 @@
+"""What a frame shows: colors, depth or opacity, and a photograph over them."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from warp_splat.color import to_srgb
+from warp_splat.config import NEAR
+from warp_splat.renderer import RenderOutput
+from warp_splat.trainer import to_bytes
+from warp_splat.viewer.camera import Box
+
+KINDS = ("image", "depth", "alpha")
+DEPTH_SHARES = (0.02, 0.98)  # of the pixels; what is nearer or farther has the color of the ends
+SAMPLES = 20_000  # pixels from which these are taken
+
+
+def paint(out: RenderOutput, kind: str) -> tuple[np.ndarray, str]:
+    """One of KINDS as [H, W, 3] uint8, and a word on it: the range of the depths."""
+    if kind == "alpha":
+        return to_bytes(out.alpha[..., None].expand(-1, -1, 3)), ""
+    if kind == "depth":
+        near, far = depth_range(out.depth, out.alpha)
+        return to_bytes(depth_colors(out.depth, out.alpha, near, far)), f"depth {near:.3g} (red) to {far:.3g} (blue)"
+    return to_bytes(out.image), ""
+
+
+def on_screen(out: RenderOutput, linear: bool) -> RenderOutput:
+    """The colors as a screen shows them; ``linear``: they are in linear light."""
+    return replace(out, image=to_srgb(out.image.clamp(0.0, 1.0), torch.where)) if linear else out
+
+
+def depth_range(depth: torch.Tensor, alpha: torch.Tensor) -> tuple[float, float]:
+    """Nearest and farthest depth that get colors of their own; those of DEPTH_SHARES of the pixels.
+
+    Args:
+        depth: [H, W] world units.
+        alpha: [H, W]; pixels that are mostly empty do not count.
+    """
+    step = max(1, depth.numel() // SAMPLES)
+    seen = depth.flatten()[::step][alpha.flatten()[::step] > 0.5]
+    if not len(seen):
+        return NEAR, 1.0
+    low, high = torch.quantile(seen, torch.tensor(DEPTH_SHARES, device=depth.device)).tolist()
+    return max(low, NEAR), max(high, NEAR, low * (1 + 1e-3))
+
+
+def depth_colors(depth: torch.Tensor, alpha: torch.Tensor, near: float, far: float) -> torch.Tensor:
+    """Depths as colors, [H, W, 3] in 0..1: red is near, blue is far, even steps in 1 / depth; black where it is empty.
+
+    Args:
+        depth: [H, W] world units.
+        alpha: [H, W].
+        near: depth of the first color, positive.
+        far: of the last, positive.
+    """
+    farthest, reach = 1.0 / far, max(1.0 / near - 1.0 / far, 1e-6)
+    place = ((1.0 / depth.clamp_min(NEAR) - farthest) / reach).clamp(0.0, 1.0)
+    table = torch.from_numpy(_turbo()).to(depth.device)
+    return table[(place * (len(table) - 1)).round().long()] * alpha[..., None]
+
+
+@functools.cache
+def _turbo() -> np.ndarray:
+    """The color map "turbo" (Mikhailov 2019) from blue to red, [256, 3] float32."""
+    import matplotlib  # noqa: PLC0415 - takes a while, and most look at the image
+
+    return matplotlib.colormaps["turbo"](np.arange(256))[:, :3].astype(np.float32)
+
+
+def overlay(frame: np.ndarray, photograph: np.ndarray, box: Box, opacity: float) -> np.ndarray:
+    """``frame`` [H, W, 3] uint8 with ``photograph`` [h, w, 3] uint8, scaled to ``box``, over it.
+
+    Args:
+        frame: the picture below.
+        photograph: any size.
+        box: where it lies; inside of the frame.
+        opacity: of the photograph, 0..1.
+    """
+    planes = torch.from_numpy(photograph).permute(2, 0, 1)[None].float()
+    if planes.shape[2:] != (box.height, box.width):
+        planes = functional.interpolate(planes, (box.height, box.width), mode="bilinear", antialias=True)
+    scaled = planes[0].permute(1, 2, 0).numpy()
+    result = frame.copy()
+    inside = result[box.top : box.top + box.height, box.left : box.left + box.width]
+    inside[:] = np.rint((1.0 - opacity) * inside + opacity * scaled)
+    return result

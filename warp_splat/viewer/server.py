@@ -1,0 +1,190 @@
+"""The server of the page, by viser: its controls, and the frames that they ask for.
+
+Viser answers browsers in threads of its own. They only note that something changed; every frame is drawn by the one
+thread that calls :meth:`Viewer.draw`, because launches of kernels are not to be made from two. (What is async runs in
+viser's event loop, in order: a browser must not leave before it has entered.)
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.config import TILE
+from warp_splat.errors import InputError
+from warp_splat.renderer import RenderOutput
+from warp_splat.scene.types import Scene, View
+from warp_splat.viewer.camera import look_at_all, look_from
+from warp_splat.viewer.pace import MOST
+from warp_splat.viewer.picture import KINDS, overlay, paint
+from warp_splat.viewer.watcher import Watcher
+from warp_splat.ways import focus_point
+
+if TYPE_CHECKING:
+    import viser
+
+HOST = "127.0.0.1"  # only this machine; from another, through ssh -L
+PORTS = 100  # that are tried, from the one asked for
+DESERTED = 10.0  # seconds after the last browser has left; one that loads the page again takes less
+MOVING_QUALITY, SHARP_QUALITY = 75, 95  # of JPEG
+
+Draw = Callable[[Camera, bool], RenderOutput]
+
+
+class Viewer:
+    """Serves the page, and draws what its browsers ask for.
+
+    Args:
+        draw: renders a camera, with or without depth.
+        means: where the Gaussians are at present, [N, 3].
+        scene: its photographs can be jumped to; None if there are none.
+        port: where to serve; if it is busy, the next free one.
+
+    Raises:
+        InputError: if no port is free.
+    """
+
+    def __init__(self, draw: Draw, means: Callable[[], torch.Tensor], scene: Scene | None, port: int):
+        self.draw_camera, self.means = draw, means
+        self.views: dict[str, View] = {}
+        if scene:
+            self.views = {view.name: view for view in (*scene.train, *scene.test)}
+            self.subject, up, _ = focus_point(scene)
+            look = look_from(scene.train[0].camera, self.subject, up)
+        else:
+            look = look_at_all(means().detach().cpu().numpy())
+            self.subject = look.target
+        self.watchers: dict[int, Watcher] = {}
+        self.left_at = -DESERTED  # when the last browser did, on time.monotonic
+        self._woken = threading.Event()
+        self._warm_up()
+        self.server = _serve(free_port(port))
+        served = self.server.get_port()
+        self.address = f"http://{HOST}:{served}"
+        self.announcement = f"Viewer at {self.address}" + f" (port {port} is taken)" * (served != port)
+        self.gui = self.server.gui
+        self.gui.configure_theme(show_share_button=False)  # a click on it would show the page to the internet
+        self._facts = self.gui.add_markdown(self._describe())
+        self.server.scene.set_up_direction(look.up)
+        start = self.server.initial_camera
+        start.position, start.look_at, start.up, start.fov = look
+        self.server.on_client_connect(self._enter)
+        self.server.on_client_disconnect(self._leave)
+
+    def _warm_up(self) -> None:
+        """Compile and load the kernels of every kind of frame, so that no frame waits for them."""
+        camera = Camera(TILE, TILE, TILE, TILE, 0.5 * TILE, 0.5 * TILE, np.eye(3), np.zeros(3))
+        for kind in KINDS:
+            paint(self.draw_camera(camera, kind == "depth"), kind)
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.server.stop()
+
+    @property
+    def deserted(self) -> bool:
+        """Whether nobody has been looking for DESERTED seconds."""
+        return not self.watchers and time.monotonic() - self.left_at >= DESERTED
+
+    def _describe(self) -> str:
+        return f"{len(self.means()):,} Gaussians"
+
+    async def _enter(self, client: viser.ClientHandle) -> None:
+        self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.wake)
+
+    async def _leave(self, client: viser.ClientHandle) -> None:
+        self.watchers.pop(client.client_id, None)
+        self.left_at = time.monotonic()
+        self.wake()
+
+    def wake(self) -> None:
+        """End :meth:`wait`."""
+        self._woken.set()
+
+    def wait(self, seconds: float) -> None:
+        """Wait until something changes, at most ``seconds``."""
+        self._woken.wait(seconds)
+        self._woken.clear()
+
+    def refresh(self) -> None:
+        """The Gaussians have changed: draw again what was drawn at rest."""
+        self._facts.content = self._describe()
+        for watcher in self._present():
+            watcher.sharp = False
+
+    @property
+    def moving(self) -> bool:
+        """Whether somebody moves, or waits for the frame that a movement asked for."""
+        return any(watcher.moving or watcher.changed for watcher in self._present())
+
+    def draw(self) -> bool:
+        """Draw the frame that has waited longest and send it; whether there was one."""
+        for watcher in sorted(self._present(), key=lambda watcher: watcher.drawn_at):
+            moving = watcher.moving
+            if watcher.changed or not (moving or watcher.sharp):
+                self._draw(watcher, moving)
+                return True
+        return False
+
+    def _present(self) -> list[Watcher]:
+        return list(self.watchers.values())  # in one step, since viser's threads add and remove
+
+    def _draw(self, watcher: Watcher, moving: bool) -> None:
+        start = time.perf_counter()
+        watcher.changed, watcher.sharp, watcher.drawn_at = False, not moving, time.monotonic()
+        try:
+            camera, view, box = watcher.camera(watcher.pace.pixels if moving else MOST)
+        except InputError:  # a window that was folded up; it will send another camera when it opens
+            return
+        kind = watcher.kind.value
+        frame, note = paint(self.draw_camera(camera, kind == "depth"), kind)
+        if view is not None and watcher.opacity.value > 0:
+            frame = overlay(frame, view.picture, box, watcher.opacity.value)
+        if watcher.client.client_id not in self.watchers:
+            return
+        quality = MOVING_QUALITY if moving else SHARP_QUALITY
+        watcher.client.scene.set_background_image(frame, format="jpeg", jpeg_quality=quality)
+        watcher.client.flush()
+        seconds = time.perf_counter() - start
+        if moving:
+            watcher.pace.took(seconds, camera.width * camera.height)
+        else:
+            size = f"{camera.width} x {camera.height} px in {1e3 * seconds:.0f} ms"
+            watcher.note.content = "  \n".join([size, *filter(None, [note])])
+
+
+def free_port(port: int) -> int:
+    """The first free port from ``port`` on. Raises InputError if there is none among PORTS, or no such port."""
+    if not 1 <= port <= 65535:
+        raise InputError(f"--port: expected 1 to 65535, got {port}.")
+    for number in range(port, min(port + PORTS, 65536)):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+            try:
+                probe.bind((HOST, number))
+                return number
+            except OSError as error:
+                if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                    raise
+    raise InputError(f"--port {port}: expected a free port, but it and those after it are taken; choose another.")
+
+
+def _serve(port: int) -> viser.ViserServer:
+    """A server without its own messages."""
+    import rich  # noqa: PLC0415 - of viser, which takes half a second to load
+    import viser  # noqa: PLC0415
+
+    rich.get_console().quiet = True
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a browser that left a moment ago
+    return viser.ViserServer(host=HOST, port=port, label="warp_splat", verbose=False)
