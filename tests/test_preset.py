@@ -44,13 +44,13 @@ def test_images_grow_to_their_full_size(scene):
     shrinks = []
     for iteration in range(1, 12):
         camera, photograph = trainer._at_size(view, iteration)
-        assert photograph.shape == (camera.height, camera.width, 3)
+        assert photograph.image.shape == (camera.height, camera.width, 3)
         assert (camera.fx / camera.width, camera.cy / camera.height) == pytest.approx(
             (view.camera.fx / view.camera.width, view.camera.cy / view.camera.height)
         )
         shrinks.append(view.camera.width // camera.width)
     assert shrinks == [4] * 4 + [2] * 5 + [1] * 2
-    assert camera is view.camera and np.array_equal(photograph.numpy(), view.image)
+    assert camera is view.camera and np.array_equal(photograph.image.numpy(), view.image)
 
 
 def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):
@@ -58,14 +58,16 @@ def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):
     camera = scene.train[0].camera.resized(48, 40)
     _, photograph = Trainer(scene, TrainConfig(device="cpu", coarse=4))._at_size(View("a", camera, image, camera), 1)
     means = image.reshape(10, 4, 12, 4, 3).mean((1, 3))
-    assert np.abs(photograph.numpy() - means).max() <= 0.5 + 1e-3
+    assert np.abs(photograph.image.numpy() - means).max() <= 0.5 + 1e-3
 
 
 def test_a_coarse_step_trains_on_a_coarse_image(scene):
     trainer = Trainer(scene, TrainConfig(device="cpu", coarse=4, coarse_until_iter=100))
     trainer.differentiate(1)
     assert trainer._photographs and all(
-        photograph.shape[0] == view.image.shape[0] // 4 for view, photograph in trainer._photographs.items()
+        photograph.image.shape[0] == view.image.shape[0] // 4 for view, photograph in trainer._photographs.items()
     )
     trainer.differentiate(60)
-    assert all(photograph.shape[0] == view.image.shape[0] // 2 for view, photograph in trainer._photographs.items())
+    assert all(
+        photograph.image.shape[0] == view.image.shape[0] // 2 for view, photograph in trainer._photographs.items()
+    )
