@@ -28,7 +28,7 @@ from warp_splat.viewer.run import make_draw
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 WIDTH, HEIGHT = 1000, 600
 pytestmark = pytest.mark.slow  # half a minute each where WebGL runs in software
-PATIENCE = 300.0  # seconds; a machine may be busy
+PATIENCE = 120.0  # seconds; a machine may be busy
 #: The picture without viser's panel, its warning that WebGL runs in software, and its axes.
 CLEAR = np.ones((HEIGHT, WIDTH), bool)
 CLEAR[:, -340:] = CLEAR[:170, :320] = CLEAR[-80:, :80] = False

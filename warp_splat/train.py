@@ -130,19 +130,24 @@ def _train(config: TrainConfig, processes: Processes) -> int:
 def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
     """Train, save, and tell; returns the process's exit code."""
     processes, end = trainer.processes, trainer.config.iterations
-    with interruptible() as interrupted, _watched(trainer, run) as viewer:
-        try:
-            _loop(trainer, run, interrupted, viewer)
-        except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
-            tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
-            return 1
-        finally:  # whatever happened, the model comes first
-            if processes.rank == 0 or processes.lost:
-                print(f"Model after {run.iteration} iterations: {save_model(trainer, run)}")
-            if run.kept is not None and run.iteration < end:
-                print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
-    if processes.rank == 0:
-        finish(trainer, run, say)
+    with _watched(trainer, run) as viewer:
+        with interruptible() as interrupted:
+            try:
+                _loop(trainer, run, interrupted, viewer)
+            except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
+                tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
+                return 1
+            finally:  # whatever happened, the model comes first
+                if processes.rank == 0 or processes.lost:
+                    print(f"Model after {run.iteration} iterations: {save_model(trainer, run)}")
+                if run.kept is not None and run.iteration < end:
+                    print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
+        if viewer:
+            viewer.show_end()
+        if processes.rank == 0:
+            finish(trainer, run, say)
+        if viewer and run.iteration == end:
+            viewer.linger()
     return 130 if run.iteration < end else 0
 
 

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from warp_splat import launch
 from warp_splat.camera import Camera
+from warp_splat.interrupts import interruptible
 from warp_splat.renderer import RenderOutput
 from warp_splat.run import Run
 from warp_splat.trainer import Trainer
@@ -72,14 +73,15 @@ class TrainingViewer:
             pass
 
     @launch.profile(False)
-    def linger(self, interrupted: list[int]) -> None:
+    def linger(self) -> None:
         """After the training, stay until the last browser has left, or Ctrl-C."""
         if self.viewer.deserted:
             return
         print(f"The viewer stays at {self.viewer.address} until its page is closed, or Ctrl-C.", flush=True)
-        while not interrupted and not self.viewer.deserted:
-            if not self._draw():
-                self.viewer.wait(IDLE)
+        with interruptible() as interrupted:
+            while not interrupted and not self.viewer.deserted:
+                if not self._draw():
+                    self.viewer.wait(IDLE)
 
     def _draw(self) -> bool:
         resting, start = not self.viewer.moving, time.monotonic()
