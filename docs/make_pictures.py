@@ -9,9 +9,11 @@ import re
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import renderer_pictures
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
@@ -97,7 +99,13 @@ def _save(picture: np.ndarray, name: str) -> Path:
     return IMAGES / name
 
 
-PICTURES = {"sheet": sheet, "videos": videos, "page": page, "viewer": viewer}
+PICTURES = {
+    "sheet": sheet,
+    "videos": videos,
+    "page": page,
+    "viewer": viewer,
+    "renderer": partial(renderer_pictures.draw, images=IMAGES),
+}
 
 
 if __name__ == "__main__":

@@ -172,6 +172,15 @@ def test_rate_of_the_means_decays_exponentially():
         assert optimizer.adam.param_groups[0]["lr"] == pytest.approx(rate * EXTENT)
 
 
+def test_all_rates_fall_to_a_tenth_in_the_end():
+    _, optimizer, _ = setup(2, iterations=100, cooldown=20, position_lr_init=1e-2, position_lr_final=1e-2)
+    optimizer.set_iteration(0)
+    start = [group["lr"] for group in optimizer.adam.param_groups]
+    for iteration, share in ((80, 1.0), (90, 0.1**0.5), (100, 0.1)):
+        optimizer.set_iteration(iteration)
+        assert [group["lr"] for group in optimizer.adam.param_groups] == pytest.approx([share * lr for lr in start])
+
+
 def test_sparse_adam_moves_only_what_was_drawn():
     """Against the formula in float64: no bias correction, rows out of view keep value and moments."""
     model, optimizer, _ = setup(4, optimizer_type="sparse_adam")

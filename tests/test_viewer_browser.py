@@ -1,18 +1,15 @@
 """The viewer in a real browser (see browser.py): what it shows, what its controls do, and how it ends."""
 
 import re
-import signal
 import socket
-import subprocess
-import sys
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from browser import browser_page
+from serving import PATIENCE, end, served
 from torch.nn import functional
 
 from warp_splat.camera import Camera
@@ -28,37 +25,9 @@ from warp_splat.viewer.run import make_draw
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 WIDTH, HEIGHT = 1000, 600
 pytestmark = pytest.mark.slow  # half a minute each where WebGL runs in software
-PATIENCE = 120.0  # seconds; a machine may be busy
 #: The picture without viser's panel, its warning that WebGL runs in software, and its axes.
 CLEAR = np.ones((HEIGHT, WIDTH), bool)
 CLEAR[:, -340:] = CLEAR[:170, :320] = CLEAR[-80:, :80] = False
-
-
-@contextmanager
-def served(*arguments):
-    """A command of ours with a viewer, once that is up: the process, its address, what it printed so far."""
-    command = [sys.executable, "-m", "warp_splat", *map(str, arguments)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    process = subprocess.Popen(command, cwd=SCENE.parents[1], **pipes)
-    try:
-        said = ""
-        for line in process.stdout:
-            said += line
-            if found := re.search(r"Viewer at (http://127.0.0.1:\d+)", line):
-                yield process, found[1], said
-                return
-        raise AssertionError(said)
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def end(process):
-    """Ctrl-C; the exit code, and what else was said."""
-    process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=PATIENCE)[0]
-    assert "Traceback" not in said
-    return process.returncode, said
 
 
 def eventually(condition):

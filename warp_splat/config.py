@@ -110,6 +110,7 @@ class TrainConfig:
     opacity_lr: float = learning(0.025, "rate of the opacity logits")
     scaling_lr: float = learning(0.005, "rate of the log scales")
     rotation_lr: float = learning(0.001, "rate of the quaternions")
+    cooldown: int = learning(0, "over so many steps at the end, all rates fall to a tenth")
     sh_interval: int = learning(1000, "steps between two rises of the active SH degree")
     optimizer_type: str = learning(
         "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
@@ -130,9 +131,7 @@ class TrainConfig:
         0, "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does"
     )
 
-    test_iterations: list[int] = reporting(
-        [7_000, 30_000], "evaluate after these steps, besides 20 times in all", many=int
-    )
+    test_iterations: list[int] = reporting([7_000, 30_000], "evaluate after these steps, and 20 times in all", many=int)
     save_iterations: list[int] = reporting([7_000, 30_000], "save the model after these steps, and the last", many=int)
     checkpoint_iterations: list[int] = reporting([], "keep a checkpoint of these steps, besides the last one", many=int)
     checkpoint_interval: float = reporting(
@@ -280,6 +279,7 @@ def check_train(config: TrainConfig) -> str | None:
         "opacity_reset_interval": 1,
         "sh_interval": 1,
         "coarse_until_iter": 1,
+        "cooldown": 0,
     }
     for name, low in at_least.items():
         if getattr(config, name) < low:

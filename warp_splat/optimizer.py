@@ -34,29 +34,34 @@ class Optimizer:
     """
 
     def __init__(self, model: GaussianModel, config: TrainConfig, extent: float, batch: int = 1):
+        self.model, self.config, self.extent, self.scale = model, config, extent, math.sqrt(batch)
+        self.batch = batch
+        names = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
+        groups = [{"name": name, "params": [model.parameters[name]]} for name in names]
+        betas = (BETAS[0] ** batch, BETAS[1] ** batch)
+        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale, fused=True)
+        self._groups = {group["name"]: group for group in self.adam.param_groups}
+        self.set_iteration(0)
+
+    def set_iteration(self, iteration: int) -> None:
+        """Set the rates for this step: the means' fall log-linearly from init to final over position_lr_max_steps.
+
+        In the last ``cooldown`` steps all fall to a tenth as well, which settles what constant rates keep in motion.
+        """
+        config = self.config
+        share = min(iteration / config.position_lr_max_steps, 1.0)
+        rate = math.exp((1 - share) * math.log(config.position_lr_init) + share * math.log(config.position_lr_final))
         rates = {
-            "means": config.position_lr_init * extent,
+            "means": rate * self.extent,
             "sh_dc": config.feature_lr,
             "sh_rest": config.feature_lr / 20.0,
             "opacities": config.opacity_lr,
             "scales": config.scaling_lr,
             "quats": config.rotation_lr,
         }
-        self.model, self.config, self.extent, self.scale = model, config, extent, math.sqrt(batch)
-        self.batch = batch
-        groups = [
-            {"name": name, "params": [model.parameters[name]], "lr": rate * self.scale} for name, rate in rates.items()
-        ]
-        betas = (BETAS[0] ** batch, BETAS[1] ** batch)
-        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale, fused=True)
-        self._groups = {group["name"]: group for group in self.adam.param_groups}
-
-    def set_iteration(self, iteration: int) -> None:
-        """Set the rate of the means for this step: log-linear from init to final over position_lr_max_steps."""
-        config = self.config
-        share = min(iteration / config.position_lr_max_steps, 1.0)
-        rate = math.exp((1 - share) * math.log(config.position_lr_init) + share * math.log(config.position_lr_final))
-        self._groups["means"]["lr"] = rate * self.extent * self.scale
+        late = max(iteration - config.iterations + config.cooldown, 0) / max(config.cooldown, 1)
+        for name, rate in rates.items():
+            self._groups[name]["lr"] = rate * self.scale * 0.1**late
 
     def step(self, radii: torch.Tensor) -> None:
         """Update from the gradients and clear them; ``radii`` [N] int32 tells what the image showed (0: not)."""

@@ -1,0 +1,79 @@
+"""What pages repeat, from where it stands: ``python docs/make_pages.py``.
+
+docs/flags.md from the configurations; between ``<!-- NAME -->`` and ``<!-- end -->`` what benchmarks/NAME.py wrote.
+"""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from warp_splat.cli import COMMANDS
+from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
+
+DOCS = Path(__file__).parent
+TABLED = [DOCS.parent / "README.md", DOCS / "performance.md"]
+TABLE = re.compile(r"<!-- (\w+) -->\n.*?<!-- end -->", re.DOTALL)
+INTRODUCTION = """# Every flag
+
+`python docs/make_pages.py` wrote this page. `--help` of each command says the same; flags that are on or off have a
+`--no-` form. `train.py` is `warp-splat train`, `render.py` is `warp-splat render`, `python -m warp_splat.compare` is
+`warp-splat compare`.
+"""
+PRESET_TEXT = """
+## What presets change
+`--preset fast`, and what training the embedded scene (without `-s`) starts from. A flag that is given goes before.
+"""
+
+
+def filled(text: str) -> str:
+    """A page with its tables as the benchmarks wrote them."""
+
+    def table(found: re.Match) -> str:
+        return f"<!-- {found[1]} -->\n{(DOCS / 'benchmarks' / f'{found[1]}.md').read_text().strip()}\n<!-- end -->"
+
+    return TABLE.sub(table, text)
+
+
+def flags() -> str:
+    """The page of flags."""
+    parts = [INTRODUCTION]
+    for name, (config_type, help) in COMMANDS.items():
+        parts.append(f"\n## warp-splat {name}\n{help[0].upper()}{help[1:]}.\n")
+        defaults, heading = config_type(), None
+        for item in fields(config_type):
+            what = item.metadata["help"].replace("|", "\\|")
+            if item.metadata["positional"]:
+                parts.append(f"\n`{item.name.upper()}`: {what}.\n")
+                continue
+            if item.metadata["group"] != heading:
+                heading = item.metadata["group"]
+                title = f"{heading[0].upper()}{heading[1:]}" if heading else "Flag"
+                parts.append(f"\n| {title} | default | |\n| --- | --- | --- |\n")
+            names = ", ".join(f"`{flag}`" for flag in (f"--{item.name}", *item.metadata["names"]))
+            choices = [str(choice) for choice in item.metadata["choices"] or () if choice != ""]
+            note = f" ({', '.join(choices)})" if choices else ""
+            parts.append(f"| {names} | {_shown(getattr(defaults, item.name))} | {what}{note} |\n")
+    parts.append(PRESET_TEXT)
+    columns = {"fast": PRESETS["fast"], "embedded": EMBEDDED_DEFAULTS[""]}
+    columns["embedded, fast"] = {**EMBEDDED_DEFAULTS[""], **PRESETS["fast"], **EMBEDDED_DEFAULTS["fast"]}
+    changed = list(dict.fromkeys(name for values in columns.values() for name in values))
+    parts.append("\n| flag | default | " + " | ".join(columns) + " |\n" + "| --- " * (2 + len(columns)) + "|\n")
+    train = COMMANDS["train"][0]()
+    for name in changed:
+        cells = [_shown(values.get(name, "")) for values in columns.values()]
+        parts.append(f"| `--{name}` | {_shown(getattr(train, name))} | {' | '.join(cells)} |\n")
+    return "".join(parts)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    return str(value)
+
+
+if __name__ == "__main__":
+    (DOCS / "flags.md").write_text(flags())
+    for page in TABLED:
+        page.write_text(filled(page.read_text()))

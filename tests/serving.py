@@ -1,0 +1,37 @@
+"""A command of ours that serves a viewer, and how it ends."""
+
+import re
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+PATIENCE = 300.0  # seconds; a machine may be busy
+
+
+@contextmanager
+def served(*arguments, cwd=Path(__file__).parents[1]):
+    """A command with a viewer, once that is up: the process, its address, what it printed so far."""
+    command = [sys.executable, "-m", "warp_splat", *map(str, arguments)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, cwd=cwd, **pipes)
+    try:
+        said = ""
+        for line in process.stdout:
+            said += line
+            if found := re.search(r"Viewer at (http://127.0.0.1:\d+)", line):
+                yield process, found[1], said
+                return
+        raise AssertionError(said)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def end(process):
+    """Ctrl-C; the exit code, and what else was said."""
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=PATIENCE)[0]
+    assert "Traceback" not in said
+    return process.returncode, said

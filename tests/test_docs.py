@@ -1,0 +1,218 @@
+"""The documentation holds: its links, flags and tables, and every command and piece of code in it."""
+
+import functools
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import textwrap
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import room
+import torch
+from serving import end, served
+
+import warp_splat
+from warp_splat.cli import COMMANDS, main
+from warp_splat.gaussians import GaussianModel
+from warp_splat.scene import load_scene
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+SCENE = ROOT / "assets" / "still_life"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+USERS = [page for page in PAGES if page.name != "CONTRIBUTING.md"]  # whose commands are tried; the others run for long
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+STEPS = "40"  # instead of thousands
+PHOTOGRAPHS = 6
+
+sys.path.insert(0, str(DOCS))
+import make_pages  # noqa: E402
+
+
+def name_of(page):
+    return page.name
+
+
+def blocks(page):
+    """(language, text) of each fenced block."""
+    return BLOCK.findall(page.read_text())
+
+
+def prose(page):
+    return BLOCK.sub("", page.read_text())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)]+)\)", prose(page)):
+        if target.startswith("http"):
+            continue
+        path, _, anchor = target.partition("#")
+        found = page.parent / path if path else page
+        assert found.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", found.read_text(), re.MULTILINE)
+            assert anchor in [re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings], target
+
+
+def test_every_picture_is_shown():
+    text = "".join(page.read_text() for page in PAGES)
+    assert not [path for path in (DOCS / "images").iterdir() if f"images/{path.name}" not in text]
+
+
+def test_the_list_of_flags_is_that_of_the_program():
+    assert (DOCS / "flags.md").read_text() == make_pages.flags(), "python docs/make_pages.py"
+
+
+@pytest.mark.parametrize("page", [page for page in USERS if page.name != "flags.md"], ids=name_of)
+def test_flags_exist(page):
+    known = {f"--{item.name}" for config_type, _ in COMMANDS.values() for item in fields(config_type)}
+    foreign = {"--help", "--version", "--no", "--nproc-per-node", "--logdir"}  # torchrun's and TensorBoard's
+    code = " ".join(re.findall(r"`([^`\n]+)`", prose(page)) + [text for kind, text in blocks(page) if not kind])
+    used = {flag for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code) if not flag.startswith("--no-")}
+    assert used <= known | foreign | benchmark_flags()
+
+
+@functools.cache
+def benchmark_flags():
+    scripts = [*(ROOT / "benchmarks").glob("*.py"), *DOCS.glob("*.py")]
+    return {flag for script in scripts for flag in re.findall(r'add_argument\([^)]*"(--\w+)"', script.read_text())}
+
+
+def test_tables_are_those_that_benchmarks_wrote():
+    for page in make_pages.TABLED:
+        assert "<!-- end -->" in page.read_text() and page.read_text() == make_pages.filled(page.read_text()), page
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with what the pages presume: a scene, a trained model, a file of Gaussians, a configuration."""
+    folder = tmp_path_factory.mktemp("user")
+    model = folder / "output" / "abc123"
+    assert main(["train", "-m", str(model), "-r", "8", "--iterations", STEPS, "--quiet"]) == 0
+    assert (
+        main(["convert", str(model / f"point_cloud/iteration_{STEPS}/point_cloud.ply"), str(folder / "vase.spz")]) == 0
+    )
+    (folder / "mine.toml").write_text(f"iterations = {STEPS}\nresolution = 8\n")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", USERS, ids=name_of)
+def test_commands(page, folder, monkeypatch):
+    """Each in its order, with few steps; what waits for a browser is ended by Ctrl-C."""
+    lines = [line for language, text in blocks(page) if not language for line in text.splitlines()]
+    makes_scene = any("warp-splat sfm" in line for line in lines)
+    if lines and makes_scene:
+        room.write_photos(folder / "path/to/photos", PHOTOGRAPHS)
+        shutil.rmtree(folder / "path/to/scene", ignore_errors=True)
+        shutil.rmtree(folder / "output" / "mine", ignore_errors=True)
+    elif not (folder / "path/to/scene").exists():
+        shutil.copytree(SCENE, folder / "path/to/scene")
+    monkeypatch.chdir(folder)
+    for line in lines:
+        run(line.removeprefix("pip install uv && "), folder)
+
+
+def run(line, folder):
+    words = shlex.split(line.replace("iteration_4500", f"iteration_{STEPS}"), comments=True)
+    assert words[:2] == ["uv", "run"], line
+    program, *arguments = words[2:]
+    if program == "pytest":  # this
+        return
+    arguments = {"train.py": ["train"], "render.py": ["render"], "warp-splat": []}[program] + arguments
+    if arguments[0] == "train":
+        arguments += ["--iterations", STEPS] + ["-r", "8"] * ("-r" not in arguments)
+    if "--tensorboard" in arguments:
+        pytest.importorskip("tensorboardX")
+    if "--video" in arguments:
+        arguments += ["--frames", "4"]
+    if arguments[0] == "view" or "--viewer" in arguments:
+        with served(*arguments, cwd=folder) as (process, _, _):
+            assert end(process)[0] == (0 if arguments[0] == "view" else 130), line
+    else:
+        assert main(arguments) == 0, line
+
+
+def names_of_an_example():
+    """What pieces of code presume: a few Gaussians, a camera, a photograph."""
+    scene = load_scene(SCENE, resolution=8, report=lambda line: None)
+    model = GaussianModel.from_points(scene.points[::8], scene.colors[::8], 0)
+    means, quats, scales, opacities, sh, _ = (tensor.detach() for tensor in model.activated())
+    view = scene.train[0]
+    photo = torch.from_numpy(view.image) / 255
+    inputs = {"means": means, "quats": quats, "scales": 0.5 * scales, "opacities": 5 * opacities, "sh": sh}
+    inputs = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    return {"warp_splat": warp_splat, "torch": torch, "camera": view.camera, "photo": photo, **inputs}
+
+
+@pytest.mark.parametrize("page", [page for page in USERS if "```python" in page.read_text()], ids=name_of)
+def test_code(page):
+    names = names_of_an_example()
+    for language, text in blocks(page):
+        if language == "diff":  # from here on, see below
+            break
+        if language == "python":
+            exec(text, names)
+    assert all(names[name].grad.isfinite().all() for name in ("means", "quats", "scales", "opacities", "sh"))
+
+
+#: After each change of docs/extending.md and the code that follows it: is it the renderer that it says?
+EVIDENCE = (
+    """
+    out = warp_splat.rasterize(means, quats, scales, opacities, sh, flat)
+    turned = means.detach().double() @ torch.tensor(flat.rotation).T + torch.tensor(flat.translation)
+    wanted = turned[:, :2] * torch.tensor([flat.fx, flat.fy]) + torch.tensor([flat.cx, flat.cy])
+    seen = out.radii > 0
+    assert seen.sum() > 100 and torch.allclose(out.means2d[seen].double(), wanted[seen], atol=1e-3)
+    assert warp_splat.check_gradients(means, quats, scales, opacities, sh, flat).ok
+    """,
+    """
+    one = [tensor[:1].detach() for tensor in (means, quats, scales, opacities, sh)]
+    out = warp_splat.rasterize(*one, camera)
+    (x, y), (a, b, c), opacity = out.means2d[0], out.conics[0], out.opacities2d[0]
+    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5 - y, torch.arange(camera.width) + 0.5 - x, indexing="ij")
+    alpha = opacity / (1 + 0.5 * (a * u * u + 2 * b * u * v + c * v * v))
+    wanted = torch.where(alpha < 1 / 255, 0, alpha.clamp(max=0.99))
+    assert (wanted > 0).sum() > 20 and (out.alpha - wanted).abs().max() < 1e-5
+    report = warp_splat.check_gradients(means, quats, scales, opacities, sh, camera, adjoint="stepwise")
+    assert report.ok
+    assert not warp_splat.check_gradients(means, quats, scales, opacities, sh, camera).ok
+    """,
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [0, 1])
+def test_changed_kernels(place, tmp_path):
+    """The changes that docs/extending.md proposes, each made to a copy of the package."""
+    found = blocks(DOCS / "extending.md")
+    changes = [index for index, (language, _) in enumerate(found) if language == "diff"]
+    assert len(changes) == len(EVIDENCE)
+    shutil.copytree(ROOT / "warp_splat", tmp_path / "warp_splat", ignore=shutil.ignore_patterns("__pycache__"))
+    change(tmp_path, found[changes[place]][1])
+    code = ["import sys", f"sys.path.insert(1, {str(ROOT / 'tests')!r})", "import test_docs"]
+    code += ["globals().update(test_docs.names_of_an_example())", "assert warp_splat.__file__.startswith(sys.path[0])"]
+    code += [found[changes[place] + 1][1], textwrap.dedent(EVIDENCE[place])]
+    (tmp_path / "example.py").write_text("\n".join(code))
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "nothing is off" in done.stdout
+
+
+def change(folder, text):
+    """Replace, in the files that the text names, the lines of each hunk by others."""
+    for part in text.split("--- ")[1:]:
+        name, *hunks = part.split("@@\n")
+        path = folder / name.strip()
+        content = path.read_text()
+        for hunk in hunks:
+            lines = hunk.splitlines(keepends=True)
+            old, new = ("".join(line[1:] for line in lines if line[0] in signs) for signs in (" -", " +"))
+            assert content.count(old) == 1, old
+            content = content.replace(old, new)
+        path.write_text(content)
