@@ -31,7 +31,7 @@ from warp_splat.scene.images import read_rgb
 from warp_splat.trainer import Trainer
 
 SYNTHETIC = (200_000, 980, 545)
-ROUNDS, STEPS = 5, 2
+ROUNDS, STEPS = 15, 2
 GEOMETRY = ("means", "quats", "scales")
 HEADERS = ("left out", "with it ms", "without ms", "saved", "what changes")
 

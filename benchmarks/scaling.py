@@ -176,11 +176,9 @@ def stage_exponents(found: dict[str, list[dict]]) -> list[tuple]:
     """Of each stage against what it follows: over the sweep, and between its last two points."""
     rows = []
     for stage, along in FOLLOWS.items():
-        points = found[VARIES[along]]
-        over = [
-            exponent(part, along, lambda point, stage=stage: point["stages"][stage]) for part in (points, points[-2:])
-        ]
-        rows.append((stage, along, f"{points[-1]['stages'][stage]:.1f}", *(f"{slope:.2f}" for slope in over)))
+        points = [{**point, **point["stages"]} for point in found[VARIES[along]]]
+        over = [exponent(part, along, stage) for part in (points, points[-2:])]
+        rows.append((stage, along, f"{points[-1][stage]:.1f}", *(f"{slope:.2f}" for slope in over)))
     return rows
 
 
