@@ -192,10 +192,11 @@ def plot(path: Path, found: dict[str, list[dict]]) -> None:
         for row, (key, name, color) in enumerate((("ms", "ms per step", BLUE), ("added", "MiB per step", ORANGE))):
             panel = axes[row][column]
             y = [point[key] for point in points]
-            plain_axes(panel, f"{name} over {title}: exponent {exponent(points, sweep, key):.2f}")
+            plain_axes(panel, f"{name}: exponent {exponent(points, sweep, key):.2f}")
+            panel.set_xlabel(title, fontsize=9)
             panel.set_xscale("log")
             panel.set_yscale("log")
-            panel.set_ylim(min(y) / 2, max(y) * 2)
+            panel.set_ylim(10 ** math.floor(math.log10(min(y))), 10 ** math.ceil(math.log10(max(y))))
             panel.yaxis.set_minor_formatter("")
             panel.plot(x, y, color=color, marker="o", markersize=4, linewidth=1.8)
             if key == "added":
