@@ -14,6 +14,7 @@ import numpy as np
 
 from warp_splat import config as constants
 from warp_splat.camera import Camera
+from warp_splat.color import TOE
 from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
@@ -48,6 +49,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     options = {
         "ANTIALIASED": antialiased,
         "ELLIPSOID": trained.get("projection") == "ellipsoid",
+        "LINEAR": bool(trained.get("linear_light")),
         "BACKGROUND": float(bool(trained.get("white_background"))),
     }
     page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
@@ -94,7 +96,8 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         name: its title.
         splats: finite Gaussians.
         cameras: names and cameras, at least one; the first is where the page starts.
-        options: how to render: ANTIALIASED and ELLIPSOID (bool), BACKGROUND (float: 0.0 black, 1.0 white).
+        options: how to render: ANTIALIASED, ELLIPSOID, LINEAR (bool; the last: colors are in linear light), BACKGROUND
+            (float: 0.0 black, 1.0 white).
 
     Raises:
         InputError: if there are more Gaussians than browsers take.
@@ -141,8 +144,6 @@ def _constants(options: dict[str, object]) -> str:
     names = ("ALPHA_MIN", "ALPHA_MAX", "NEAR", "BLUR", "COMPENSATION_MIN", "FRUSTUM_MARGIN", "OUTLINE", "OUTLINE_REACH")
     values = {name: getattr(constants, name) for name in names}
     values |= {name: getattr(harmonics, name) for name in HARMONICS}
-    values |= {
-        f"{name}_STEPS": float(getattr(pack, f"{name}_STEPS")) for name in ("LOG", "ROTATION", "COLOR", "HARMONIC")
-    }
-    values |= {"LOG2_E": float(blend.LOG2_E), **options}
+    values |= {name: float(getattr(pack, name)) for name in STEPS}
+    values |= {"LOG2_E": float(blend.LOG2_E), "TOE": TOE, **options}
     return "\n".join(f"const {type(value).__name__} {name} = {str(value).lower()};" for name, value in values.items())
