@@ -69,12 +69,11 @@ def load_scene(
     from warp_splat.scene.images import load_views  # noqa: PLC0415  keeps `import warp_splat` light
     from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
 
-    file = None
+    file, drawn = None, not (start or len(points))
     if start:
         file, points, colors = load_start(start, report)
-    elif not len(points):
+    elif drawn:
         points, colors = random_points([photo.camera for photo in train])
-        report(f"Warning: {source} has no points to start from; taking {len(points)} random ones, which trains worse.")
     require_visible(train, points, start or source)
     views = load_views(train + test, resolution, white_background, invert_masks)
     train_views, test_views = views[: len(train)], views[len(train) :]
@@ -83,7 +82,7 @@ def load_scene(
     if views[0].linear and not start:
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
     _require_one_kind(train_views + test_views, source)
-    return Scene(train_views, test_views, points, colors, file)
+    return Scene(train_views, test_views, points, colors, file, drawn)
 
 
 def _drop_masked(views: list[View], source: str | Path, report: Callable[[str], object]) -> list[View]:
