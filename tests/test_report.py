@@ -86,7 +86,7 @@ def test_plot_training_draws_what_was_recorded(tmp_path, history):
         report.plot_training(tmp_path / f"{split}.png", history, split)
         pictures.append(load_png(tmp_path / f"{split}.png"))
     assert pictures[0].shape == pictures[1].shape == (500, 1600, 3)
-    assert (pictures[0] != pictures[1]).any() == any("psnr" in record for record in history)  # its panel names the split
+    assert (pictures[0] != pictures[1]).any() == any("psnr" in record for record in history)  # which it names
 
 
 def test_plot_profile(tmp_path):

@@ -5,19 +5,23 @@ import itertools
 import socket
 import sys
 import time
+from contextlib import contextmanager, nullcontext
 from types import ModuleType, SimpleNamespace
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
+from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
+from warp_splat.color import to_srgb
 from warp_splat.config import NEAR, TrainConfig, ViewConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.splats import SplatArrays
+from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.run import Run
 from warp_splat.scene.types import Scene, View
@@ -517,6 +521,27 @@ def test_pause_ends(fake_viser, monkeypatch, happens):
 def test_what_cannot_be_viewed(config, message):
     with pytest.raises(InputError, match=message):
         view(config)
+
+
+@pytest.mark.parametrize("source", ["", "scene"])
+def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, source):
+    """A file does not say what light it was trained in; its scene does."""
+    root = write_colmap(tmp_path / "scene", ["a.exr", "b.exr"], np.full((32, 48, 3), 0.2, np.float32))
+    save_gaussians(tmp_path / "a.ply", SplatFile(some_gaussians(50)))
+    draws = []
+
+    @contextmanager
+    def served(draw, *_):
+        draws.append(draw)
+        yield SimpleNamespace(announcement="")
+
+    monkeypatch.setattr("warp_splat.viewer.run.Viewer", served)
+    monkeypatch.setattr("warp_splat.viewer.run.interruptible", lambda: nullcontext([2]))
+    assert view(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
+    draws.append(make_draw(GaussianModel.from_splats(some_gaussians(50)), {}))
+    drawn, plain = (draw(PHOTO, False).image for draw in draws)
+    assert plain.std() > 0.1
+    torch.testing.assert_close(drawn, to_srgb(plain.clamp(0, 1), torch.where) if source else plain)
 
 
 def test_flags_of_training(capsys):
