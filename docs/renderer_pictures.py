@@ -16,7 +16,7 @@ from warp_splat.renderer import Dropped, Project, camera_view, rasterize
 from warp_splat.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
 
 OUTLINES = 1500  # ellipses that are drawn
-FEW = 8  # entries of a list
+FEW = 60  # entries of a list
 
 
 def draw(model: str, images: Path) -> list[Path]:
@@ -62,7 +62,7 @@ def stages(path: Path, out, lists: np.ndarray, early: np.ndarray) -> None:
     for axes, title in zip(grid, titles, strict=True):
         axes.set_title(title, fontsize=8, color=INK, loc="left")
         axes.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[], aspect="equal")
-    grid[0].scatter(*means.T, s=0.3, c=colors, linewidths=0)
+    grid[0].scatter(*means.T, s=1.5, c=colors, linewidths=0)
     chosen = np.random.default_rng(0).permutation(len(means))[:OUTLINES]
     a, b, c = out.conics.detach().numpy()[seen][chosen].astype(np.float64).T
     values, vectors = np.linalg.eigh(np.stack([a, b, b, c], -1).reshape(-1, 2, 2))
@@ -81,7 +81,8 @@ def stages(path: Path, out, lists: np.ndarray, early: np.ndarray) -> None:
         axes.imshow(picture.clip(0, 1), extent=(0, width, height, 0))
     order = np.argsort(slopes)
     grid[5].set_facecolor("black")
-    grid[5].scatter(*means[order].T, s=0.6, c=np.sqrt(slopes[order]), cmap="inferno", linewidths=0)
+    strength = (slopes / np.percentile(slopes, 98)).clip(max=1)[order]
+    grid[5].scatter(*means[order].T, s=2.5, c=strength, cmap="inferno", linewidths=0)
     save_figure(figure, path)
 
 

@@ -85,6 +85,7 @@ def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
     assert running
 
 
-def test_threads_must_be_positive():
+@pytest.mark.parametrize("count", [0, "a", 1.5])
+def test_threads_must_be_a_positive_number(count):
     with pytest.raises(warp_splat.InputError, match="threads"):
-        warp_splat.set_threads(0)
+        warp_splat.set_threads(count)

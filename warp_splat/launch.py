@@ -116,11 +116,11 @@ def set_threads(count: int) -> None:
     """Use ``count`` threads (1 to 1024) for CPU launches. Results do not depend on it.
 
     Raises:
-        InputError: if ``count`` is out of that range.
+        InputError: if ``count`` is not a whole number, or out of that range.
     """
     global _threads
-    if not 1 <= count <= MOST_THREADS:
-        raise InputError(f"threads: expected 1 to {MOST_THREADS}, got {count}.")
+    if not isinstance(count, int) or not 1 <= count <= MOST_THREADS:
+        raise InputError(f"threads: expected a whole number, 1 to {MOST_THREADS}, got {count!r}.")
     _threads = count
 
 

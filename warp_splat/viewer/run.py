@@ -47,8 +47,8 @@ def view(config: ViewConfig) -> int:
         memory_explained(device, model, [LARGEST], advice),
         Viewer(draw, lambda: model.parameters["means"], scene, config.port) as viewer,
     ):
-        print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
         with interruptible() as interrupted:
+            print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
             while not interrupted:
                 if not viewer.draw():
                     viewer.wait(IDLE)
