@@ -23,7 +23,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.run import Run
+from warp_splat.run import Run, finish
 from warp_splat.scene.types import Scene, View
 from warp_splat.trainer import Trainer
 from warp_splat.viewer import server, watcher
@@ -504,6 +504,65 @@ def test_pause_ends(fake_viser, monkeypatch, happens):
     monkeypatch.setattr(server, "DESERTED", 0.0)
     paused = Paused(monkeypatch, happens)
     assert paused.waits >= 3 and (not paused.training.paused or paused.interrupted)
+
+
+def test_the_end_is_shown_once_to_everybody(fake_viser):
+    """Also while one drags on and on, and where Pause was clicked during the last step."""
+    trainer, run = Trainer(some_scene(), TrainConfig(iterations=10)), Run(None, 0.0, iteration=10)
+    viewer, training = watch_training(trainer, run)
+    clients = [FakeClient(number, trainer.scene.train[0].camera) for number in (1, 2)]
+    for client in clients:
+        viewer.server.enter(client)
+    receive = clients[0].scene.set_background_image
+
+    def dragged(frame, **options):
+        receive(frame, **options)
+        clients[0].moved()
+
+    clients[0].scene.set_background_image = dragged
+    training._toggle()
+    training.show_end()
+    assert [len(client.frames) for client in clients] == [1, 1]
+    assert training._button.disabled and "paused" not in training._facts.content
+
+
+class Visited(FakeServer):
+    """With a browser from the start, which leaves at the second wait."""
+
+    def on_client_disconnect(self, handler):
+        super().on_client_disconnect(handler)
+        self.client, self.waits, self.seen = FakeClient(1, PHOTO), 0, []
+        self.enter(self.client)
+        Visited.last = self
+
+    def wait(self):
+        self.waits += 1
+        if self.waits == 2:
+            self.leave(self.client)
+
+
+def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, capsys):
+    """From the command line: frames while it trains, the end before it is evaluated, and then it lingers."""
+    root = write_colmap(tmp_path / "scene")
+    (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
+    monkeypatch.setattr(sys.modules["viser"], "ViserServer", Visited)
+    monkeypatch.setattr(server, "DESERTED", 0.0)
+    monkeypatch.setattr("warp_splat.viewer.training.REFRESH", 0.0)
+    monkeypatch.setattr("warp_splat.viewer.training.SHARE", 1e9)
+    monkeypatch.setattr(server.Viewer, "wait", lambda viewer, seconds: viewer.server.wait())
+    at_rest(monkeypatch)
+
+    def evaluated(*_):
+        seen = Visited.last
+        seen.seen = [len(seen.client.frames), seen.gui.add_button().disabled]
+        return finish(*_)
+
+    monkeypatch.setattr("warp_splat.train.finish", evaluated)
+    assert main(["train", "-s", str(root), "-m", str(tmp_path / "model"), "--viewer", "--iterations", "3"]) == 0
+    seen, said = Visited.last, capsys.readouterr()
+    assert seen.seen == [3, True] and seen.waits == 2 and seen.stopped  # after two steps and at the end
+    assert "Viewer at http" in said.out and "The viewer stays at" in said.out
+    assert "no points to start from" in said.out and "Done after 3 iterations" in said.out
 
 
 # commands ---------------------------------------------------------------------------------------------------------
