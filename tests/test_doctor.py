@@ -198,7 +198,8 @@ def test_masks_that_a_frame_names(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("black", "level", "words"), [("ab", "note", "masks of 2 images are black"), ("abc", "error", "all 3 images are black")]
+    ("black", "level", "words"),
+    [("ab", "note", "masks of 2 images are black"), ("abc", "error", "all 3 images are black")],
 )
 def test_black_masks(tmp_path, capsys, black, level, words):
     root = write_colmap(tmp_path / "a")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import psutil
 
 from warp_splat.config import CORES, TrainConfig
-from warp_splat.forecast import FLOAT, GIB, INSTANCES, expected_gaussians, step_memory
+from warp_splat.forecast import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
 from warp_splat.presets import PRESETS
 from warp_splat.scene.images import target_size
 
@@ -33,7 +33,8 @@ def forecast(
     targets = [target_size(*size, -1) for size in sizes]
     areas = [width * height for width, height in targets]
     gaussians, _ = expected_gaussians(points, max(areas), config)
-    step = step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, max(areas))
+    per_pixel = pixel_floats(masked, False, linear)
+    step = step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, max(areas), per_pixel=per_pixel)
     photographs = sum(areas) * ((3 * FLOAT if linear else 3) + masked + alpha)
     needed, available = BASE + photographs + step, psutil.virtual_memory().available
     seconds = sum(areas) / len(areas) * SECONDS_PER_PIXEL / CORES
