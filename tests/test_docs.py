@@ -12,13 +12,9 @@ from pathlib import Path
 
 import pytest
 import room
-import torch
 from serving import end, served
 
-import warp_splat
 from warp_splat.cli import COMMANDS, main
-from warp_splat.gaussians import GaussianModel
-from warp_splat.scene import load_scene
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -103,7 +99,7 @@ def test_the_list_of_flags_is_that_of_the_program():
 def test_flags_exist(page):
     flags = [item for config_type, _ in COMMANDS.values() for item in fields(config_type)]
     known = {name for item in flags for name in (f"--{item.name}", *item.metadata.get("names", ()))}
-    foreign = {"--help", "--version", "--no", "--nproc-per-node", "--logdir"}  # torchrun's and TensorBoard's
+    foreign = {"--help", "--version", "--no", "--nproc-per-node", "--logdir", "--with"}  # of torchrun, TensorBoard, uv
     code = " ".join(re.findall(r"`([^`\n]+)`", prose(page)) + [text for kind, text in blocks(page) if not kind])
     used = {flag for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code) if not flag.startswith("--no-")}
     assert used <= known | foreign | benchmark_flags()
@@ -184,27 +180,28 @@ def run(line, folder):
         assert main(arguments) == 0, line
 
 
-def names_of_an_example():
-    """What pieces of code presume: a few Gaussians, a camera, a photograph."""
-    scene = load_scene(SCENE, resolution=8, report=lambda line: None)
-    model = GaussianModel.from_points(scene.points[::8], scene.colors[::8], 0)
-    means, quats, scales, opacities, sh, _ = (tensor.detach() for tensor in model.activated())
-    view = scene.train[0]
-    photo = torch.from_numpy(view.image) / 255
-    inputs = {"means": means, "quats": quats, "scales": 0.5 * scales, "opacities": 5 * opacities, "sh": sh}
-    inputs = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
-    return {"warp_splat": warp_splat, "torch": torch, "camera": view.camera, "photo": photo, **inputs}
+def example():
+    """The README's code, which that of other pages continues."""
+    return next(text for language, text in blocks(ROOT / "README.md") if language == "python")
 
 
 @pytest.mark.parametrize("page", [page for page in USERS if "```python" in page.read_text()], ids=name_of)
-def test_code(page):
-    names = names_of_an_example()
+def test_code(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(with_scene(tmp_path))
+    names = {}
+    exec(example(), names)
     for language, text in blocks(page):
         if language == "diff":  # from here on, see below
             break
         if language == "python":
             exec(text, names)
     assert all(names[name].grad.isfinite().all() for name in ("means", "quats", "scales", "opacities", "sh"))
+
+
+def with_scene(folder):
+    (folder / "path/to").mkdir(parents=True)
+    (folder / "path/to/scene").symlink_to(SCENE)
+    return folder
 
 
 #: After each change of docs/extending.md and the code that follows it: is it the renderer that it says?
@@ -239,13 +236,11 @@ def test_changed_kernels(place, tmp_path):
     found = blocks(DOCS / "extending.md")
     changes = [index for index, (language, _) in enumerate(found) if language == "diff"]
     assert len(changes) == len(EVIDENCE)
-    shutil.copytree(ROOT / "warp_splat", tmp_path / "warp_splat", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "warp_splat", with_scene(tmp_path) / "warp_splat", ignore=shutil.ignore_patterns("__pycache__")
+    )
     change(tmp_path, found[changes[place]][1])
-    code = ["import sys", f"sys.path.insert(1, {str(ROOT / 'tests')!r})", "import test_docs"]
-    code += [
-        "globals().update(test_docs.names_of_an_example())",
-        f"assert warp_splat.__file__.startswith({str(tmp_path)!r})",
-    ]
+    code = [example(), f"assert warp_splat.__file__.startswith({str(tmp_path)!r})"]
     code += [found[changes[place] + 1][1], textwrap.dedent(EVIDENCE[place])]
     (tmp_path / "example.py").write_text("\n".join(code))
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False)

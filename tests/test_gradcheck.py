@@ -121,6 +121,20 @@ def test_a_wrong_gradient_is_named(function, change, named, monkeypatch):
     assert found == named, errors(report)
 
 
+def test_turning_balls_changes_nothing(monkeypatch):
+    """Of their gradient only rounding is left, and that is no error; anything more is."""
+    scene = SCENES["degree1"]()
+    means, quats, scales, opacities, sh = scene.parameters()
+    balls, upright = (
+        scales[:, :1].expand(-1, 3).contiguous(),
+        torch.tensor([1.0, 0, 0, 0]).expand_as(quats).contiguous(),
+    )
+    arguments = (means, upright, balls, opacities, sh, scene.camera)
+    assert check_gradients(*arguments, parameters=["quats"]).ok
+    spoil(monkeypatch, renderer.Project, lambda gradients: gradients.__setitem__(1, gradients[1] + 1))
+    assert check_gradients(*arguments, parameters=["quats"]).named("off") == ["quats"]
+
+
 def test_a_uniform_error_is_measured(monkeypatch):
     spoil(monkeypatch, renderer.Blend, scale_conics)
     report = check("degree1", parameters=["conics"])

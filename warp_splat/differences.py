@@ -222,9 +222,8 @@ def _extrapolate(scene: MovableScene, rung: int, far: tuple, near: tuple) -> Quo
     pixels = float((kept & moved).sum() / moved.sum()) if moved.any() else 1.0
     spread, quotient = odd[kept] / (2 * h), (near_plus - near_minus)[kept] / h
     value = float(((quotient - spread / 3) * scene.weights[kept]).sum())
-    uncertainty = 2 * math.hypot(
-        float(spread.norm()), ROUNDING * largest * math.sqrt(int((kept & moved).sum())) / (2 * h)
-    )
+    rounded = max(int((kept & moved).sum()), 1)
+    uncertainty = 2 * math.hypot(float(spread.norm()), ROUNDING * largest * math.sqrt(rounded) / (2 * h))
     size = float(quotient.norm())
     rank = (uncertainty / size if size else 1.0) / pixels if pixels else math.inf
     return Quotient(rung, value, uncertainty, kept, pixels, rank)

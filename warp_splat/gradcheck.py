@@ -167,11 +167,11 @@ def _judge(name: str, trials: list[Trial], tolerance: float) -> GradientRow:
     """A parameter's directions as a row."""
     differences = [trial.quotient.value for trial in trials]
     uncertainties = [trial.quotient.uncertainty for trial in trials]
-    scale = _rms(differences)
-    error, uncertainty = (
-        size / scale if scale else (math.inf if size else 0.0)
-        for size in (_rms([trial.gap for trial in trials]), _rms(uncertainties))
-    )
+    scale, gap, doubt = _rms(differences), _rms([trial.gap for trial in trials]), _rms(uncertainties)
+    if scale:
+        error, uncertainty = gap / scale, doubt / scale
+    else:  # nothing moves the image, such as turning a ball: of the gradient, only rounding may be left
+        error, uncertainty = math.inf if gap > doubt else 0.0, 0.0
     pixels = sum(trial.quotient.pixels for trial in trials) / len(trials)
     unclear = uncertainty > 10 * tolerance or not pixels
     # of thousands of jumps the uncertainty sees fewer than there are
