@@ -3,7 +3,7 @@
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -47,19 +47,26 @@ def cameras(width: int, height: int, count: int) -> list[Camera]:
     return [camera.resized(width, height) for camera in origin_orbit(count)]
 
 
-def make_scene(width: int, height: int) -> Scene:
-    """VIEWS photographs of noise, from the orbit."""
+def make_scene(width: int, height: int, kinds: Sequence[str] = ()) -> Scene:
+    """VIEWS photographs of noise, from the orbit; see :func:`make_trainer`."""
     rng = np.random.default_rng(0)
-    views = [
-        View(f"{index}", camera, rng.integers(0, 256, (height, width, 3), dtype=np.uint8), camera)
-        for index, camera in enumerate(cameras(width, height, VIEWS))
-    ]
+    views = []
+    for index, camera in enumerate(cameras(width, height, VIEWS)):
+        image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
+        if "linear" in kinds:
+            image = np.divide(image, 255, dtype=np.float32)
+        alpha, mask = (np.ones((height, width), np.uint8) if k in kinds else None for k in ("composited", "masked"))
+        views.append(View(f"{index}", camera, image, camera, alpha, mask))
     return Scene(views, [], np.eye(4, 3, dtype=np.float32), np.zeros((4, 3), np.uint8))
 
 
-def make_trainer(count: int, width: int, height: int, device: str) -> Trainer:
-    """:func:`trainer_on` the scene and ``count`` random Gaussians."""
-    return trainer_on(make_scene(width, height), make_gaussians(count, device), device)
+def make_trainer(count: int, width: int, height: int, device: str, kinds: Sequence[str] = ()) -> Trainer:
+    """:func:`trainer_on` the scene and ``count`` random Gaussians.
+
+    Its photographs may be "masked", in "linear" light, and "composited" on random backgrounds.
+    """
+    options = {"random_background": True} if "composited" in kinds else {}
+    return trainer_on(make_scene(width, height, kinds), make_gaussians(count, device), device, **options)
 
 
 def trainer_on(scene: Scene, gaussians: GaussianModel, device: str, **options) -> Trainer:

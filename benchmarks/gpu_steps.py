@@ -11,8 +11,9 @@ from warp_splat.compare import adjoints
 from warp_splat.compare.workloads import layered
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.render import ORBIT_SIZE, make_picture
+from warp_splat.render import make_picture
 from warp_splat.renderer import render
+from warp_splat.ways import ORBIT_SIZE
 
 STAGES = (
     *("project", "bin", "blend", "loss", "adjoint of loss", "adjoint of blend", "adjoint of project"),

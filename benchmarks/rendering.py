@@ -43,7 +43,7 @@ def measure(model: GaussianModel, names: list[str], cameras: list, test: list) -
     seconds, full, rows = interleaved_medians(runs, ROUNDS), frames[FULL], []
     for name, picture in pictures.items():
         error = np.abs(frames[name].astype(int) - full).max()
-        quality = np.mean([psnr(picture(view.camera), view.image) for view in test])
+        quality = np.mean([psnr(picture(view.camera), view.picture, view.mask) for view in test])
         speeds = (f"{len(cameras) / seconds[name]:.1f}", f"{seconds[FULL] / seconds[name]:.2f}")
         close = "" if name == FULL else f"{psnr(frames[name], full):.1f}"
         rows.append((len(model), name, *speeds, close, f"{error}/255", f"{quality:.2f}"))

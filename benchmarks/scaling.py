@@ -25,7 +25,7 @@ from warp_splat import launch
 from warp_splat.binning import bin_tiles
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.devices import peak_memory
-from warp_splat.forecast import step_memory
+from warp_splat.forecast import pixel_floats, step_memory
 from warp_splat.renderer import Dropped, Project, camera_view
 from warp_splat.report import BLUE, INK, ORANGE, format_table, new_figure, plain_axes, save_figure
 from warp_splat.trainer import Trainer
@@ -66,14 +66,20 @@ GROWTH = (
 )
 
 
-def measure(count: int, width: int, height: int, size: float, faint: bool, seconds: float = SECONDS) -> dict:
-    """One point, in this process: milliseconds of a step and of its stages, peak and forecast in MiB."""
+def measure(
+    count: int, width: int, height: int, size: float, faint: bool, seconds: float = SECONDS, kinds: tuple = ()
+) -> dict:
+    """One point, in this process: milliseconds of a step and of its stages, peak and forecast in MiB.
+
+    ``kinds`` of photographs: "masked", "composited", "linear".
+    """
     launch.prepare("cpu", 0)
-    small = make_trainer(64, 2 * TILE, TILE, "cpu")  # loads every kernel
+    small = make_trainer(64, 2 * TILE, TILE, "cpu", kinds)  # loads every kernel
     take_step(small, 10)
     loaded = peak_memory()
-    trainer = make_trainer(count, width, height, "cpu")
-    photographs = sum(view.image.nbytes for view in trainer.scene.train)
+    trainer = make_trainer(count, width, height, "cpu", kinds)
+    planes = [plane for view in trainer.scene.train for plane in (view.image, view.alpha, view.mask)]
+    photographs = sum(plane.nbytes for plane in planes if plane is not None)
     with torch.no_grad():
         trainer.model.parameters["scales"] += math.log(size)
         if faint:
@@ -89,7 +95,8 @@ def measure(count: int, width: int, height: int, size: float, faint: bool, secon
             steps.append(time.perf_counter() - start)
         stages.append(dict(profile))
     peak, instances = peak_memory(), count_instances(trainer)
-    needed = step_memory(count, 16, instances, width * height)
+    per_pixel = pixel_floats("masked" in kinds, "composited" in kinds, "linear" in kinds)
+    needed = step_memory(count, 16, instances, width * height, per_pixel=per_pixel)
     return {
         "gaussians": count,
         "width": width,

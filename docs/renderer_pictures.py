@@ -8,9 +8,10 @@ from matplotlib.collections import EllipseCollection
 
 from warp_splat.binning import bin_tiles
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE, RasterOptions
+from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.losses import image_loss
-from warp_splat.render import load_trained_scene, open_model
+from warp_splat.render import load_trained_scene
 from warp_splat.renderer import Dropped, Project, camera_view, rasterize
 from warp_splat.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
 
@@ -20,7 +21,7 @@ FEW = 60  # entries of a list
 
 def draw(model: str, images: Path) -> list[Path]:
     """Write renderer.jpg and renderer_pixel.png for the first held-out view of ``model``."""
-    _, gaussians, trained = open_model(Path(model))
+    _, gaussians, trained = open_model(model)
     scene = load_trained_scene(model, "", trained, lambda line: None)
     view = scene.evaluated[1][0]
     activated = GaussianModel.from_splats(gaussians.splats).activated()

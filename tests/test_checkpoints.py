@@ -14,6 +14,7 @@ import sys
 import time
 import tracemalloc
 import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ import safetensors.numpy
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scene_files import pose, write_colmap
+from splat_files import some_splats
 from test_distributed import TORCHRUN, Pretended
 from test_hostile_files import changed, changed_json
 from test_train import ROOT, SCENE, SHORT, fails, train
@@ -29,8 +32,10 @@ from warp_splat.cli import main, parse
 from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import LAST, load_checkpoint, load_options, save_checkpoint
+from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
+from warp_splat.formats.splats import SplatFile
 from warp_splat.run import Run, keep, restore
 from warp_splat.scene import load_scene
 from warp_splat.trainer import Trainer
@@ -191,6 +196,40 @@ def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
     config = parse(["train", "--resume", str(whole)])
     assert (config.resolution, config.adjoint, config.max_gaussians, config.sh_interval) == (2, "stepwise", 40000, 15)
     assert len(load_ply(ply_path(whole, 120)).means) <= 40000
+
+
+@pytest.mark.parametrize("gone", [False, True], ids=["the file is there", "the file has gone"])
+def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
+    """Of a scene without points; stopped before the first evaluation, resumed to there, and on to the same bytes.
+
+    All cameras stand at one place, where the extent is that of the points, unless these have gone.
+    """
+    monkeypatch.chdir(tmp_path)
+    if not gone:
+        monkeypatch.setattr("scene_files.pose", lambda index: (pose(index)[0], pose(index)[0] @ (0.0, 0.0, 5.0)))
+    root = write_colmap(tmp_path / "scene")
+    (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
+    save_gaussians("start.ply", SplatFile(some_splats(50)))
+    begin = ["train", "-s", str(root), "--start_ply", "start.ply", "--viewer", "--port", "1234", "-m"]
+    monkeypatch.setattr("warp_splat.train._watched", lambda *_: nullcontext())
+    assert main([*begin, "whole", "--iterations", "6"]) == 0
+    with monkeypatch.context() as patch:
+        interrupt(patch, 1)
+        assert main([*begin, "parts", "--iterations", "60"]) == 130
+    before = (tmp_path / "parts" / "input.ply").read_bytes()
+    assert (load_options("parts")["viewer"], load_options("parts")["port"]) == (False, TrainConfig().port)
+    if gone:
+        (tmp_path / "start.ply").unlink()
+    capsys.readouterr()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for end in ("1", "6"):
+        assert main(["train", "--resume", "../parts", "--iterations", end]) == 0
+    said = capsys.readouterr()
+    assert "random ones" not in said.out + said.err and "curves" not in said.out.split("Done")[1]
+    assert (tmp_path / "parts" / "input.ply").read_bytes() == before
+    models = [ply_path(tmp_path / folder, 6).read_bytes() for folder in ("whole", "parts")]
+    assert models[0] == models[1]
 
 
 def test_another_scene_is_refused(whole, tmp_path, capsys):

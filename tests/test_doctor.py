@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from scene_files import texture, write_blender, write_colmap, write_image
+from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, write_image
+from test_inputs import write_transforms
 from test_scene_input import BAD
 
 from warp_splat.cli import main
 from warp_splat.doctor import geometry
+from warp_splat.doctor.forecast import forecast
 from warp_splat.doctor.subject import read_subject
 
 EMBEDDED = Path(__file__).parents[1] / "assets" / "still_life"
@@ -185,6 +187,45 @@ def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case
     folder = options.get("images", "images")
     assert main(["inspect", str(source), "-o", str(tmp_path / "page.html"), "-i", folder]) == 1
     assert "Traceback" not in "".join(capsys.readouterr())
+
+
+def test_masks_that_a_frame_names(tmp_path, capsys):
+    names = ["a.png", "b.png", "c.png"]
+    root = write_transforms(tmp_path / "a", names, frame=lambda index: {"mask_path": "seen.png"} if index == 0 else {})
+    write_image(root / "seen.png", texture(channels=1))
+    findings, _ = examine(root, tmp_path, capsys, 0)
+    assert ("warning", "masks", "there are masks for 1 of 3 images; none for b.png, c.png.") in findings
+
+
+@pytest.mark.parametrize(
+    ("black", "level", "words"),
+    [("ab", "note", "masks of 2 images are black"), ("abc", "error", "all 3 images are black")],
+)
+def test_black_masks(tmp_path, capsys, black, level, words):
+    root = write_colmap(tmp_path / "a")
+    for name in "abc":
+        write_image(root / "masks" / f"{name}.png", np.full((HEIGHT, WIDTH, 1), 255 * (name not in black), np.uint8))
+    findings, _ = examine(root, tmp_path, capsys, level == "error")
+    assert any(found == level and words in text for found, _, text in findings), findings
+
+
+def test_other_endings_and_two_kinds_of_light(tmp_path, capsys):
+    root = write_colmap(tmp_path / "a")
+    write_image(root / "images" / "more.exr", np.ones((HEIGHT, WIDTH, 3), np.float32))
+    findings, _ = examine(root, tmp_path, capsys, 0)
+    assert any(check == "unregistered" and "more.exr" in text for _, check, text in findings)
+    (root / "images" / "b.png").unlink()
+    (root / "images" / "more.exr").rename(root / "images" / "b.exr")
+    findings, _ = examine(root, tmp_path, capsys, 1)
+    assert any(found == "error" and "b.png in linear light" in text for found, _, text in findings)
+
+
+def test_the_forecast_knows_what_a_photograph_takes():
+    """float32 in linear light instead of bytes, and a byte for each pixel of masks and of alpha."""
+    sizes, told = [(1600, 1000)] * 5000, []
+    for kinds in ((False, False, False), (False, True, False), (False, True, True), (True, True, True)):
+        told.append(float(re.search(r"about ([\d.]+) GiB", forecast(sizes, 10, *kinds)[0])[1]))
+    assert np.diff(told) / (5000 * 1600 * 1000 / 2**30) == pytest.approx([1, 1, 9], abs=0.1)
 
 
 def test_text_of_the_scene_is_not_html(tmp_path, capsys):

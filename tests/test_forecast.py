@@ -24,10 +24,18 @@ def scene():
     return Scene([view], [], np.zeros((5000, 3), np.float32), np.zeros((5000, 3), np.uint8))
 
 
-@pytest.mark.parametrize("point", [(200_000, 64, 64), (1000, 1200, 900)], ids=str)
-def test_forecast_is_what_a_step_takes(point):
+@pytest.mark.parametrize(
+    ("point", "kinds"),
+    [
+        ((200_000, 64, 64), []),
+        ((1000, 1200, 900), []),
+        ((1000, 1200, 900), ["masked", "composited", "linear"]),
+    ],
+    ids=str,
+)
+def test_forecast_is_what_a_step_takes(point, kinds):
     """In a process of its own, beyond what that takes before the first step."""
-    found = scaling.measure_apart([*point, 1.0, False, 0.0])
+    found = scaling.measure_apart([*point, 1.0, False, 0.0, kinds])
     loaded = found["peak"] - found["added"]
     assert found["forecast"] - loaded == pytest.approx(found["added"], rel=0.25)
 

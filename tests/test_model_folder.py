@@ -6,11 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
+from splat_files import some_splats
 
 from warp_splat.camera import Camera
+from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.splats import SplatFile
 from warp_splat.scene.types import View
 
 ARGUMENTS = {
@@ -194,3 +199,21 @@ def test_default_model_path_is_new_each_time():
     first, second = model_folder.default_model_path(), model_folder.default_model_path()
     assert first != second
     assert first.parent == Path("output") and len(first.name) == 10
+
+
+@pytest.mark.parametrize("mark", [False, True])
+def test_open_model(tmp_path, mark, monkeypatch, capsys):
+    """cfg_args goes before the file's own mark of antialiasing, which goes before nothing; convert does likewise."""
+    folder, target = tmp_path / "model", tmp_path / "a.spz"
+    for iteration in (3, 20):
+        save_gaussians(model_folder.ply_path(folder, iteration), SplatFile(some_splats(iteration), mark))
+    iteration, file, options = model_folder.open_model(folder)
+    assert (iteration, len(file.splats.means), options) == (20, 20, {"eval": True, "antialiasing": mark})
+    assert model_folder.open_model(model_folder.ply_path(folder, 3))[::2] == (0, options)
+    assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased == mark
+    monkeypatch.chdir(write_colmap(tmp_path / "scene"))  # which it was not trained on
+    assert main(["render", "-m", str(folder)]) == 1
+    assert "name the scene with -s" in capsys.readouterr().err
+    model_folder.write_cfg_args(folder, {"antialiasing": not mark, "eval": False})
+    assert model_folder.open_model(folder, 3)[::2] == (3, {"antialiasing": not mark, "eval": False})
+    assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased != mark

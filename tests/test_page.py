@@ -31,7 +31,7 @@ from warp_splat.scene.types import View
 from warp_splat.ways import orbit_cameras
 
 EVIL = "</script><script>window.evil = 1</script><img src=x onerror='window.evil = 1'>\u2028.jpg"
-OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "BACKGROUND": 0.0}
+OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "LINEAR": False, "BACKGROUND": 0.0}
 
 
 class Blocks(HTMLParser):
@@ -123,16 +123,16 @@ def test_names_of_strangers_are_text():
     assert re.search(r"content=\"default-src 'none'; script-src 'sha256-[^' ]*'; ", text)
 
 
-def model(folder, splats, options=RasterOptions(), white=False, name="1.jpg"):  # noqa: B008 - frozen
+def model(folder, splats, options=RasterOptions(), white=False, name="1.jpg", linear=False):  # noqa: B008 - frozen
     """A model folder with three cameras; (its path, a function from a camera to our picture, the cameras)."""
     cameras = orbit_cameras(np.array([0.2, 0, 0]), np.array([0, -1.0, 0]), np.array([0, 2.0, -9.0]), 3)
     cameras = [replace(camera.resized(280, 156), cx=150.0, cy=70.0) for camera in cameras]
     views = [View(name, camera, np.zeros((1, 1, 3), np.uint8), camera) for camera in cameras]
     save_gaussians(model_folder.ply_path(folder, 7), SplatFile(splats, options.antialiasing))
     model_folder.write_cameras(folder, [], views)
-    settings = {"antialiasing": options.antialiasing, "projection": options.projection, "white_background": white}
-    model_folder.write_cfg_args(folder, settings)
-    return folder, make_picture(GaussianModel.from_splats(splats), white, options), cameras
+    settings = {"antialiasing": options.antialiasing, "projection": options.projection}
+    model_folder.write_cfg_args(folder, {**settings, "white_background": white, "linear_light": linear})
+    return folder, make_picture(GaussianModel.from_splats(splats), white, options, linear), cameras
 
 
 def export(folder, *arguments):
@@ -183,19 +183,20 @@ def photographed(page, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("coefficients", "options", "white"),
+    ("coefficients", "options", "white", "linear"),
     [
-        (16, RasterOptions(), False),
-        (9, RasterOptions(antialiasing=True), True),
-        (4, RasterOptions(projection="ellipsoid"), False),
-        (1, RasterOptions(), True),
+        (16, RasterOptions(), False, False),
+        (9, RasterOptions(antialiasing=True), True, False),
+        (4, RasterOptions(projection="ellipsoid"), False, False),
+        (1, RasterOptions(), True, False),
+        (4, RasterOptions(), False, True),
     ],
 )
-def test_pictures_agree_with_ours(browser, tmp_path, coefficients, options, white):
+def test_pictures_agree_with_ours(browser, tmp_path, coefficients, options, white, linear):
     splats = some_splats(400, coefficients)
     splats.scales[:] -= 1.5
     splats.scales[:100] -= 2.0  # smaller than a pixel, where antialiasing matters
-    folder, picture, cameras = model(tmp_path, splats, options, white)
+    folder, picture, cameras = model(tmp_path, splats, options, white, linear=linear)
     page = open_page(browser, export(folder))
     for index, camera in enumerate(cameras):
         found = pixels(page, index)

@@ -81,8 +81,12 @@ def test_pictures_are_the_same_bytes_each_time(tmp_path):
     ],
 )
 def test_plot_training_draws_what_was_recorded(tmp_path, history):
-    report.plot_training(tmp_path / "training.png", history)
-    assert load_png(tmp_path / "training.png").shape == (500, 1600, 3)
+    pictures = []
+    for split in ("test", "train"):
+        report.plot_training(tmp_path / f"{split}.png", history, split)
+        pictures.append(load_png(tmp_path / f"{split}.png"))
+    assert pictures[0].shape == pictures[1].shape == (500, 1600, 3)
+    assert (pictures[0] != pictures[1]).any() == any("psnr" in record for record in history)  # which it names
 
 
 def test_plot_profile(tmp_path):

@@ -5,21 +5,25 @@ import itertools
 import socket
 import sys
 import time
+from contextlib import contextmanager, nullcontext
 from types import ModuleType, SimpleNamespace
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
+from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
+from warp_splat.color import to_srgb
 from warp_splat.config import NEAR, TrainConfig, ViewConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.splats import SplatArrays
+from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.run import Run
+from warp_splat.run import Run, finish
 from warp_splat.scene.types import Scene, View
 from warp_splat.trainer import Trainer
 from warp_splat.viewer import server, watcher
@@ -502,6 +506,65 @@ def test_pause_ends(fake_viser, monkeypatch, happens):
     assert paused.waits >= 3 and (not paused.training.paused or paused.interrupted)
 
 
+def test_the_end_is_shown_once_to_everybody(fake_viser):
+    """Also while one drags on and on, and where Pause was clicked during the last step."""
+    trainer, run = Trainer(some_scene(), TrainConfig(iterations=10)), Run(None, 0.0, iteration=10)
+    viewer, training = watch_training(trainer, run)
+    clients = [FakeClient(number, trainer.scene.train[0].camera) for number in (1, 2)]
+    for client in clients:
+        viewer.server.enter(client)
+    receive = clients[0].scene.set_background_image
+
+    def dragged(frame, **options):
+        receive(frame, **options)
+        clients[0].moved()
+
+    clients[0].scene.set_background_image = dragged
+    training._toggle()
+    training.show_end()
+    assert [len(client.frames) for client in clients] == [1, 1]
+    assert training._button.disabled and "paused" not in training._facts.content
+
+
+class Visited(FakeServer):
+    """With a browser from the start, which leaves at the second wait."""
+
+    def on_client_disconnect(self, handler):
+        super().on_client_disconnect(handler)
+        self.client, self.waits, self.seen = FakeClient(1, PHOTO), 0, []
+        self.enter(self.client)
+        Visited.last = self
+
+    def wait(self):
+        self.waits += 1
+        if self.waits == 2:
+            self.leave(self.client)
+
+
+def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, capsys):
+    """From the command line: frames while it trains, the end before it is evaluated, and then it lingers."""
+    root = write_colmap(tmp_path / "scene")
+    (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
+    monkeypatch.setattr(sys.modules["viser"], "ViserServer", Visited)
+    monkeypatch.setattr(server, "DESERTED", 0.0)
+    monkeypatch.setattr("warp_splat.viewer.training.REFRESH", 0.0)
+    monkeypatch.setattr("warp_splat.viewer.training.SHARE", 1e9)
+    monkeypatch.setattr(server.Viewer, "wait", lambda viewer, seconds: viewer.server.wait())
+    at_rest(monkeypatch)
+
+    def evaluated(*_):
+        seen = Visited.last
+        seen.seen = [len(seen.client.frames), seen.gui.add_button().disabled]
+        return finish(*_)
+
+    monkeypatch.setattr("warp_splat.train.finish", evaluated)
+    assert main(["train", "-s", str(root), "-m", str(tmp_path / "model"), "--viewer", "--iterations", "3"]) == 0
+    seen, said = Visited.last, capsys.readouterr()
+    assert seen.seen == [3, True] and seen.waits == 2 and seen.stopped  # after two steps and at the end
+    assert "Viewer at http" in said.out and "The viewer stays at" in said.out
+    assert "no points to start from" in said.out and "Done after 3 iterations" in said.out
+
+
 # commands ---------------------------------------------------------------------------------------------------------
 
 
@@ -517,6 +580,27 @@ def test_pause_ends(fake_viser, monkeypatch, happens):
 def test_what_cannot_be_viewed(config, message):
     with pytest.raises(InputError, match=message):
         view(config)
+
+
+@pytest.mark.parametrize("source", ["", "scene"])
+def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, source):
+    """A file does not say what light it was trained in; its scene does."""
+    root = write_colmap(tmp_path / "scene", ["a.exr", "b.exr"], np.full((32, 48, 3), 0.2, np.float32))
+    save_gaussians(tmp_path / "a.ply", SplatFile(some_gaussians(50)))
+    draws = []
+
+    @contextmanager
+    def served(draw, *_):
+        draws.append(draw)
+        yield SimpleNamespace(announcement="")
+
+    monkeypatch.setattr("warp_splat.viewer.run.Viewer", served)
+    monkeypatch.setattr("warp_splat.viewer.run.interruptible", lambda: nullcontext([2]))
+    assert view(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
+    draws.append(make_draw(GaussianModel.from_splats(some_gaussians(50)), {}))
+    drawn, plain = (draw(PHOTO, False).image for draw in draws)
+    assert plain.std() > 0.1
+    torch.testing.assert_close(drawn, to_srgb(plain.clamp(0, 1), torch.where) if source else plain)
 
 
 def test_flags_of_training(capsys):

@@ -237,9 +237,9 @@ class InspectConfig:
 
 @dataclass
 class ConvertConfig:
-    """Two files of Gaussians: .ply, .splat, .spz, .glb or .gltf."""
+    """A model and a file of Gaussians: .ply, .splat, .spz, .glb or .gltf."""
 
-    source: str = argument("the file to read")
+    source: str = argument("the file to read, or the folder of a trained model")
     target: str = argument("the file to write; its ending says in which format")
 
 
@@ -256,7 +256,7 @@ class ExportHtmlConfig:
 class CompareConfig:
     """Options of the comparison; without ``--stability`` or ``--volume``: adjoints, knobs and training."""
 
-    scene: str = flag("", "a COLMAP or nerf-synthetic scene to measure on, besides those that come with it", "-s")
+    scene: str = flag("", "scene (COLMAP, nerf-synthetic, transforms.json) to measure on, besides our own", "-s")
     out: str = flag("output/compare", "folder for tables (CSV, JSON) and plots", "-o")
     modes: list[str] = flag(list(ADJOINTS), "adjoints to compare", many=str)
     stability: bool = flag(False, "the catalogue of stiff and extreme cases instead")

@@ -6,6 +6,7 @@ import numpy as np
 
 from warp_splat.config import ConvertConfig
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
+from warp_splat.formats.model_folder import open_model
 from warp_splat.formats.splats import COEFFICIENTS, LOG_SCALES, SH_C0, SplatArrays, SplatFile, sigmoid, unit_quats
 
 ROUNDING = 1e-6  # smaller changes, as a share of the largest value, are those of float32
@@ -18,7 +19,8 @@ def convert(config: ConvertConfig) -> int:
         InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
     """
     format_of(config.target)  # before anything is read
-    before = load_gaussians(config.source)
+    _, before, trained = open_model(config.source)
+    before = before._replace(antialiased=bool(trained["antialiasing"]))
     notes: list[str] = []
     save_gaussians(config.target, before, notes.append)
     after = load_gaussians(config.target)

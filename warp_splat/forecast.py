@@ -48,9 +48,24 @@ PER_PIXEL = sum(
         3 + 1 + 1,  # upstream gradients of image and transmittance in blocks, of alpha
     )
 )
+MASKED = 3 + 3 + 3  # floats of a pixel more, where masks are: both images in black, and a gradient
+COMPOSITED = 3 + 1 + 1 + 3 + 3  # where alpha lets random backgrounds through: colors, what is clear, its share, the sum
+LINEAR = 6 * 3 + 1 + 3 + 2 * 3  # in linear light: the steps of sRGB's curve, the photograph under it, two gradients
 
 
-def step_memory(gaussians: int, coefficients: int, instances: int, pixels: int, adjoint: str = "manual") -> int:
+def pixel_floats(masked: bool, composited: bool, linear: bool) -> int:
+    """Floats of a pixel with what the photographs have."""
+    return PER_PIXEL + MASKED * masked + COMPOSITED * composited + LINEAR * linear
+
+
+def step_memory(
+    gaussians: int,
+    coefficients: int,
+    instances: int,
+    pixels: int,
+    adjoint: str = "manual",
+    per_pixel: int = PER_PIXEL,
+) -> int:
     """Bytes that training steps take on the CPU, beyond what the process takes before the first.
 
     Args:
@@ -59,13 +74,14 @@ def step_memory(gaussians: int, coefficients: int, instances: int, pixels: int, 
         instances: pairs of a Gaussian and a tile that it touches.
         pixels: of a view.
         adjoint: one of ADJOINTS.
+        per_pixel: see :func:`pixel_floats`.
     """
     parameters = 3 + 4 + 3 + 1 + 3 * coefficients  # means, quats, scales, opacities, sh
     # while the set changes: all of the old one, and the largest tensor twice, as rows kept and with those added
     changing = parameters + 2 * max(4, 3 * (coefficients - 1))
     of_gaussian = COPIES * parameters + changing + PER_GAUSSIAN
     of_instance = PER_INSTANCE + (STATES if adjoint == "stored" else 0)
-    return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * PER_PIXEL)
+    return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
 
 def describe(scene: Scene, config: TrainConfig, gaussians: int, processes: int = 1) -> str:
@@ -79,9 +95,13 @@ def describe(scene: Scene, config: TrainConfig, gaussians: int, processes: int =
     """
     pixels = max(view.camera.width * view.camera.height for view in scene.train)
     count, reason = expected_gaussians(gaussians, pixels, config)
+    masked = any(view.mask is not None for view in scene.train)
+    composited = config.random_background and any(view.alpha is not None for view in scene.train)
+    per_pixel = pixel_floats(masked, composited, scene.linear)
 
     def step(gaussians: int) -> int:
-        return step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, pixels, config.adjoint)
+        coefficients, instances = (config.sh_degree + 1) ** 2, INSTANCES * gaussians
+        return step_memory(gaussians, coefficients, instances, pixels, config.adjoint, per_pixel)
 
     base, needed = psutil.Process().memory_info().rss, step(count)
     each = f" in each of {processes} processes" if processes > 1 else ""

@@ -18,7 +18,6 @@ from warp_splat.devices import memory_explained
 from warp_splat.errors import InputError
 from warp_splat.evaluate import describe, evaluate_views, show_views, write_views
 from warp_splat.formats import model_folder
-from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
@@ -48,8 +47,7 @@ def render(config: RenderConfig) -> int:
     scene = None
     if _needs_scene(config):
         scene = load_trained_scene(config.model_path, config.source_path, trained, say)
-    linear = scene.linear if scene else bool(trained.get("linear_light"))
-    options = options_of(trained)
+    options, linear = options_of(trained), is_linear(scene, trained)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = make_picture(model.to(device), bool(trained.get("white_background")), options, linear)
@@ -115,33 +113,10 @@ def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
     if not config.model_path:
         raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
     path = Path(config.model_path)
-    if is_file_of_gaussians(path) and not config.source_path and _needs_scene(config):
+    is_file = model_folder.is_file_of_gaussians(path)
+    if is_file and not config.source_path and _needs_scene(config):
         raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
-    iteration, gaussians, trained = open_model(path, config.iteration)
-    if not trained and not config.orbit:
-        model_folder.read_cfg_args(path)  # says what is missing
-    return Path(f"{path}.renders") if is_file_of_gaussians(path) else path, iteration, gaussians, trained
-
-
-def is_file_of_gaussians(path: Path) -> bool:
-    """Whether this names a file of Gaussians, not the folder of a model."""
-    return not path.is_dir() and path.suffix.lower() in FORMATS
-
-
-def open_model(path: Path, iteration: int = -1) -> tuple[int, SplatFile, dict]:
-    """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
-
-    Of a file, the iteration is 0 and the options are those that it tells; of a folder without cfg_args there are none.
-
-    Raises:
-        InputError: if there is no such model, or it cannot be read.
-    """
-    if is_file_of_gaussians(path):
-        gaussians = load_gaussians(path)
-        return 0, gaussians, {"eval": True, "antialiasing": gaussians.antialiased}
-    iteration = model_folder.find_iteration(path, iteration)
-    trained = model_folder.read_cfg_args(path) if (path / "cfg_args").exists() else {}
-    return iteration, load_gaussians(model_folder.ply_path(path, iteration)), trained
+    return Path(f"{path}.renders") if is_file else path, *model_folder.open_model(path, config.iteration)
 
 
 def options_of(trained: dict) -> RasterOptions:
@@ -150,6 +125,11 @@ def options_of(trained: dict) -> RasterOptions:
         antialiasing=bool(trained.get("antialiasing")),
         projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
     )
+
+
+def is_linear(scene: Scene | None, trained: dict) -> bool:
+    """Whether the colors of a model are in linear light: those of its scene, or else what its training says."""
+    return scene.linear if scene else bool(trained.get("linear_light"))
 
 
 def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Callable[[str], object]) -> Scene:
@@ -162,13 +142,16 @@ def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Ca
         say: receives what there is to say.
 
     Raises:
-        InputError: as :func:`load_scene`.
+        InputError: as :func:`load_scene`, or if it is not known which scene that is.
     """
+    source = source_path or str(trained.get("source_path", ""))
+    if not source:
+        raise InputError(f"{model_path}: it does not say what it was trained on; name the scene with -s.")
     resolution = trained.get("resolution", -1)
     if not isinstance(resolution, int):
         raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
     return load_scene(
-        source_path or str(trained.get("source_path", "")),
+        source,
         images=str(trained.get("images", "images")),
         resolution=resolution,
         white_background=bool(trained.get("white_background")),

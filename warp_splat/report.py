@@ -79,17 +79,18 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
     save_figure(figure, path)
 
 
-def plot_training(path: str | Path, history: Sequence[Mapping[str, float]]) -> None:
-    """Draw loss, test PSNR and number of Gaussians over the iterations, a panel for each that was recorded.
+def plot_training(path: str | Path, history: Sequence[Mapping[str, float]], split: str = "test") -> None:
+    """Draw loss, PSNR and number of Gaussians over the iterations, a panel for each that was recorded.
 
     Args:
         path: the file to write, such as .png.
         history: records with ``iteration`` and any of ``loss``, ``psnr`` [dB] and ``gaussians``, in order.
+        split: of which views the PSNR is.
 
     Raises:
         InputError: if nothing was recorded; if the file cannot be written.
     """
-    panels = (("loss", "loss", BLUE), ("psnr", "test PSNR [dB]", ORANGE), ("gaussians", "Gaussians", GREEN))
+    panels = (("loss", "loss", BLUE), ("psnr", f"{split} PSNR [dB]", ORANGE), ("gaussians", "Gaussians", GREEN))
     series = {key: [(record["iteration"], record[key]) for record in history if key in record] for key, *_ in panels}
     drawn = [panel for panel in panels if series[panel[0]]]
     if not drawn:

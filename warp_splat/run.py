@@ -22,6 +22,7 @@ from warp_splat.events import EventLog
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
+from warp_splat.formats.config_file import OF_ONE_RUN
 from warp_splat.perceptual import choose_metrics
 from warp_splat.trainer import Trainer
 
@@ -85,7 +86,8 @@ def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
         if run.losses:
             tensors["losses"] = torch.stack(run.losses)
         options = asdict(trainer.config)
-        del options["start_checkpoint"], options["model_path"], options["config"]
+        for name in OF_ONE_RUN:
+            del options[name]
         facts |= {"options": options, "iteration": run.iteration, "history": run.history}
         facts |= {"seconds": run.seconds, "wall": time.perf_counter() - run.start}
         arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
@@ -153,10 +155,11 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     show_views(compared, run.folder, split, run.iteration, say)
     run.events.write_means(run.iteration, split, means)
     plot = run.folder / "training.png"
-    report.plot_training(plot, run.history)
+    if run.history:  # none, if it was stopped before the first evaluation and goes no further
+        report.plot_training(plot, run.history, split)
     write_json(run.folder / "history.json", run.history)
     names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
-    lines = [(what, run.folder / name) for what, name in names.items()]
+    lines = [(what, run.folder / name) for what, name in names.items() if run.history or name != plot.name]
     if run.stages:
         report.plot_profile(run.folder / "profile.png", run.stages)
         lines += [("profile", run.folder / "profile.png")]

@@ -84,6 +84,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
 
         config.source_path = scene_for(config, processes.count)
     config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
+    config.start_ply = config.start_ply and os.path.abspath(config.start_ply)
     started = time.perf_counter()
     say(f"Scene {config.source_path}")
     scene = load_scene(
@@ -93,7 +94,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         white_background=config.white_background,
         eval=config.eval,
         invert_masks=config.invert_masks,
-        start="" if checkpoint else config.start_ply,
+        start=config.start_ply if not checkpoint or os.path.isfile(config.start_ply) else "",  # if it has gone
         report=say,
     )
     run = Run(Path(processes.first(str(folder))), started)
@@ -103,12 +104,14 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
         f"{len(scene.points)} points; {together}{launch.get_threads()} threads; output in {run.folder}"
     )
-    if scene.start and scene.start.antialiased != config.antialiasing:
+    if scene.random_points and not checkpoint:
+        say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
+    if scene.start and not checkpoint and scene.start.antialiased != config.antialiasing:
         which = "with" if scene.start.antialiased else "without"
         say(f"Warning: {config.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
     trainer = Trainer(scene, config, processes)
     if leads:
-        _write_inputs(model_folder.prepare(run.folder), config, scene)
+        _write_inputs(model_folder.prepare(run.folder), config, scene, continues=checkpoint is not None)
     say("Preparing kernels (compiled once on a machine, about 15 s) ...")
     start = time.perf_counter()
     with _memory_explained(trainer):
@@ -182,7 +185,7 @@ def embedded_scene() -> Path:
     raise InputError("The embedded scene is missing from this installation; name a scene with -s.")
 
 
-def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
+def _write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: bool) -> None:
     model_folder.write_cfg_args(
         folder,
         {
@@ -196,7 +199,8 @@ def _write_inputs(folder: Path, config: TrainConfig, scene: Scene) -> None:
     write_config(folder, config)
     model_folder.write_cameras(folder, scene.test, scene.train)
     remove_leftovers(folder)
-    save_points(folder / "input.ply", scene.points, scene.colors)
+    if not (continues and (folder / "input.ply").exists()):
+        save_points(folder / "input.ply", scene.points, scene.colors)
 
 
 def _memory_explained(trainer: Trainer):

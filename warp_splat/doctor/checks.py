@@ -11,8 +11,8 @@ import numpy as np
 from warp_splat.doctor.forecast import forecast
 from warp_splat.doctor.subject import Finding, Subject, few
 from warp_splat.errors import InputError
-from warp_splat.scene import MASKS, read_photos, require_visible
-from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, find_mask
+from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
+from warp_splat.scene.photos import READABLE, find_files
 
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
@@ -73,7 +73,7 @@ def check_names(subject: Subject) -> list[Finding]:
         findings.append(Finding("duplicates", "ok", "no image occurs twice."))
     if subject.model is not None and subject.root.is_dir():
         known = {subject.model.image(i).name for i in subject.model.reg_image_ids()}
-        extra = [name for name in find_files(subject.root, PHOTOS) if name not in known]
+        extra = [name for name in find_files(subject.root, READABLE) if name not in known]
         if extra:
             text = f"{len(extra)} images in {subject.root} have no camera and are not used: {few(extra)}."
             findings.append(Finding("unregistered", "note", text))
@@ -86,21 +86,22 @@ def _digest(path: Path) -> str:
 
 
 def check_masks(subject: Subject) -> list[Finding]:
-    """Alpha channels, and a folder of masks."""
-    findings = []
+    """Alpha channels and masks."""
+    findings, count = [], len(subject.photos)
     if subject.alpha:
-        text = f"{len(subject.alpha)} of {len(subject.photos)} images have alpha: black behind them, with -w white"
-        level = "warning" if 0 < len(subject.alpha) < len(subject.photos) else "note"
+        text = f"{len(subject.alpha)} of {count} images have alpha: black behind them, with -w white"
+        level = "warning" if 0 < len(subject.alpha) < count else "note"
         findings.append(Finding("alpha", level, f"{text}."))
-    if (subject.source / MASKS).is_dir():
-        masks = ImageFinder(subject.source / MASKS)
-        names = [photo.name for photo in subject.photos]
-        without = [name for name in names if find_mask(masks, name) is None]
-        text = f"masks/ has masks for {len(names) - len(without)} of {len(names)} images"
+    without = [photo.name for photo in subject.photos if photo.mask is None]
+    if len(without) < count or (subject.source / MASKS).is_dir():
+        text = f"there are masks for {count - len(without)} of {count} images"
         if without:
             findings.append(Finding("masks", "warning", f"{text}; none for {few(without)}."))
         else:
             findings.append(Finding("masks", "ok", f"{text}."))
+    if subject.black:
+        text = f"the masks of {len(subject.black)} images are black; these are left out: {few(subject.black)}."
+        findings.append(Finding("masks", "note", text))
     return findings or [Finding("masks", "ok", "no alpha channels and no masks.")]
 
 
@@ -115,6 +116,9 @@ def check_loading(subject: Subject, folder: str) -> list[Finding]:
         else:
             text = "there are none to start from; training takes random ones, which gives worse results."
             missing = [Finding("points", "warning", text)]
+        if subject.thumbnails:
+            require_one_kind([(name, name in subject.linear) for name in subject.thumbnails], subject.source)
+            require_unmasked(len(subject.photos), len(subject.black), subject.source)
     except InputError as error:
         return [Finding("loading", "error", f"training would refuse this scene: {error}")]
     accepted = Finding("loading", "ok", "training would accept this scene.")
@@ -125,5 +129,7 @@ def check_cost(subject: Subject) -> list[Finding]:
     """Memory and time of a training, against what this machine has."""
     if not subject.photos:
         return []
-    text, fits = forecast([(photo.camera.width, photo.camera.height) for photo in subject.photos], len(subject.points))
+    sizes = [(photo.camera.width, photo.camera.height) for photo in subject.photos]
+    kinds = bool(subject.linear), any(photo.mask for photo in subject.photos), bool(subject.alpha)
+    text, fits = forecast(sizes, len(subject.points), *kinds)
     return [Finding("forecast", "note" if fits else "warning", text)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import psutil
 
 from warp_splat.config import CORES, TrainConfig
-from warp_splat.forecast import GIB, INSTANCES, expected_gaussians, step_memory
+from warp_splat.forecast import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
 from warp_splat.presets import PRESETS
 from warp_splat.scene.images import target_size
 
@@ -14,12 +14,17 @@ SECONDS_PER_PIXEL = 6.7e-7  # of a thread, for each step: 1216 s for 7,000 steps
 RUNS = {"--preset fast": PRESETS["fast"]["iterations"], "the default": TrainConfig.iterations}
 
 
-def forecast(sizes: list[tuple[int, int]], points: int) -> tuple[str, bool]:
+def forecast(
+    sizes: list[tuple[int, int]], points: int, linear: bool = False, masked: bool = False, alpha: bool = False
+) -> tuple[str, bool]:
     """Memory and time of a training with default options.
 
     Args:
         sizes: width and height [px] of each image.
         points: that training starts from.
+        linear: the images are in linear light.
+        masked: they have masks.
+        alpha: they have alpha.
 
     Returns:
         A sentence, and whether this machine has the memory.
@@ -28,8 +33,10 @@ def forecast(sizes: list[tuple[int, int]], points: int) -> tuple[str, bool]:
     targets = [target_size(*size, -1) for size in sizes]
     areas = [width * height for width, height in targets]
     gaussians, _ = expected_gaussians(points, max(areas), config)
-    step = step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, max(areas))
-    needed, available = BASE + 3 * sum(areas) + step, psutil.virtual_memory().available
+    per_pixel = pixel_floats(masked, False, linear)
+    step = step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, max(areas), per_pixel=per_pixel)
+    photographs = sum(areas) * ((3 * FLOAT if linear else 3) + masked + alpha)
+    needed, available = BASE + photographs + step, psutil.virtual_memory().available
     seconds = sum(areas) / len(areas) * SECONDS_PER_PIXEL / CORES
     times = ", ".join(f"{_span(steps * seconds)} for {name} ({steps} iterations)" for name, steps in RUNS.items())
     text = (

@@ -14,7 +14,7 @@ import pycolmap
 
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
-from warp_splat.scene import colmap, images, transforms
+from warp_splat.scene import colmap, images, transforms, with_masks
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_photo, make_sampling
 from warp_splat.scene.photos import ImageFinder
@@ -45,6 +45,8 @@ class Subject:
     random_points: bool = False  # not measured, but drawn: of a nerf-synthetic scene
     thumbnails: dict[str, np.ndarray] = field(default_factory=dict)  # by name, [h, w, 3] uint8
     alpha: list[str] = field(default_factory=list)  # names of images with an alpha channel
+    linear: list[str] = field(default_factory=list)  # in linear light
+    black: list[str] = field(default_factory=list)  # whose masks are black all over
 
 
 def few(names: Iterable[str]) -> str:
@@ -66,6 +68,7 @@ def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
             subject.photos = train + test
         except InputError as error:
             findings.append(Finding("transforms", "error", str(error)))
+    subject.photos = with_masks(subject.photos, source, lambda line: None)
     findings += _decode(subject)
     return subject, findings
 
@@ -138,18 +141,22 @@ def _match_files(subject: Subject) -> list[Finding]:
 
 
 def _decode(subject: Subject) -> list[Finding]:
-    """Read every image to its end; fills the thumbnails."""
+    """Read every image and every mask to its end; fills the thumbnails and what the images are."""
 
-    def read(photo: Photo) -> tuple[np.ndarray, bool] | str:
+    def read(photo: Photo) -> tuple[np.ndarray, list[list[str]]] | str:
+        """A thumbnail, and the lists that the photo belongs to."""
         try:
             image, alpha, linear = images.read_pixels(photo.path, 0.0)
+            lists = [subject.alpha] * (alpha is not None) + [subject.linear] * linear
+            if photo.mask and not images.read_mask(photo.mask, (image.shape[1], image.shape[0]), False).any():
+                lists.append(subject.black)
             image = to_srgb(image.clip(0), np.where) if linear else image
             scale = THUMBNAIL / max(image.shape[:2])
             size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
             roi = oiio.ROI(0, size[0], 0, size[1], 0, 1, 0, 3)
             small = oiio.ImageBufAlgo.resample(oiio.ImageBuf(np.ascontiguousarray(image)), roi=roi, nthreads=1)
             pixels = np.asarray(small.get_pixels(oiio.FLOAT))
-            return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), alpha is not None
+            return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), lists
         except InputError as error:
             return str(error)
 
@@ -161,7 +168,8 @@ def _decode(subject: Subject) -> list[Finding]:
             findings.append(Finding("files", "error", outcome))
         else:
             subject.thumbnails[photo.name] = outcome[0]
-            subject.alpha += [photo.name] if outcome[1] else []
+            for names in outcome[1]:
+                names.append(photo.name)
     if not findings and subject.photos:
         text = f"{len(subject.photos)} images of {subject.root} were read to their ends."
         findings.append(Finding("files", "ok", text))

@@ -15,7 +15,7 @@ from warp_splat.flags import fits
 from warp_splat.formats.atomic import write_text
 
 NAME = "config.toml"
-OF_ONE_RUN = ("model_path", "start_checkpoint", "config")  # where it wrote, where it came from
+OF_ONE_RUN = ("model_path", "start_checkpoint", "config", "viewer", "port")  # where it wrote, came from and was seen
 KINDS = {str: "a text", bool: "true or false", int: "a whole number", float: "a number", list: "a list of numbers"}
 
 

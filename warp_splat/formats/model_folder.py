@@ -18,7 +18,9 @@ import numpy as np
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.splats import SplatFile
 
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
@@ -72,6 +74,32 @@ def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     if iteration not in saved:
         raise InputError(f"{folder}: iteration {iteration} was not saved; there are {', '.join(map(str, saved))}.")
     return iteration
+
+
+def is_file_of_gaussians(path: str | Path) -> bool:
+    """Whether this names a file, of Gaussians it is to be hoped, not the folder of a model."""
+    path = Path(path)
+    return path.is_file() or (not path.exists() and path.suffix.lower() in FORMATS)
+
+
+def open_model(path: str | Path, iteration: int = -1) -> tuple[int, SplatFile, dict]:
+    """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
+
+    Of a file, the iteration is 0. Where there is no cfg_args, the options are that every 8th view was held out, and
+    the antialiasing that the file tells.
+
+    Raises:
+        InputError: if there is no such model, or it cannot be read.
+    """
+    path, options = Path(path), {"eval": True}
+    if is_file_of_gaussians(path):
+        iteration, file = 0, path
+    else:
+        iteration = find_iteration(path, iteration)
+        file = ply_path(path, iteration)
+        options = read_cfg_args(path) if (path / "cfg_args").exists() else options
+    gaussians = load_gaussians(file)
+    return iteration, gaussians, {"antialiasing": gaussians.antialiased, **options}
 
 
 def write_cfg_args(folder: str | Path, namespace: Mapping[str, object]) -> None:

@@ -14,12 +14,12 @@ import numpy as np
 
 from warp_splat import config as constants
 from warp_splat.camera import Camera
+from warp_splat.color import TOE
 from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.exchange import load_gaussians
-from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels import blend, harmonics
 from warp_splat.page import pack
 
@@ -43,11 +43,13 @@ def export_html(config: ExportHtmlConfig) -> int:
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
     if config.max_gaussians < 0:
         raise InputError(f"--max_gaussians: expected at least 0, got {config.max_gaussians}.")
-    (splats, antialiased), cameras, trained = _open(Path(config.model))
+    _, (splats, _), trained = model_folder.open_model(config.model)
+    cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
     kept = pack.shown(splats, config.max_gaussians)
     options = {
-        "ANTIALIASED": antialiased,
+        "ANTIALIASED": bool(trained.get("antialiasing")),
         "ELLIPSOID": trained.get("projection") == "ellipsoid",
+        "LINEAR": bool(trained.get("linear_light")),
         "BACKGROUND": float(bool(trained.get("white_background"))),
     }
     page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
@@ -62,16 +64,6 @@ def export_html(config: ExportHtmlConfig) -> int:
             "  This is a large page, for which phones lack the memory; --max_gaussians N keeps the N that matter most."
         )
     return 0
-
-
-def _open(path: Path) -> tuple[SplatFile, list[tuple[str, Camera]], dict]:
-    """The Gaussians, the cameras with their names, and the options of the training, of a model folder or a file."""
-    if not path.is_dir():
-        return load_gaussians(path), [], {}
-    trained = model_folder.read_cfg_args(path) if (path / "cfg_args").exists() else {}
-    file = load_gaussians(model_folder.ply_path(path, model_folder.find_iteration(path)))
-    antialiased = bool(trained.get("antialiasing", file.antialiased))
-    return SplatFile(file.splats, antialiased), model_folder.read_cameras(path), trained
 
 
 def _start(splats: SplatArrays) -> Camera:
@@ -94,7 +86,8 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         name: its title.
         splats: finite Gaussians.
         cameras: names and cameras, at least one; the first is where the page starts.
-        options: how to render: ANTIALIASED and ELLIPSOID (bool), BACKGROUND (float: 0.0 black, 1.0 white).
+        options: how to render: ANTIALIASED, ELLIPSOID, LINEAR (bool; the last: colors are in linear light), BACKGROUND
+            (float: 0.0 black, 1.0 white).
 
     Raises:
         InputError: if there are more Gaussians than browsers take.
@@ -141,8 +134,6 @@ def _constants(options: dict[str, object]) -> str:
     names = ("ALPHA_MIN", "ALPHA_MAX", "NEAR", "BLUR", "COMPENSATION_MIN", "FRUSTUM_MARGIN", "OUTLINE", "OUTLINE_REACH")
     values = {name: getattr(constants, name) for name in names}
     values |= {name: getattr(harmonics, name) for name in HARMONICS}
-    values |= {
-        f"{name}_STEPS": float(getattr(pack, f"{name}_STEPS")) for name in ("LOG", "ROTATION", "COLOR", "HARMONIC")
-    }
-    values |= {"LOG2_E": float(blend.LOG2_E), **options}
+    values |= {name: float(getattr(pack, name)) for name in STEPS}
+    values |= {"LOG2_E": float(blend.LOG2_E), "TOE": TOE, **options}
     return "\n".join(f"const {type(value).__name__} {name} = {str(value).lower()};" for name, value in values.items())

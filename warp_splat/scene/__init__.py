@@ -69,12 +69,11 @@ def load_scene(
     from warp_splat.scene.images import load_views  # noqa: PLC0415  keeps `import warp_splat` light
     from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
 
-    file = None
+    file, drawn = None, not (start or len(points))
     if start:
         file, points, colors = load_start(start, report)
-    elif not len(points):
+    elif drawn:
         points, colors = random_points([photo.camera for photo in train])
-        report(f"Warning: {source} has no points to start from; taking {len(points)} random ones, which trains worse.")
     require_visible(train, points, start or source)
     views = load_views(train + test, resolution, white_background, invert_masks)
     train_views, test_views = views[: len(train)], views[len(train) :]
@@ -82,31 +81,37 @@ def load_scene(
         train_views, test_views = _drop_masked(train_views, source, report), _drop_masked(test_views, source, report)
     if views[0].linear and not start:
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
-    _require_one_kind(train_views + test_views, source)
-    return Scene(train_views, test_views, points, colors, file)
+    require_one_kind([(view.name, view.linear) for view in train_views + test_views], source)
+    return Scene(train_views, test_views, points, colors, file, drawn)
 
 
 def _drop_masked(views: list[View], source: str | Path, report: Callable[[str], object]) -> list[View]:
     """The views with a pixel that counts."""
     kept = [view for view in views if view.mask is None or view.mask.any()]
-    if views and not kept:
-        raise InputError(
-            f"{source}: expected masks that leave something to train on or test with, but those of all {len(views)} "
-            "images are black; use --invert_masks, or remove the folder masks."
-        )
+    require_unmasked(len(views), len(views) - len(kept), source)
     if len(kept) < len(views):
         report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")
     return kept
 
 
-def _require_one_kind(views: list[View], source: str | Path) -> None:
-    odd = [view.name for view in views if view.linear != views[0].linear]
+def require_unmasked(count: int, black: int, source: str | Path) -> None:
+    """Refuse ``count`` photographs if as many have black masks."""
+    if 0 < count == black:
+        raise InputError(
+            f"{source}: expected masks that leave something to train on or test with, but those of all {count} images "
+            "are black; use --invert_masks, or remove the folder masks."
+        )
+
+
+def require_one_kind(photographs: list[tuple[str, bool]], source: str | Path) -> None:
+    """Refuse photographs, by name and whether they are in linear light, of which some are and some are not."""
+    name, linear = photographs[0]
+    odd = [other for other, kind in photographs if kind != linear]
     if odd:
         kinds = ("in linear light", "as a screen shows it")
-        here, there = kinds if views[0].linear else kinds[::-1]
+        here, there = kinds if linear else kinds[::-1]
         raise InputError(
-            f"{source}: expected photographs of one kind, but {views[0].name} is {here} and {odd[0]} {there}; convert "
-            "one kind."
+            f"{source}: expected photographs of one kind, but {name} is {here} and {odd[0]} {there}; convert one kind."
         )
 
 
@@ -130,10 +135,10 @@ def read_photos(
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
     if (source / "sparse").is_dir():
         photos, points, colors = colmap.read(source, folder, report)
-        return _masked(photos, source, report), [], points, colors
+        return with_masks(photos, source, report), [], points, colors
     if transforms.has_transforms(source):
         train, test, points, colors = transforms.read(source, report)
-        return _masked(train, source, report), _masked(test, source, report), points, colors
+        return with_masks(train, source, report), with_masks(test, source, report), points, colors
     expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
     photographs = find_files(photo_root(source), PHOTOS)
     if photographs:
@@ -148,7 +153,7 @@ def has_cameras(source: str | Path) -> bool:
     return (Path(source) / "sparse").is_dir() or transforms.has_transforms(Path(source))
 
 
-def _masked(photos: list[Photo], source: Path, report: Callable[[str], object]) -> list[Photo]:
+def with_masks(photos: list[Photo], source: Path, report: Callable[[str], object]) -> list[Photo]:
     """The photos with the masks that lie in the scene's folder, besides those that they have."""
     if photos and (source / MASKS).is_dir():
         masks = ImageFinder(source / MASKS)

@@ -49,6 +49,7 @@ class Scene:
     points: np.ndarray  # [P, 3] float32, world coordinates
     colors: np.ndarray  # [P, 3] uint8
     start: SplatFile | None = None  # Gaussians to start from instead; the points are their centers
+    random_points: bool = False  # drawn, since there were none
 
     @property
     def linear(self) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 
@@ -12,9 +11,10 @@ from warp_splat.camera import Camera
 from warp_splat.config import ViewConfig
 from warp_splat.devices import memory_explained
 from warp_splat.errors import InputError
+from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.interrupts import interruptible
-from warp_splat.render import is_file_of_gaussians, load_trained_scene, open_model, options_of
+from warp_splat.render import is_linear, load_trained_scene, options_of
 from warp_splat.renderer import RenderOutput
 from warp_splat.renderer import render as render_gaussians
 from warp_splat.scene.types import Scene
@@ -36,11 +36,11 @@ def view(config: ViewConfig) -> int:
         raise InputError("MODEL: expected the folder of a trained model, or a file of Gaussians; name one.")
     free_port(config.port)  # before the scene is loaded
     device = settle_device(launch.prepare(config.device, config.threads), config.device)
-    iteration, gaussians, trained = open_model(Path(config.model), config.iteration)
+    iteration, gaussians, trained = open_model(config.model, config.iteration)
     model = GaussianModel.from_splats(gaussians.splats).to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
     scene = _find_scene(config, trained)
-    draw = make_draw(model, trained)
+    draw = make_draw(model, trained, is_linear(scene, trained))
     print("Preparing kernels (compiled once on a machine, about 15 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
@@ -55,8 +55,14 @@ def view(config: ViewConfig) -> int:
     return 0
 
 
-def make_draw(model: GaussianModel, trained: dict) -> Draw:
-    """A function from a camera, and whether depth is wanted, to what the model looks like."""
+def make_draw(model: GaussianModel, trained: dict, linear: bool = False) -> Draw:
+    """A function from a camera, and whether depth is wanted, to what the model looks like.
+
+    Args:
+        model: the Gaussians.
+        trained: options of the training.
+        linear: its colors are in linear light.
+    """
     options = options_of(trained)
     background = torch.full((3,), float(bool(trained.get("white_background"))), device=model.device)
     with torch.no_grad():
@@ -65,16 +71,13 @@ def make_draw(model: GaussianModel, trained: dict) -> Draw:
     def draw(camera: Camera, depth: bool) -> RenderOutput:
         with torch.no_grad():
             out = render_gaussians(gaussians, camera, background, replace(options, depth=depth))
-        return on_screen(out, bool(trained.get("linear_light")))
+        return on_screen(out, linear)
 
     return draw
 
 
 def _find_scene(config: ViewConfig, trained: dict) -> Scene | None:
     """The scene of the model; None if it is not known or has gone, since one can look around without it."""
-    if not config.source_path and is_file_of_gaussians(Path(config.model)):
-        print("Without photographs: a file does not say what it was trained on; -s names the scene.")
-        return None
     try:
         return load_trained_scene(config.model, config.source_path, trained, print)
     except InputError as error:

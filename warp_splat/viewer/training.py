@@ -65,12 +65,13 @@ class TrainingViewer:
 
     @launch.profile(False)
     def show_end(self) -> None:
-        """Show the model as it was saved; evaluating it takes a while."""
+        """Show the model as it was saved, once to everybody; evaluating it takes a while."""
         self._button.disabled = True
+        self.paused = False  # by a click during the last step
         self._tell()
         self.viewer.refresh()
-        while self.viewer.draw():
-            pass
+        for _ in list(self.viewer.watchers):
+            self.viewer.draw()
 
     @launch.profile(False)
     def linger(self) -> None:
