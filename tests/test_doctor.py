@@ -228,6 +228,18 @@ def test_the_forecast_knows_what_a_photograph_takes():
     assert np.diff(told) / (5000 * 1600 * 1000 / 2**30) == pytest.approx([1, 1, 9], abs=0.1)
 
 
+def test_a_model_without_its_points(life, tmp_path, capsys):
+    (life / "sparse" / "0" / "points3D.bin").write_bytes(bytes(8))  # none
+    assert ("warning", "points") in worst(examine(life, tmp_path, capsys, 0)[0])
+
+
+def test_no_file_but_a_page_is_written_over(tmp_path, capsys):
+    photo = tmp_path / "photo.jpg"
+    photo.write_text("a photograph")
+    assert main(["inspect", str(EMBEDDED), "-o", str(photo)]) == 1
+    assert "ends in .html" in capsys.readouterr().err and photo.read_text() == "a photograph"
+
+
 def test_text_of_the_scene_is_not_html(tmp_path, capsys):
     name = "<script>alert(1)</script>.png".replace("/", "_")
     findings, page = examine(write_colmap(tmp_path / "a", names=(name, "b.png", "c.png")), tmp_path, capsys, 0)

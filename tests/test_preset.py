@@ -8,6 +8,7 @@ import pytest
 
 from warp_splat.cli import parse
 from warp_splat.config import TrainConfig
+from warp_splat.errors import InputError
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
 from warp_splat.trainer import Trainer
@@ -30,6 +31,12 @@ def test_flags_go_before_the_preset_and_the_preset_before_defaults():
     assert embedded.sh_interval == 7 and embedded.eval
     assert embedded.coarse == PRESETS["fast"]["coarse"]
     assert embedded.iterations == EMBEDDED_DEFAULTS["fast"]["iterations"]
+
+
+@pytest.mark.parametrize("flag", ["-s", "-m", "--resume", "--config"])
+def test_empty_paths_are_refused(flag):
+    with pytest.raises(InputError, match="an empty one"):
+        parse(["train", flag, ""])
 
 
 def test_presets_are_made_of_documented_flags():

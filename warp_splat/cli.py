@@ -106,6 +106,9 @@ def parse(arguments: list[str]) -> Config:
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
+    for name in ("source_path", "model_path", "start_checkpoint", "config"):
+        if values.get(name) == "":  # mostly a variable of a shell that was never set
+            raise InputError(f"--{name}: expected a path, got an empty one; leave the flag out or name one.")
     if values.get("config"):
         from warp_splat.formats.config_file import read_config  # noqa: PLC0415 - seldom needed
 
@@ -128,10 +131,10 @@ def _continued(given: dict) -> dict:
     source = given["start_checkpoint"]
     options = load_options(source)
     for name, reason in FIXED_OPTIONS.items():
-        if given.get(name, options[name]) != options[name]:
-            raise InputError(
-                f"--{name} {given[name]}: expected {options[name] or 'none'}, as in {source} ({reason}); leave it out."
-            )
+        kept = options[name]
+        if given.get(name, kept) != kept:
+            kept = "none" if kept == "" else kept
+            raise InputError(f"--{name} {given[name]}: expected {kept}, as in {source} ({reason}); leave it out.")
     return {**options, **given}
 
 

@@ -59,7 +59,8 @@ class Optimizer:
             "scales": config.scaling_lr,
             "quats": config.rotation_lr,
         }
-        late = max(iteration - config.iterations + config.cooldown, 0) / max(config.cooldown, 1)
+        cooldown = min(config.cooldown, config.iterations)
+        late = max(iteration - config.iterations + cooldown, 0) / max(cooldown, 1)
         for name, rate in rates.items():
             self._groups[name]["lr"] = rate * self.scale * 0.1**late
 

@@ -87,6 +87,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     config.start_ply = config.start_ply and os.path.abspath(config.start_ply)
     started = time.perf_counter()
     say(f"Scene {config.source_path}")
+    if config.coarse > 1 and config.coarse_until_iter > config.iterations:
+        say(f"Warning: images reach their full size at --coarse_until_iter {config.coarse_until_iter}, after the end.")
     scene = load_scene(
         config.source_path,
         images=config.images,

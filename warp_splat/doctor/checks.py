@@ -121,6 +121,9 @@ def check_loading(subject: Subject, folder: str) -> list[Finding]:
             require_unmasked(len(subject.photos), len(subject.black), subject.source)
     except InputError as error:
         return [Finding("loading", "error", f"training would refuse this scene: {error}")]
+    unread = len(subject.photos) - len(subject.thumbnails)
+    if unread:
+        return [Finding("loading", "error", f"training would refuse this scene: {unread} images cannot be read.")]
     accepted = Finding("loading", "ok", "training would accept this scene.")
     return [accepted, *missing, *(Finding("loading", "note", note) for note in notes)]
 

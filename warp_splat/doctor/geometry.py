@@ -46,7 +46,8 @@ def check_reprojection(subject: Subject, measured: Measured) -> list[Finding]:
     chosen = sample([image for image in registered if image.name in names], VIEWS)
     widths = {}
     for image in chosen:
-        pairs = [(point.xy, subject.model.point3D(point.point3D_id).xyz) for point in image.get_observation_points2D()]
+        seen = [point for point in image.get_observation_points2D() if subject.model.exists_point3D(point.point3D_id)]
+        pairs = [(point.xy, subject.model.point3D(point.point3D_id).xyz) for point in seen]
         if not pairs:
             continue
         keypoints, xyz = (np.array(column, np.float64) for column in zip(*pairs, strict=True))

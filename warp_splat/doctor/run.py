@@ -12,6 +12,7 @@ from warp_splat.doctor import checks, geometry
 from warp_splat.doctor.page import write_page
 from warp_splat.doctor.pictures import draw
 from warp_splat.doctor.subject import Finding, read_subject
+from warp_splat.errors import InputError
 from warp_splat.scene import has_cameras, read_photos
 
 LEVELS = ("error", "warning", "note", "ok")
@@ -26,6 +27,9 @@ def inspect(config: InspectConfig) -> int:
     """
     started = time.perf_counter()
     source = Path(config.scene)
+    page = Path(config.out or Path("output") / "inspect" / f"{source.resolve().name}.html")
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"--out {page}: expected the name of a page, which ends in .html; found {page.suffix!r}.")
     if not has_cameras(source):
         read_photos(source, config.images, print)  # says what is missing
     subject, findings = read_subject(source, config.images)
@@ -38,7 +42,6 @@ def inspect(config: InspectConfig) -> int:
     findings += checks.check_loading(subject, config.images) + checks.check_cost(subject)
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     verdict = _verdict(findings)
-    page = Path(config.out or Path("output") / "inspect" / f"{source.resolve().name}.html")
     write_page(page, f"Scene {source}", verdict, findings, draw(subject, measured))
     for finding in findings:
         print(f"{_colored(finding.level)}  {finding.check:13s} {finding.text}")
