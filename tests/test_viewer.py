@@ -506,6 +506,23 @@ def test_pause_ends(fake_viser, monkeypatch, happens):
     assert paused.waits >= 3 and (not paused.training.paused or paused.interrupted)
 
 
+def test_a_pause_while_a_frame_is_drawn_is_told(fake_viser, monkeypatch):
+    trainer, interrupted = Trainer(some_scene(), TrainConfig(iterations=10)), []
+    viewer, training = watch_training(trainer, Run(None, 0.0))
+    viewer.server.enter(FakeClient(1, trainer.scene.train[0].camera))
+    draw = viewer.draw
+
+    def draw_and_click():
+        if not training.paused:
+            training._toggle()
+        return draw()
+
+    monkeypatch.setattr(viewer, "draw", draw_and_click)
+    monkeypatch.setattr(viewer, "wait", lambda seconds: interrupted.append(2))
+    training.between_steps(interrupted)
+    assert training.paused and "paused" in training._facts.content
+
+
 def test_the_end_is_shown_once_to_everybody(fake_viser):
     """Also while one drags on and on, and where Pause was clicked during the last step."""
     trainer, run = Trainer(some_scene(), TrainConfig(iterations=10)), Run(None, 0.0, iteration=10)

@@ -50,10 +50,12 @@ class TrainingViewer:
         if not self.viewer.watchers and not self.paused:
             return
         self._refresh_if_due()
-        if self.paused:
-            self._tell()
-            tqdm.write(f"Paused after {self.run.iteration} iterations in the viewer, {self.viewer.address}")
+        told = False
         while not interrupted:
+            if self.paused and not told:  # by a click that came while a frame was drawn, too
+                told = True
+                self._tell()
+                tqdm.write(f"Paused after {self.run.iteration} iterations in the viewer, {self.viewer.address}")
             drawn = self._draw()
             if self.paused and self.viewer.deserted:
                 self._toggle()
