@@ -1,7 +1,8 @@
 """Files from strangers: whatever the bytes, a reader gives finite Gaussians or one sentence, in little memory.
 
 Random bytes, cuts, and changes of valid files: of the bytes, of what is compressed, and of values in the JSON.
-The short run is part of every test run; the long one is marked slow.
+The short run is part of every test run; the long one is marked slow. Both try the same inputs each time, so that they
+gate a change and nothing else; the long one tries others with ``--hypothesis-seed=N``.
 """
 
 import copy
@@ -169,7 +170,7 @@ def hostile(draw, kind, files):
     return changed(draw, data)
 
 
-def attack(kind, files, folder, examples):
+def attack(kind, files, folder, examples, seeded=False):
     (folder / "data.bin").write_bytes(files["data.bin"])
     assert survive(folder, kind, files[kind])
     found = [0, 0]
@@ -178,7 +179,7 @@ def attack(kind, files, folder, examples):
         max_examples=examples,
         deadline=None,
         database=None,
-        derandomize=examples == QUICK,
+        derandomize=not seeded,
         suppress_health_check=list(HealthCheck),
     )
     @given(data=hostile(kind, files))
@@ -196,8 +197,8 @@ def test_hostile_bytes(tmp_path, valid, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_hostile_bytes_for_long(tmp_path, valid, kind):
-    attack(kind, valid, tmp_path, LONG)
+def test_hostile_bytes_for_long(tmp_path, valid, kind, pytestconfig):
+    attack(kind, valid, tmp_path, LONG, pytestconfig.getoption("--hypothesis-seed") is not None)
 
 
 @pytest.mark.parametrize("kind", KINDS)

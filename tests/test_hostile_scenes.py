@@ -98,7 +98,7 @@ def hostile(draw, files):
     return path, changed(draw, data)
 
 
-def attack(kind, root, examples):
+def attack(kind, root, examples, seeded=False):
     shutil.rmtree(root, ignore_errors=True)
     files = {path: path.read_bytes() for path in KINDS[kind](root)}
     assert survive(root)
@@ -108,7 +108,7 @@ def attack(kind, root, examples):
         max_examples=examples,
         deadline=None,
         database=None,
-        derandomize=examples == QUICK,
+        derandomize=not seeded,
         suppress_health_check=list(HealthCheck),
     )
     @given(change=hostile(files))
@@ -132,8 +132,8 @@ def test_hostile_scenes(tmp_path, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_hostile_scenes_for_long(tmp_path, kind):
-    attack(kind, tmp_path / "scene", LONG)
+def test_hostile_scenes_for_long(tmp_path, kind, pytestconfig):
+    attack(kind, tmp_path / "scene", LONG, pytestconfig.getoption("--hypothesis-seed") is not None)
 
 
 @pytest.mark.parametrize("name", MODEL)
@@ -163,6 +163,23 @@ def test_bytes_in_a_file_that_are_no_text(tmp_path):
     assert b"channels\0chlist" in data
     path.write_bytes(data.replace(b"channels\0chlist", b"chann\x80ls\0chlist"))
     with pytest.raises(InputError, match=r"a\.exr: expected a complete image file"):
+        load(tmp_path)
+
+
+def test_a_model_whose_frames_name_images_that_it_lacks(tmp_path):
+    """pycolmap reads it, and raises when such an image is asked for."""
+    colmap(tmp_path, MODEL)
+    (tmp_path / "sparse" / "0" / "images.bin").write_bytes(bytes(8))
+    with pytest.raises(InputError, match="image 1 in frame 1 does not exist"):
+        load(tmp_path)
+
+
+def test_all_that_a_library_complains_of_is_cut_to_a_sentence(tmp_path):
+    """OpenEXR lists what follows from a name that stands there twice."""
+    (path,) = with_image(tmp_path, "a.exr")
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"screenWindowCenter\0", b"screenWindowCenter\0screenWindowCenter\0"))
+    with pytest.raises(InputError, match=r"a\.exr: .* \.\.\.\); replace this file\.$"):
         load(tmp_path)
 
 

@@ -60,7 +60,9 @@ class Camera:
                 raise InputError(f"Camera {name}: expected finite numbers, got {value.tolist()}.")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
-        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(self.rotation) < 0:
+        small = np.abs(self.rotation).max() < 2  # products of larger numbers may overflow
+        orthonormal = small and np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() <= 1e-4
+        if not orthonormal or np.linalg.det(self.rotation) < 0:
             raise InputError("Camera rotation: expected an orthonormal matrix with determinant +1 (world to camera).")
 
     @property

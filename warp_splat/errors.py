@@ -1,5 +1,13 @@
 """The one exception that a user's mistake may raise: its text is all they see."""
 
+REASON_MOST = 300  # characters of a library's own words: on a damaged file, OpenImageIO may list all that it met
+
 
 class InputError(ValueError):
     """Bad input. The message is one sentence: the file or argument, what was expected, what was found, what to do."""
+
+
+def reason_of(error: object) -> str:
+    """A library's own words as a part of one sentence: on one line, not longer than a reader will bear."""
+    words = " ".join(str(error).split()).rstrip(".")
+    return (words if len(words) <= REASON_MOST else words[:REASON_MOST] + " ...") or "no reason given"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.formats.atomic import atomic_write
 
 PNG_END = b"IEND\xaeB`\x82"  # the last chunk of every complete file, with its checksum
@@ -49,13 +49,13 @@ def load_png(path: str | Path) -> np.ndarray:
     unassociated["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(path), unassociated)
     if source is None:
-        raise InputError(f"{path}: could not be read as an image ({oiio.geterror()}).")
+        raise InputError(f"{path}: could not be read as an image ({reason_of(oiio.geterror())}).")
     channels = source.spec().nchannels
     if channels < 3:
         raise InputError(f"{path}: expected an image with red, green and blue, found {channels} channel(s).")
     image = source.read_image(0, 0, 0, 3, "uint8")
     if image is None:
-        raise InputError(f"{path}: the image is damaged ({source.geterror()}); write it again.")
+        raise InputError(f"{path}: the image is damaged ({reason_of(source.geterror())}); write it again.")
     return image
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
 import pycolmap
 
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.scene import images
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_photo, make_sampling
@@ -81,13 +81,12 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         model = pycolmap.Reconstruction(folder)
         if not (folder / "images.bin").is_file():
             _restore_names(model, folder / "images.txt")
-        for image in model.images.values():
-            _ = image.name  # from binary files, pycolmap decodes it only now
+        for image in model.reg_image_ids():
+            _ = model.image(image).name  # from binary files, pycolmap looks for it, and decodes it, only now
         return model
     except Exception as error:  # pycolmap raises many types, IndexError and ValueError among them
-        reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"{folder}: expected a COLMAP model, but pycolmap cannot read it ({reason}); export it again, "
+            f"{folder}: expected a COLMAP model, but pycolmap cannot read it ({reason_of(error)}); export it again, "
             f"for COLMAP {pycolmap.__version__} or older."
         ) from error
 

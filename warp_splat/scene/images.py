@@ -16,7 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.scene.types import View
 
 THREADS = 2  # OpenImageIO releases the GIL; more threads hold more decoded photographs in memory
@@ -222,8 +222,9 @@ def _text(get: Callable[..., str], *arguments: str) -> str:
 
 
 def _unreadable(path: Path, error: str) -> InputError:
-    reason = " ".join(error.split()).rstrip(".") or "no reason given"
-    return InputError(f"{path}: expected a complete image file, but it cannot be read ({reason}); replace this file.")
+    return InputError(
+        f"{path}: expected a complete image file, but it cannot be read ({reason_of(error)}); replace this file."
+    )
 
 
 def _buffer(array: np.ndarray) -> oiio.ImageBuf:

@@ -11,7 +11,7 @@ import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with it
 import pycolmap
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.scene import images
 from warp_splat.scene.images import Photo
 
@@ -69,10 +69,9 @@ def _undistorted(lens: pycolmap.Camera) -> pycolmap.Camera:
     try:
         return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
     except Exception as error:
-        reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
             f"expected a lens that can be undistorted, pycolmap refuses {lens.model_name} {lens.params.tolist()} "
-            f"({reason}); correct the model or leave this image out."
+            f"({reason_of(error)}); correct the model or leave this image out."
         ) from error
 
 

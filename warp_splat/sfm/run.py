@@ -19,7 +19,7 @@ import pycolmap
 from tqdm import tqdm
 
 from warp_splat.config import CORES, SfmConfig, TrainConfig
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.formats.atomic import write_json
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.photos import (
@@ -96,10 +96,9 @@ def _explained(work: Path) -> Iterator[None]:
     except InputError:
         raise
     except (RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"{work}: pycolmap cannot go on there ({reason}); free some space if the disk is full and run again, or "
-            "remove this folder to start anew."
+            f"{work}: pycolmap cannot go on there ({reason_of(error)}); free some space if the disk is full and run "
+            "again, or remove this folder to start anew."
         ) from error
 
 
