@@ -37,7 +37,7 @@ def filled(text: str) -> str:
 def flags() -> str:
     """The page of flags."""
     parts = [INTRODUCTION]
-    for name, (config_type, help) in COMMANDS.items():
+    for name, (config_type, _, help) in COMMANDS.items():
         parts.append(f"\n## warp-splat {name}\n{help[0].upper()}{help[1:]}.\n")
         defaults, heading = config_type(), None
         for item in fields(config_type):

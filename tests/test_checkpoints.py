@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scene_files import pose, write_colmap
 from splat_files import some_splats
-from test_distributed import TORCHRUN, Pretended
+from test_distributed import Pretended, torchrun
 from test_hostile_files import changed, changed_json
 from test_train import ROOT, SCENE, SHORT, fails, train
 
@@ -282,13 +282,10 @@ def test_other_numbers_of_processes(scene, tmp_path):
 def test_two_processes_stop_and_resume(tmp_path):
     """The same bytes as without a stop; one process goes on as well."""
 
-    def torchrun(*arguments):
-        command = [*TORCHRUN, ROOT / "train.py", *map(str, arguments)]
-        subprocess.run(command, check=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-
-    torchrun("-s", SCENE, "-m", tmp_path / "whole", *SHORT)
-    torchrun("-s", SCENE, "-m", tmp_path / "parts", *SHORT, "--iterations", "34")
-    torchrun("--resume", tmp_path / "parts", "--iterations", "60")
+    program = ROOT / "train.py"
+    torchrun(program, "-s", SCENE, "-m", tmp_path / "whole", *SHORT)
+    torchrun(program, "-s", SCENE, "-m", tmp_path / "parts", *SHORT, "--iterations", "34")
+    torchrun(program, "--resume", tmp_path / "parts", "--iterations", "60")
     assert ply_path(tmp_path / "parts", 60).read_bytes() == ply_path(tmp_path / "whole", 60).read_bytes()
     assert main(["train", "--resume", str(tmp_path / "parts"), "--iterations", "65", "--quiet"]) == 0
     assert ply_path(tmp_path / "parts", 65).is_file()

@@ -97,7 +97,7 @@ def test_the_list_of_flags_is_that_of_the_program():
 
 @pytest.mark.parametrize("page", [page for page in USERS if page.name != "flags.md"], ids=name_of)
 def test_flags_exist(page):
-    flags = [item for config_type, _ in COMMANDS.values() for item in fields(config_type)]
+    flags = [item for config_type, *_ in COMMANDS.values() for item in fields(config_type)]
     known = {name for item in flags for name in (f"--{item.name}", *item.metadata.get("names", ()))}
     foreign = {"--help", "--version", "--no", "--nproc-per-node", "--logdir", "--with"}  # of torchrun, TensorBoard, uv
     code = " ".join(re.findall(r"`([^`\n]+)`", prose(page)) + [text for kind, text in blocks(page) if not kind])

@@ -369,6 +369,7 @@ def test_convert_says_what_is_lost(tmp_path, capsys):
         ("a.ply", "b", "found 'no ending'"),
         ("none.spz", "b.ply", "none.spz: no such file"),
         ("a.spz", "b.ply", "a.spz: expected an SPZ file of version 2, 3 or 4, found a file that begins with b'ply"),
+        ("a.ply", "a.ply", "expected another file than the source"),
         ("empty.ply", "b.splat", "there are no Gaussians"),
         ("empty.ply", "b.glb", "there are no Gaussians"),
     ],

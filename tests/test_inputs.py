@@ -19,12 +19,14 @@ from scene_files import (
     write_image,
     write_model,
 )
+from splat_files import some_file
 from test_losses import oracle
 from test_scene import distorted_picture, fisheye, pattern, radial
 
 from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluate import evaluate_views
+from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.ply import save_points
 from warp_splat.losses import LossByConvolution, image_loss
 from warp_splat.metrics import METRICS, psnr, ssim
@@ -81,6 +83,21 @@ def test_transforms_sizes_twice_those_of_the_files(tmp_path):
     assert (camera.width, camera.fx, camera.fy, camera.cx, camera.cy) == (WIDTH, 20, 22, 11.25, 8.625)
 
 
+def test_transforms_with_lists_of_names(tmp_path):
+    names = [f"images/{name}.png" for name in "abcde"]
+    root = write_transforms(tmp_path, names, train_filenames=[names[3], f"./{names[0]}"], val_filenames=[names[1]])
+    scene, lines = load(root, eval=True)
+    assert [view.name for view in scene.train] == [names[0], names[3]]
+    assert [view.name for view in scene.test] == [names[1]]
+    assert lines == ["Leaving out 2 of 5 images that transforms.json neither trains nor tests on."]
+    assert [view.name for view in load(root)[0].train] == [names[0], names[3], names[1]]
+    scene, lines = load(
+        write_transforms(tmp_path, names, test_filenames=names[2:4], val_filenames=names[:1]), eval=True
+    )
+    assert [view.name for view in scene.train] == [names[0], names[1], names[4]] and not lines
+    assert [view.name for view in scene.test] == names[2:4]
+
+
 def full_radial(x, y, k1, k2, p1, p2, k3, k4=0.0, k5=0.0, k6=0.0):
     """OpenCV's rational model."""
     r2 = x * x + y * y
@@ -89,6 +106,21 @@ def full_radial(x, y, k1, k2, p1, p2, k3, k4=0.0, k5=0.0, k6=0.0):
         x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
     )
+
+
+def thin_prism(x, y, k1, k2, p1, p2, k3, k4, s1, s2):
+    """Weng et al. 1992 on the angles of a fisheye, in COLMAP's order of the parameters."""
+    x, y = fisheye(x, y, 0.0, 0.0, 0.0, 0.0)
+    dx, dy = full_radial(x, y, k1, k2, p1, p2, k3)
+    r2 = x * x + y * y
+    return dx + x * k4 * r2**4 + s1 * r2, dy + y * k4 * r2**4 + s2 * r2
+
+
+def field_of_view(x, y, omega):
+    """Devernay and Faugeras 2001."""
+    r = np.hypot(x, y)
+    factor = np.arctan(2 * r * np.tan(omega / 2)) / (r * omega)
+    return x * factor, y * factor
 
 
 def check_ideal(view):
@@ -124,6 +156,8 @@ def test_transforms_with_distortion(tmp_path, model, distort, params, values):
         ("FULL_OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
         ("SIMPLE_RADIAL_FISHEYE", fisheye, (0.02,)),
         ("RADIAL_FISHEYE", fisheye, (0.02, -0.01)),
+        ("THIN_PRISM_FISHEYE", thin_prism, (0.02, -0.01, 0.002, 0.001, 0.003, 0.0, 0.004, -0.002)),
+        ("FOV", field_of_view, (0.4,)),
     ],
 )
 def test_other_models_of_colmap(tmp_path, model, distort, params):
@@ -172,6 +206,10 @@ BAD = {
     "absolute": (broken(lambda c: c["frames"][0].update(file_path="/etc/hostname")), ["'/etc/hostname'"]),
     "long": (broken(lambda c: c["frames"][0].update(file_path="x" * 5000)), ["1 of them cannot be found"]),
     "nul": (broken(lambda c: c["frames"][0].update(file_path="a\0b/c")), ["1 of them cannot be found"]),
+    "list": (broken(test_filenames=["images/c.png"]), ["'images/c.png' has no frame or is in two"]),
+    "list-twice": (broken(train_filenames=["images/a.png"], val_filenames=["images/a.png"]), ["'images/a.png'"]),
+    "list-all": (broken(val_filenames=["images/a.png", "images/b.png"]), ["none is left to train on"]),
+    "list-odd": (broken(train_filenames="images/a.png"), ["train_filenames as a list of names", "'images/a.png'"]),
     "points": (broken(lambda c: c.update(ply_file_path="b.ply")), ["'b.ply'", "no such file"]),
     "points-outside": (broken(lambda c: c.update(ply_file_path="../b.ply")), ["in this folder"]),
     "points-number": (broken(lambda c: c.update(ply_file_path=3)), ["string as ply_file_path"]),
@@ -258,6 +296,9 @@ def test_start_from_a_file(tmp_path, degree):
             assert torch.equal(found, tensor)
     with pytest.raises(InputError, match="no such file"):
         load(root, start=str(tmp_path / "b.ply"))
+    save_gaussians(tmp_path / "empty.ply", some_file(0))
+    with pytest.raises(InputError, match=r"empty\.ply: expected at least one Gaussian to start from"):
+        load(root, start=str(tmp_path / "empty.ply"))
 
 
 # masks -------------------------------------------------------------------------------------------

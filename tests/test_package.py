@@ -43,6 +43,16 @@ def test_version_on_the_command_line():
     assert warp_splat.__version__ in out.stdout
 
 
+def test_ctrl_c_while_libraries_load():
+    code = (
+        "import signal; from warp_splat import cli\n"
+        "cli.importlib.import_module = lambda name: signal.raise_signal(signal.SIGINT)\n"
+        "cli.main(['render'])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 130 and run.stderr == "warp-splat: interrupted before it began.\n"
+
+
 def image(count=3000):
     generator = torch.Generator().manual_seed(0)
     means = torch.randn(count, 3, generator=generator) + torch.tensor([0.0, 0.0, 5.0])

@@ -239,6 +239,15 @@ def test_means2d_carries_gradients_of_its_own(device):
     assert relative_error(leaves["means"].grad, exact["means"].grad) < 1e-5
 
 
+def test_second_derivatives_are_refused(device):
+    scene = SCENES["offcentre"]()
+    leaves = leaves_of(scene.to(device))
+    loss = rasterize(scene, leaves).image.square().sum()
+    (first,) = torch.autograd.grad(loss, leaves["means"], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.sum().backward()
+
+
 @pytest.mark.parametrize("key", ["image", "alpha", "depth"])
 def test_one_output_alone(key, device):
     """A loss on one output only: the others bring nothing."""

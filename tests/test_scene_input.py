@@ -96,6 +96,11 @@ def no_test_left(root):
     return write_colmap(root, ["only.png"]), {"eval": True}
 
 
+def trained_model(root):
+    (root / "point_cloud").mkdir()
+    return root, {}
+
+
 def unknown_binary_model(path):
     data = bytearray(path.read_bytes())
     data[12:16] = (99).to_bytes(4, "little")
@@ -113,6 +118,7 @@ BAD = {
         plain_photos,
         ["model (sparse/), transforms_train.json or transforms.json", "1 photographs alone", "warp-splat sfm"],
     ),
+    "model": (trained_model, ["found a trained model", "folder of its scene"]),
     "resolution-0": (colmap_case(lambda root: None, resolution=0), ["resolution", "got 0"]),
     "resolution-negative": (colmap_case(lambda root: None, resolution=-2), ["resolution", "got -2"]),
     "eval-one-image": (no_test_left, ["at least 2 images", "found 1", "--eval"]),

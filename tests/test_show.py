@@ -43,12 +43,15 @@ def test_video(told, capsys, video, opposite):
     assert psnr(film[0], film[opposite]) < 25
 
 
-def test_frames_of_a_video(told, tmp_path):
+def test_frames_of_a_video(told, tmp_path, capsys):
     """A folder gets the frames that the film shows, as H.264 keeps them; the first is the first photograph's."""
     for output in (tmp_path / "frames", tmp_path / "film.mp4"):
         options = ["--video", "path", "--frames", "11", "--orbit_output", str(output), "--quiet"]
         assert main(["render", "-m", str(told), *options]) == 0
     frames = [load_png(path) for path in sorted((tmp_path / "frames").iterdir())]
+    few = ["--video", "path", "--frames", "9", "--video_output", str(tmp_path / "frames")]
+    assert main(["render", "-m", str(told), *few]) == 0
+    assert "2 older frames are in" in capsys.readouterr().out
     assert psnr(frames[0], load_png(told / "train" / "ours_20" / "renders" / "00000.png")) > 60
     for decoded, frame in zip(decode(tmp_path / "film.mp4"), frames, strict=True):
         assert frame.shape == (61, 65, 3) and psnr(np.ascontiguousarray(decoded[:61, :65]), frame) > 30

@@ -194,6 +194,9 @@ def test_help_answers_without_torch_or_warp():
     ("options", "words"),
     [
         (("--iterations", "0"), ("--iterations", "at least 1", "0")),
+        (("--save_iterations", "5", "-5"), ("--save_iterations", "at least 1", "-5")),
+        (("-m", str(SCENE)), ("another folder than the scene's",)),
+        (("--config", "/no/such/file"), ("/no/such/file", "TOML", "(No such file or directory)")),
         (("--device", "cpu", "--data_device", "cuda"), ("--data_device cuda", "GPU")),
         (("--start_checkpoint", "x.pth"), ("x.pth", "can run code")),
         (("--iteratons", "5"), ("--iteratons", "--iterations")),
@@ -212,8 +215,9 @@ def test_bad_options(options, words, tmp_path, capsys):
 
 def test_output_folder_that_cannot_be_written(tmp_path, capsys):
     (tmp_path / "file").write_text("in the way")
-    message = fails(capsys, "train", "-s", str(SCENE), "-m", str(tmp_path / "file" / "model"))
-    assert str(tmp_path / "file") in message
+    for scene in (SCENE, tmp_path / "no scene"):  # said before the scene is loaded
+        message = fails(capsys, "train", "-s", str(scene), "-m", str(tmp_path / "file" / "model"))
+        assert f"{tmp_path / 'file'} is a file" in message
 
 
 def test_a_folder_that_holds_a_model_is_left_alone(trained, capsys):

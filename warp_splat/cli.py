@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import fields
 
 from warp_splat import __version__
@@ -22,6 +24,7 @@ from warp_splat.config import (
 )
 from warp_splat.errors import InputError
 from warp_splat.flags import FOREIGN_FLAGS
+from warp_splat.interrupts import leaving_at_once
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
 Config = (
@@ -34,15 +37,16 @@ Config = (
     | ExportHtmlConfig
     | CompareConfig
 )
+#: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
 COMMANDS = {
-    "sfm": (SfmConfig, "compute the cameras of photographs or of a video: a scene to train on"),
-    "inspect": (InspectConfig, "examine a scene before training: a verdict for each check, a page with pictures"),
-    "train": (TrainConfig, "train Gaussians on a scene's photographs"),
-    "render": (RenderConfig, "render the views of a trained model with their metrics, or a video"),
-    "view": (ViewConfig, "look at a trained model in a browser"),
-    "convert": (ConvertConfig, "convert Gaussians between .ply, .splat, .spz and glTF, and say what was lost"),
-    "export-html": (ExportHtmlConfig, "write a page that shows a model in any browser, without a server or a network"),
-    "compare": (CompareConfig, "compare adjoints, knobs and models: error against run time"),
+    "sfm": (SfmConfig, "sfm.run.sfm", "compute the cameras of photographs or of a video: a scene to train on"),
+    "inspect": (InspectConfig, "doctor.run.inspect", "examine a scene before training: verdicts, a page with pictures"),
+    "train": (TrainConfig, "train.train", "train Gaussians on a scene's photographs"),
+    "render": (RenderConfig, "render.render", "render the views of a trained model with their metrics, or a video"),
+    "view": (ViewConfig, "viewer.run.view", "look at a trained model in a browser"),
+    "convert": (ConvertConfig, "convert.convert", "convert Gaussians between .ply, .splat, .spz and glTF"),
+    "export-html": (ExportHtmlConfig, "page.export.export_html", "write a page that shows a model in any browser"),
+    "compare": (CompareConfig, "compare.run.compare", "compare adjoints, knobs and models: error against run time"),
 }
 
 
@@ -79,7 +83,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"warp-splat {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
-    for name, (config_type, help) in COMMANDS.items():
+    for name, (config_type, _, help) in COMMANDS.items():
         places = [item.name.upper() for item in fields(config_type) if item.metadata["positional"]]
         usage = " ".join(["warp-splat", name, *places, "[options]"])  # not all flags before the first line of help
         command = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", usage=usage)
@@ -138,6 +142,12 @@ def _continued(given: dict) -> dict:
     return {**options, **given}
 
 
+def _function_of(config: Config) -> Callable[[Config], int]:
+    """The function that runs the command of this configuration, loaded now."""
+    module, name = next(place for kind, place, _ in COMMANDS.values() if isinstance(config, kind)).rsplit(".", 1)
+    return getattr(importlib.import_module(f"warp_splat.{module}"), name)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
     try:
@@ -148,22 +158,8 @@ def main(arguments: list[str] | None = None) -> int:
         # torch's profiler, by which the comparison measures memory, would tell what it does
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
-        if isinstance(config, TrainConfig):
-            from warp_splat.train import train as run  # noqa: PLC0415 - torch and Warp take seconds to load
-        elif isinstance(config, SfmConfig):
-            from warp_splat.sfm.run import sfm as run  # noqa: PLC0415
-        elif isinstance(config, InspectConfig):
-            from warp_splat.doctor.run import inspect as run  # noqa: PLC0415
-        elif isinstance(config, ViewConfig):
-            from warp_splat.viewer.run import view as run  # noqa: PLC0415
-        elif isinstance(config, ConvertConfig):
-            from warp_splat.convert import convert as run  # noqa: PLC0415
-        elif isinstance(config, ExportHtmlConfig):
-            from warp_splat.page.export import export_html as run  # noqa: PLC0415
-        elif isinstance(config, CompareConfig):
-            from warp_splat.compare.run import compare as run  # noqa: PLC0415
-        else:
-            from warp_splat.render import render as run  # noqa: PLC0415
+        with leaving_at_once():
+            run = _function_of(config)
         return run(config)
     except InputError as error:
         if os.environ.get("WARP_SPLAT_TRACEBACK"):

@@ -284,6 +284,9 @@ def check_train(config: TrainConfig) -> str | None:
     for name, low in at_least.items():
         if getattr(config, name) < low:
             return f"--{name}: expected at least {low}, got {getattr(config, name)}."
+    for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
+        if min(getattr(config, name), default=1) < 1:
+            return f"--{name}: expected numbers of steps, at least 1, got {min(getattr(config, name))}."
     if not 1 <= config.port <= 65535:
         return f"--port: expected 1 to 65535, got {config.port}."
     if not 0 <= config.seed < 2**63:

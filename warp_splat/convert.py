@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 
 from warp_splat.config import ConvertConfig
+from warp_splat.errors import InputError
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import open_model
 from warp_splat.formats.splats import COEFFICIENTS, LOG_SCALES, SH_C0, SplatArrays, SplatFile, sigmoid, unit_quats
@@ -19,6 +22,8 @@ def convert(config: ConvertConfig) -> int:
         InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
     """
     format_of(config.target)  # before anything is read
+    if os.path.exists(config.target) and os.path.samefile(config.source, config.target):
+        raise InputError(f"{config.target}: expected another file than the source; name a new one.")
     _, before, trained = open_model(config.source)
     before = before._replace(antialiased=bool(trained["antialiasing"]))
     notes: list[str] = []
@@ -57,7 +62,7 @@ def _changes(old: SplatArrays, new: SplatArrays) -> list[tuple[str, str, float, 
     others = np.where((quats * others).sum(axis=1, keepdims=True) < 0, -others, others)
     halves = np.linalg.norm(quats - others, axis=1), np.linalg.norm(quats + others, axis=1)
     return [
-        ("position", "", largest(old.means), np.abs(old.means - new.means)),
+        ("position", "", largest(old.means), np.abs(old.means.astype(np.float64) - new.means)),
         ("scale", "", largest(scales[0]), np.abs(scales[0] - scales[1])),
         ("opacity", "", 1.0, np.abs(sigmoid(old.opacities) - sigmoid(new.opacities))),
         ("colour", "", 1.0, SH_C0 * np.abs(old.sh[:, 0] - new.sh[:, 0])),

@@ -23,11 +23,6 @@ from warp_splat.launch import stage
 PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
 
 
-#: What the last exchange took. A thread of gloo lets go of it a moment later; if it were the last to do so while Python
-#: shuts down, the process would abort.
-_exchanged: tuple = ()
-
-
 class GroupError(InputError):
     """The processes cannot go on together: one has ended, or their models differ."""
 
@@ -129,10 +124,8 @@ class ProcessGroup(Processes):
             )
 
     def _exchange(self, collective: Callable, *arguments) -> None:
-        global _exchanged
         try:
             collective(*arguments)
-            _exchanged = arguments
         except RuntimeError as error:
             if is_out_of_memory(error):
                 raise
@@ -166,6 +159,10 @@ def join(device: str) -> Iterator[Processes]:
             f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
             f"({error}); start several processes with torchrun, or unset it."
         ) from error
+    # torch loads this later anyhow, and functions of it have the group that there is then as a default: nothing would
+    # end it, nor the threads of gloo, which abort a process that shuts down around them
+    import torch.distributed.nn  # noqa: PLC0415 - only of use here
+
     backend = "gloo"
     if device != "cpu" and torch.cuda.is_available():
         if local_count > torch.cuda.device_count():

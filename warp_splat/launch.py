@@ -53,16 +53,24 @@ class _Job:
         self.helping = 0
         self.error: BaseException | None = None
 
-    def work(self) -> None:
-        """The caller's part: run slices until there are no more, and until the helpers are done."""
-        try:
-            self._run_slices()
-        finally:  # nobody may still write into tensors that the caller is about to free
-            with self.lock:
+    def share(self, helpers: int) -> None:
+        """The caller's part: call ``helpers``, run slices until there are no more, wait for those that are at work.
+
+        An error or Ctrl-C is raised only then: nobody may still write into tensors that the caller is about to free.
+        """
+        error = None
+        while True:
+            try:
+                for _ in range(helpers):
+                    _jobs.put(self)
+                self._run_slices()
+                self.idle.wait()
+                break
+            except BaseException as raised:  # Ctrl-C comes at any of these lines, mostly while waiting
+                error, helpers = raised, 0
                 self.slices.clear()
-            self.idle.wait()
-        if self.error:
-            raise self.error
+        if error or self.error:
+            raise error or self.error
 
     def _run_slices(self) -> None:
         while True:
@@ -220,10 +228,7 @@ def launch(
         _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
         _helpers[-1].start()
     wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
-    job = _Job(run, full)
-    for _ in range(helpers):
-        _jobs.put(job)
-    job.work()
+    _Job(run, full).share(helpers)
 
 
 def launch_blocks(

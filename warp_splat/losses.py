@@ -8,6 +8,7 @@ import math
 import numpy as np
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from warp_splat.errors import InputError
@@ -99,6 +100,7 @@ class LossByConvolution(torch.autograd.Function):
         return ctx.loss.detach()
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, adj_loss):
         with stage("adjoint of loss"):
             return *torch.autograd.grad(ctx.loss, ctx.image, adj_loss), None, None
@@ -138,6 +140,7 @@ class ImageLoss(torch.autograd.Function):
             return torch.tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), dtype=torch.float32)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, adj_loss):
         with stage("adjoint of loss"):
             x, y, slopes = ctx.saved_tensors

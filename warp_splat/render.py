@@ -213,6 +213,9 @@ def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output
         folder = model_folder.prepare(output)
         for index, frame in enumerate(frames):
             save_png(folder / f"{index:05d}.png", frame)
+        older = len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)
+        if older:
+            print(f"Warning: {older} older frames are in {folder}, too.")
     else:
         for _ in frames:
             pass

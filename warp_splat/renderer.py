@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 import warp as wp
+from torch.autograd.function import once_differentiable
 
 from warp_splat.binning import bin_tiles, views2d
 from warp_splat.blocks import adjoint_of_blocks, blend_blocks
@@ -231,6 +232,7 @@ class Project(torch.autograd.Function):
         return *outputs, radii
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
             saved = ctx.saved_tensors
@@ -275,6 +277,7 @@ class Blend(torch.autograd.Function):
         return image, alpha, depth
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, adj_image, adj_alpha, adj_depth):
         with stage("adjoint of blend"):
             background, *saved = ctx.saved_tensors

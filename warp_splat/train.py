@@ -169,6 +169,9 @@ def _choose_folder(config: TrainConfig, checkpoint: Checkpoint | None) -> Path:
     """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
     default = checkpoint.path.parent if checkpoint else model_folder.default_model_path()
     folder = Path(config.model_path or default)
+    model_folder.check_place(folder)
+    if config.source_path and folder.resolve() == Path(config.source_path).resolve():
+        raise InputError(f"-m {folder}: expected another folder than the scene's; choose a new one.")
     continued = checkpoint and checkpoint.path.resolve() == (folder / LAST).resolve()
     if not continued and ((folder / LAST).exists() or any(folder.glob("point_cloud/*/*.ply"))):
         raise InputError(

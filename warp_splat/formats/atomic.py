@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import math
 import os
@@ -12,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from warp_splat.errors import InputError
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
@@ -42,7 +45,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(
             f"{path}: could not be written ({error.strerror or error}); an older file of this name is untouched. "
-            "Free some space or choose another folder."
+            f"{'Free some space or choose' if error.errno in FULL else 'Choose'} another folder."
         ) from error
 
 

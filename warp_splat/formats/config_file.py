@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_splat.config import TrainConfig
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.flags import fits
 from warp_splat.formats.atomic import write_text
 
@@ -29,7 +29,8 @@ def read_config(path: str | Path) -> dict[str, Any]:
         with open(path, "rb") as file:
             found = tomllib.load(file)
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"--config {path}: expected a TOML file with options of training ({error}).") from error
+        reason = reason_of(getattr(error, "strerror", None) or error)
+        raise InputError(f"--config {path}: expected a TOML file with options of training ({reason}).") from error
     defaults, options = TrainConfig(), {item.name: item for item in fields(TrainConfig) if item.name != "config"}
     for name, value in found.items():
         if name not in options:

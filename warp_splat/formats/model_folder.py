@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import uuid
 from collections.abc import Mapping, Sequence
@@ -29,6 +30,18 @@ if TYPE_CHECKING:
 def default_model_path() -> Path:
     """A folder name that is new each time: ``output/`` and ten characters of a UUID."""
     return Path("output") / str(uuid.uuid4())[:10]
+
+
+def check_place(folder: Path) -> None:
+    """Refuse a folder that :func:`prepare` could not create or write, as far as one sees without trying.
+
+    Raises:
+        InputError: if a file is in the way, or permissions are.
+    """
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        reason = "may not be written" if place.is_dir() else "is a file"
+        raise InputError(f"{folder}: expected a folder that can be written ({place} {reason}); choose another.")
 
 
 def prepare(folder: str | Path) -> Path:

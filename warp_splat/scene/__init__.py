@@ -140,6 +140,8 @@ def read_photos(
         train, test, points, colors = transforms.read(source, report)
         return with_masks(train, source, report), with_masks(test, source, report), points, colors
     expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
+    if (source / "point_cloud").is_dir():
+        raise InputError(f"{source}: {expected}, found a trained model; give the folder of its scene.")
     photographs = find_files(photo_root(source), PHOTOS)
     if photographs:
         raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")

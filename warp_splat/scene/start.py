@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from warp_splat.camera import Camera
+from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.ply import GRAY
 from warp_splat.formats.splats import SH_C0, SplatFile
@@ -64,8 +65,10 @@ def load_start(path: str, report: Callable[[str], None]) -> tuple[SplatFile, np.
     """Gaussians of a file, their centers [N, 3] float32 and colors [N, 3] uint8, seen from nowhere in particular.
 
     Raises:
-        InputError: if it is missing or not a file of Gaussians.
+        InputError: if it is missing or not a file of Gaussians, or if there are none in it.
     """
     file = load_gaussians(path, report)
+    if not len(file.splats.means):
+        raise InputError(f"{path}: expected at least one Gaussian to start from, found none; name another file.")
     colors = (255 * (SH_C0 * file.splats.sh[:, 0].astype(np.float64) + 0.5)).clip(0, 255).round().astype(np.uint8)
     return file, file.splats.means, colors

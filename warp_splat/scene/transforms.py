@@ -40,9 +40,9 @@ def read(source: Path, report: Callable[[str], object]) -> tuple[list[Photo], li
     """Read the cameras in ``source``, and its points or, for nerf-synthetic, random ones.
 
     Returns:
-        Photos of the training set; those of the test set, empty without transforms_test.json; points [P, 3] float32,
-        for nerf-synthetic 100,000, uniform in [-1.3, 1.3]^3, always the same, for others maybe none; colors [P, 3]
-        uint8.
+        Photos of the training set; those of the test set, empty without transforms_test.json or nerfstudio's lists of
+        names; points [P, 3] float32, for nerf-synthetic 100,000, uniform in [-1.3, 1.3]^3, always the same, for others
+        maybe none; colors [P, 3] uint8.
 
     Raises:
         InputError: if a file is missing, cannot be parsed, lacks a key, holds a matrix that is not a pose or a lens
@@ -50,7 +50,8 @@ def read(source: Path, report: Callable[[str], object]) -> tuple[list[Photo], li
     """
     if not (source / TRAIN).is_file():
         content = _parse(source / ALL)
-        return _read_photos(source / ALL, content, report), [], *_points(source, content.get("ply_file_path"), report)
+        train, test = _split(source / ALL, content, _read_photos(source / ALL, content, report), report)
+        return train, test, *_points(source, content.get("ply_file_path"), report)
     train, test = (
         _read_photos(path, _parse(path), report) if path.is_file() else [] for path in (source / TRAIN, source / TEST)
     )
@@ -98,6 +99,36 @@ def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], ob
     if distorted:
         report(f"Undistorting {distorted} of {len(photos)} images to pinhole cameras.")
     return photos
+
+
+def _split(
+    path: Path, content: dict[str, Any], photos: list[Photo], report: Callable[[str], object]
+) -> tuple[list[Photo], list[Photo]]:
+    """Photos to train on and to hold out, by nerfstudio's lists of names; all are to train on where it has none.
+
+    Held out are those of test_filenames or, without it, of val_filenames; to train on those of train_filenames or,
+    without it, the rest.
+    """
+    names = [Path(frame["file_path"]).as_posix() for frame in content["frames"]]
+    train, val, test = (_names(content, f"{key}_filenames", path) for key in ("train", "val", "test"))
+    held_out = test or val
+    to_train = train or {*names} - held_out
+    odd = ((to_train | held_out) - {*names}) | (to_train & held_out)
+    if odd or not to_train:
+        problem = f"{min(odd)!r:.200} has no frame or is in two" if odd else "none is left to train on"
+        raise InputError(f"{path}: expected lists of names that part the frames, but {problem}; correct the file.")
+    unused = len({*names} - to_train - held_out)
+    if unused:
+        report(f"Leaving out {unused} of {len(names)} images that {path.name} neither trains nor tests on.")
+    pick = lambda chosen: [photo for photo, name in zip(photos, names, strict=True) if name in chosen]  # noqa: E731
+    return pick(to_train), pick(held_out)
+
+
+def _names(content: dict[str, Any], key: str, path: Path) -> set[str]:
+    names = content.get(key, [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{path}: expected {key} as a list of names, got {reprlib.repr(names)}; correct the file.")
+    return {Path(name).as_posix() for name in names}
 
 
 def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sampling, where: str) -> Photo:

@@ -23,6 +23,7 @@ from warp_splat.interrupts import interruptible
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
+BLOCK = 10  # images: pairs are matched in blocks of this size squared, and Ctrl-C is heard after each
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
 
@@ -113,6 +114,7 @@ def match(database: Path, matching: str, seed: int, threads: int, quiet: bool) -
         total, run = _sequential_pairs(images, pairing.overlap), pycolmap.match_sequential
     else:
         pairing = pycolmap.ExhaustivePairingOptions()
+        pairing.block_size = BLOCK
         total, run = images * (images - 1) // 2, pycolmap.match_exhaustive
 
     def work(token):
