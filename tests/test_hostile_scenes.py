@@ -17,7 +17,7 @@ from test_inputs import light, write_floats, write_transforms
 
 from warp_splat.errors import InputError
 
-QUICK, LONG = 60, 2_000  # examples for each kind
+QUICK, LONG = 60, 1_000  # examples for each kind
 MEMORY = 2**30  # bytes that all examples of a kind may add to the process: one is decoded at a time
 MODEL = ("rigs.bin", "cameras.bin", "frames.bin", "images.bin", "points3D.bin")
 OLD_MODEL = ("cameras.bin", "images.bin", "points3D.bin")
