@@ -7,12 +7,14 @@ import OpenImageIO as oiio
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from warp_splat.formats.ply import save_points
 from warp_splat.scene import load_scene
 
 WIDTH, HEIGHT = 48, 32
 PINHOLE = f"PINHOLE {WIDTH} {HEIGHT} 40 44 22.5 17.25"
 POINTS = np.random.default_rng(1).uniform(-1, 1, (20, 3))
 COLORS = np.random.default_rng(2).integers(0, 256, (20, 3))
+LENS = {"w": WIDTH, "h": HEIGHT, "fl_x": 40.0, "fl_y": 44.0, "cx": 22.5, "cy": 17.25}
 
 
 def pose(index):
@@ -114,3 +116,24 @@ def scale_axes(content, factors):
     matrix = np.array(content["frames"][0]["transform_matrix"])
     matrix[:3, :3] *= factors
     content["frames"][0]["transform_matrix"] = matrix.tolist()
+
+
+def write_transforms(root, names=("images/a.png", "images/b.png"), pixels=None, frame=None, points=True, **values):
+    """A nerfstudio scene; ``frame`` changes the frame of an index."""
+    frames = []
+    for index, name in enumerate(names):
+        write_image(root / name, texture() if pixels is None else pixels)
+        matrix = look_at_origin(np.array((4.0, -1.0 + index, 1.5)))
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist(), **(frame(index) if frame else {})})
+    if points:
+        save_points(root / "points.ply", POINTS, COLORS.astype(np.uint8))
+        values["ply_file_path"] = "points.ply"
+    (root / "transforms.json").write_text(json.dumps({**LENS, **values, "frames": frames}))
+    return root
+
+
+def write_floats(path, pixels, kind="half", names=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(pixels.astype(np.float32)) and output.close()

@@ -22,7 +22,6 @@ from warp_splat.distributed import ALONE, Processes, join
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
-from warp_splat.scene import load_scene
 from warp_splat.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
@@ -44,11 +43,6 @@ class Pretended(Processes):
 
     def __init__(self, rank, count):
         self.rank, self.count = rank, count
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return load_scene(SCENE, resolution=8, report=str)
 
 
 def gradients_of_ranks(scene, trainers, iteration):

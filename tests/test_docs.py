@@ -29,10 +29,11 @@ PHOTOGRAPHS = 6
 PROOFS = {
     "COLMAP, binary and text": """
         test_scene.py::test_colmap_cameras_points_and_pixels test_scene.py::test_largest_of_several_models
-        test_scene.py::test_undistorted_image_is_the_ideal_pinhole_image test_inputs.py::test_other_models_of_colmap""",
+        test_scene.py::test_undistorted_image_is_the_ideal_pinhole_image
+        test_transforms.py::test_other_models_of_colmap""",
     "nerfstudio, instant-ngp": """
-        test_inputs.py::test_transforms_cameras_points_and_axes test_inputs.py::test_transforms_with_distortion
-        test_inputs.py::test_transforms_intrinsics_of_frames_go_before_those_of_the_file""",
+        test_transforms.py::test_transforms_cameras_points_and_axes test_transforms.py::test_transforms_with_distortion
+        test_transforms.py::test_transforms_intrinsics_of_frames_go_before_those_of_the_file""",
     "nerf-synthetic": "test_scene.py::test_blender_axes_and_intrinsics test_scene.py::test_blender_splits",
     "no points": "test_inputs.py::test_without_points_random_ones_in_the_views",
     "images": """
@@ -43,8 +44,8 @@ PROOFS = {
         test_inputs.py::test_alpha_is_composited_on_random_backgrounds""",
     "EXR, HDR, TIFF of floats": "test_inputs.py::test_floats_are_linear_light",
     "masks": """
-        test_inputs.py::test_masks_by_either_name test_inputs.py::test_masked_loss
-        test_inputs.py::test_metrics_do_not_see_what_is_masked""",
+        test_masks.py::test_masks_by_either_name test_masks.py::test_masked_loss
+        test_masks.py::test_metrics_do_not_see_what_is_masked""",
     "`--start_ply FILE`": "test_inputs.py::test_start_from_a_file",
     "`.ply`": "test_ply.py:: test_exchange.py::test_round_trip_returns_the_scene",
     "`.splat`": "test_exchange.py::test_splat_bytes_are_the_documented_layout",

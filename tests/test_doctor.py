@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, write_image
-from test_inputs import write_transforms
+from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, write_image, write_transforms
 from test_scene_input import BAD
 
 from warp_splat.cli import main

@@ -11,9 +11,18 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scene_files import load, texture, write_blender, write_colmap, write_image, write_model
+from scene_files import (
+    load,
+    texture,
+    write_blender,
+    write_colmap,
+    write_floats,
+    write_image,
+    write_model,
+    write_transforms,
+)
 from test_hostile_files import changed, changed_json
-from test_inputs import light, write_floats, write_transforms
+from test_inputs import light
 
 from warp_splat.errors import InputError
 

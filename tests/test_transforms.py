@@ -1,0 +1,192 @@
+"""Cameras in JSON, and lenses: against formulas that share nothing with the loader."""
+
+import json
+
+import numpy as np
+import pytest
+from scene_files import (
+    COLORS,
+    HEIGHT,
+    POINTS,
+    WIDTH,
+    load,
+    project,
+    write_colmap,
+    write_transforms,
+)
+from test_scene import distorted_picture, fisheye, pattern, radial
+
+from warp_splat.errors import InputError
+
+
+def test_transforms_cameras_points_and_axes(tmp_path):
+    scene, lines = load(write_transforms(tmp_path, applied_transform=np.eye(4)[[1, 0, 2]].tolist()))
+    assert [view.name for view in scene.train] == ["images/a.png", "images/b.png"] and not lines
+    camera = scene.train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 44, 22.5, 17.25)
+    np.testing.assert_allclose(camera.center, (4.0, -1.0, 1.5))  # as in the file: applied_transform is not undone
+    np.testing.assert_allclose(project(camera, [(0, 0, 0)]), [(22.5, 17.25)], atol=1e-9)
+    assert project(camera, [(0, 0, 0.5)])[0, 1] < 15  # the world's z is up
+    np.testing.assert_array_equal(scene.points, POINTS.astype(np.float32))
+    np.testing.assert_array_equal(scene.colors, COLORS)
+
+
+def test_transforms_intrinsics_of_frames_go_before_those_of_the_file(tmp_path):
+    root = write_transforms(tmp_path, frame=lambda index: {"fl_x": 50.0, "fl_y": 51.0, "cx": 20} if index else {})
+    cameras = [view.camera for view in load(root)[0].train]
+    assert [(c.fx, c.fy, c.cx, c.cy) for c in cameras] == [(40, 44, 22.5, 17.25), (50, 51, 20, 17.25)]
+
+
+def test_transforms_sizes_twice_those_of_the_files(tmp_path):
+    camera = load(write_transforms(tmp_path, w=2 * WIDTH, h=2 * HEIGHT))[0].train[0].camera
+    assert (camera.width, camera.fx, camera.fy, camera.cx, camera.cy) == (WIDTH, 20, 22, 11.25, 8.625)
+
+
+def test_transforms_with_lists_of_names(tmp_path):
+    names = [f"images/{name}.png" for name in "abcde"]
+    root = write_transforms(tmp_path, names, train_filenames=[names[3], f"./{names[0]}"], val_filenames=[names[1]])
+    scene, lines = load(root, eval=True)
+    assert [view.name for view in scene.train] == [names[0], names[3]]
+    assert [view.name for view in scene.test] == [names[1]]
+    assert lines == ["Leaving out 2 of 5 images that transforms.json neither trains nor tests on."]
+    assert [view.name for view in load(root)[0].train] == [names[0], names[3], names[1]]
+    scene, lines = load(
+        write_transforms(tmp_path, names, test_filenames=names[2:4], val_filenames=names[:1]), eval=True
+    )
+    assert [view.name for view in scene.train] == [names[0], names[1], names[4]] and not lines
+    assert [view.name for view in scene.test] == names[2:4]
+
+
+def full_radial(x, y, k1, k2, p1, p2, k3, k4=0.0, k5=0.0, k6=0.0):
+    """OpenCV's rational model."""
+    r2 = x * x + y * y
+    factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return (
+        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+    )
+
+
+def thin_prism(x, y, k1, k2, p1, p2, k3, k4, s1, s2):
+    """Weng et al. 1992 on the angles of a fisheye, in COLMAP's order of the parameters."""
+    x, y = fisheye(x, y, 0.0, 0.0, 0.0, 0.0)
+    dx, dy = full_radial(x, y, k1, k2, p1, p2, k3)
+    r2 = x * x + y * y
+    return dx + x * k4 * r2**4 + s1 * r2, dy + y * k4 * r2**4 + s2 * r2
+
+
+def field_of_view(x, y, omega):
+    """Devernay and Faugeras 2001."""
+    r = np.hypot(x, y)
+    factor = np.arctan(2 * r * np.tan(omega / 2)) / (r * omega)
+    return x * factor, y * factor
+
+
+def check_ideal(view):
+    camera = view.camera
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    ideal = pattern((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy) * 255
+    assert view.image.shape == ideal.shape
+    assert np.abs(view.image - ideal)[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
+
+
+@pytest.mark.parametrize(
+    ("model", "distort", "params", "values"),
+    [
+        ("OPENCV", radial, (-0.15, 0.04, 0.002, -0.003), {"k1": -0.15, "k2": 0.04, "p1": 0.002, "p2": -0.003}),
+        ("OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01), {}),
+        ("OPENCV_FISHEYE", fisheye, (0.02, -0.01, 0.003, 0.0), {}),
+    ],
+)
+def test_transforms_with_distortion(tmp_path, model, distort, params, values):
+    width, height, lens = 160, 120, (150, 156, 83.2, 58.6)
+    keys = ("k1", "k2", "p1", "p2", "k3") if distort is full_radial else ("k1", "k2", "k3", "k4")
+    values = {**(values or dict(zip(keys, params, strict=True))), "camera_model": model}
+    values |= dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), (width, height, *lens), strict=True))
+    pixels = distorted_picture(distort, params, width, height, *lens)
+    scene, lines = load(write_transforms(tmp_path, ["a.png"], pixels, **values))
+    check_ideal(scene.train[0])
+    assert len(lines) == 1 and "Undistorting 1 of 1" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("model", "distort", "params"),
+    [
+        ("FULL_OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
+        ("SIMPLE_RADIAL_FISHEYE", fisheye, (0.02,)),
+        ("RADIAL_FISHEYE", fisheye, (0.02, -0.01)),
+        ("THIN_PRISM_FISHEYE", thin_prism, (0.02, -0.01, 0.002, 0.001, 0.003, 0.0, 0.004, -0.002)),
+        ("FOV", field_of_view, (0.4,)),
+    ],
+)
+def test_other_models_of_colmap(tmp_path, model, distort, params):
+    fx, fy, cx, cy = (150, 150 if "RADIAL" in model else 156, 83.2, 58.6)
+    focal = (fx,) if "RADIAL" in model else (fx, fy)
+    bent = (*params, *[0.0] * (4 - len(params))) if distort is fisheye else params
+    pixels = distorted_picture(distort, bent, 160, 120, fx, fy, cx, cy)
+    numbers = " ".join(map(str, (model, 160, 120, *focal, cx, cy, *params)))
+    scene, lines = load(write_colmap(tmp_path, ["a.png"], pixels, camera=numbers))
+    check_ideal(scene.train[0])
+    assert model in lines[0]
+
+
+def broken(change=None, **values):
+    def make(root):
+        write_transforms(root, **values)
+        if change:
+            content = json.loads((root / "transforms.json").read_text())
+            change(content)
+            (root / "transforms.json").write_text(json.dumps(content))
+
+    return make
+
+
+def deep(root):
+    (root / "transforms.json").write_text("[" * 100_000)
+
+
+def huge(root):
+    (root / "transforms.json").write_text("[" + "[]," * 6_000_000 + "[]]")
+
+
+BAD = {
+    "k4": (broken(k1=0.1, k4=0.1), ["frame 0", "OPENCV", "k4 = 0.1"]),
+    "fisheye-p1": (broken(camera_model="OPENCV_FISHEYE", p1=0.1), ["frame 0", "p1 = 0.1"]),
+    "model": (broken(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR"]),
+    "model-list": (broken(camera_model=[1]), ["frame 0", "camera_model"]),
+    "focal": (broken(fl_x="wide"), ["frame 0", "fl_x as a number", "'wide'"]),
+    "focal-0": (broken(fl_x=0), ["fx", "positive"]),
+    "focal-large": (broken(fl_x=10**400), ["frame 0", "fl_x"]),
+    "no-focal": (broken(lambda c: c.pop("fl_x")), ["frame 0", "camera_angle_x"]),
+    "size": (broken(w=32, h=48), ["a.png", "32 x 48", f"{WIDTH} x {HEIGHT}"]),
+    "size-half": (broken(w=1.5), ["frame 0", "w and h"]),
+    "frame": (broken(lambda c: c["frames"].append(5)), ["frame 2", "file_path"]),
+    "outside": (broken(lambda c: c["frames"][0].update(file_path="../a.png")), ["in this folder", "'../a.png'"]),
+    "absolute": (broken(lambda c: c["frames"][0].update(file_path="/etc/hostname")), ["'/etc/hostname'"]),
+    "long": (broken(lambda c: c["frames"][0].update(file_path="x" * 5000)), ["1 of them cannot be found"]),
+    "nul": (broken(lambda c: c["frames"][0].update(file_path="a\0b/c")), ["1 of them cannot be found"]),
+    "list": (broken(test_filenames=["images/c.png"]), ["'images/c.png' has no frame or is in two"]),
+    "list-twice": (broken(train_filenames=["images/a.png"], val_filenames=["images/a.png"]), ["'images/a.png'"]),
+    "list-all": (broken(val_filenames=["images/a.png", "images/b.png"]), ["none is left to train on"]),
+    "list-odd": (broken(train_filenames="images/a.png"), ["train_filenames as a list of names", "'images/a.png'"]),
+    "points": (broken(lambda c: c.update(ply_file_path="b.ply")), ["'b.ply'", "no such file"]),
+    "points-outside": (broken(lambda c: c.update(ply_file_path="../b.ply")), ["in this folder"]),
+    "points-number": (broken(lambda c: c.update(ply_file_path=3)), ["string as ply_file_path"]),
+    "mask": (broken(lambda c: c["frames"][1].update(mask_path="m.png")), ["frame 1", "the mask 'm.png'"]),
+    "matrix-large": (
+        broken(lambda c: c["frames"][1].update(transform_matrix=[[10**400] * 4] * 4)),
+        ["frame 1", "4 x 4 finite"],
+    ),
+    "deep": (deep, ["transforms.json", "cannot be parsed"]),
+    "huge": (huge, ["transforms.json", "at most 16777216 bytes"]),
+}
+
+
+@pytest.mark.parametrize(("make", "parts"), BAD.values(), ids=BAD.keys())
+def test_bad_transforms_are_one_sentence(tmp_path, make, parts):
+    make(tmp_path)
+    with pytest.raises(InputError) as caught:
+        load(tmp_path)
+    message = str(caught.value)
+    assert all(part in message for part in parts), message
+    assert "\n" not in message and message.endswith(".") and len(message) < 700 + 2 * len(str(tmp_path))
