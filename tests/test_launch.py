@@ -1,9 +1,6 @@
 """Launches: one on a GPU, blocks of threads where they are made of fibers, memory that torch owns."""
 
 import gc
-import signal
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -34,29 +31,6 @@ def test_every_index_once(device):
             device=device,
         )
         assert torch.equal(sums, values + torch.arange(5000.0, device=device))
-
-
-def test_an_interrupted_launch_waits_for_its_helpers():
-    """Who is interrupted frees the tensors that helpers still write into."""
-    begun, written = threading.Event(), []
-
-    def run(low, high):
-        if threading.current_thread() is threading.main_thread():
-            begun.wait()  # until a helper has the other slice
-        else:
-            begun.set()
-            signal.raise_signal(signal.SIGINT)  # for the main thread, which waits by now, or soon
-            time.sleep(0.3)
-            written.append(low)
-
-    launch.launch(add_index, 5000, [torch.zeros(5000)], [torch.zeros(5000)])  # a helper is there
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background, shells have it ignored
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            launch._Job(run, [(0, 1), (1, 2)]).share(helpers=1)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert len(written) == 1
 
 
 def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):

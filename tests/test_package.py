@@ -2,8 +2,11 @@
 
 import itertools
 import os
+import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -93,6 +96,32 @@ def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
     finally:
         warp_splat.set_threads(threads)
     assert running
+
+
+def test_an_interrupted_launch_waits_for_its_helpers():
+    """Who is interrupted frees the tensors that helpers still write into."""
+    threads = launch.get_threads()
+    warp_splat.set_threads(2)
+    image()  # a helper is there
+    begun, ended = threading.Event(), []
+
+    def run(low, high):
+        if threading.current_thread() is threading.main_thread():
+            begun.wait()  # until the helper has the other slice
+        else:
+            begun.set()
+            signal.raise_signal(signal.SIGINT)  # for the main thread, which waits for this one by now, or soon
+            time.sleep(0.3)
+            ended.append(low)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background, shells have it ignored
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            launch._Job(run, [(0, 1), (1, 2)]).share(helpers=1)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        warp_splat.set_threads(threads)
+    assert len(ended) == 1
 
 
 @pytest.mark.parametrize("count", [0, "a", 1.5])
