@@ -146,11 +146,11 @@ import datetime, os, signal, sys
 from warp_splat import distributed, trainer
 from warp_splat.cli import main
 loss, calls = trainer.image_loss, []
-def failing(*arguments):
+def failing(*arguments, **options):
     calls.append(0)
     if len(calls) == 30 and os.environ["RANK"] == "1":
         FAIL
-    return loss(*arguments)
+    return loss(*arguments, **options)
 trainer.image_loss = failing
 distributed.PATIENCE = datetime.timedelta(seconds=3)
 sys.exit(main(["train", *sys.argv[1:]]))

@@ -93,9 +93,9 @@ def seen_targets(monkeypatch, scene, steps, **options):
     """(render, photograph) of each step as the loss gets them, and the backgrounds drawn."""
     trainer, found = Trainer(scene, TrainConfig(device="cpu", iterations=steps, **options)), []
 
-    def spy(image, target, share, mask):
+    def spy(image, target, *arguments, **options):
         found.append((image.detach().clone(), target.clone()))
-        return image_loss(image, target, share, mask)
+        return image_loss(image, target, *arguments, **options)
 
     monkeypatch.setattr("warp_splat.trainer.image_loss", spy)
     for iteration in range(1, steps + 1):

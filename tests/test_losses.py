@@ -84,6 +84,26 @@ def test_bytes_are_divided_by_255():
     assert abs(image_loss(image, target).item() - oracle(image, target / 255.0, 0.2).item()) < 1e-6
 
 
+@pytest.mark.parametrize("size", [(1, 1), (2, 5), (33, 50), (40, 64)])
+def test_clamped_as_by_torch(size):
+    generator = torch.Generator().manual_seed(sum(size))
+    image = 1.6 * torch.rand(*size, 3, generator=generator) - 0.3
+    image.view(-1)[:2] = torch.tensor([0.0, 1.0])
+    target = (255 * torch.rand(*size, 3, generator=generator)).to(torch.uint8)
+    leaf, other = image.clone().requires_grad_(), image.clone().requires_grad_()
+    loss, expected = image_loss(leaf, target, clamped=True), image_loss(other.clamp(0.0, 1.0), target)
+    (2 * loss).backward()
+    (2 * expected).backward()
+    assert loss.item() == expected.item() and torch.equal(leaf.grad, other.grad)
+
+
+def test_images_that_lie_otherwise_in_memory():
+    image, target = torch.rand(2, 30, 20, 3, generator=torch.Generator().manual_seed(4)).transpose(1, 2)
+    flat = torch.full((3,), 0.5).expand(20, 30, 3)
+    for other in (target, flat):
+        assert image_loss(image, other).item() == image_loss(image.contiguous(), other.contiguous()).item()
+
+
 def test_equal_images_have_no_loss_and_no_gradient():
     image = torch.rand(24, 35, 3, generator=torch.Generator().manual_seed(1)).requires_grad_()
     loss = image_loss(image, image.detach())

@@ -1,6 +1,7 @@
 """What a training and a rendering show: videos, sheets, tables, event files, a configuration that repeats itself."""
 
 import json
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -55,6 +56,14 @@ def test_frames_of_a_video(told, tmp_path, capsys):
     assert psnr(frames[0], load_png(told / "train" / "ours_20" / "renders" / "00000.png")) > 60
     for decoded, frame in zip(decode(tmp_path / "film.mp4"), frames, strict=True):
         assert frame.shape == (61, 65, 3) and psnr(np.ascontiguousarray(decoded[:61, :65]), frame) > 30
+
+
+def test_render_says_that_the_scene_is_another(told, tmp_path, capsys):
+    shutil.copytree(SCENE, tmp_path / "other")
+    options = ["-m", str(told), "--video", "orbit", "--frames", "2", "--video_output", str(tmp_path / "a.mp4")]
+    for source, said in ((tmp_path / "other", True), (SCENE, False)):
+        assert main(["render", "-s", str(source), *options]) == 0
+        assert (f"the model was trained on {SCENE}" in capsys.readouterr().out) == said
 
 
 def test_options_of_a_video(told, capsys):

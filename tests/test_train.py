@@ -336,11 +336,11 @@ def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkey
 
     loss, steps = trainer.image_loss, []
 
-    def poisoned(image, *arguments):
+    def poisoned(image, *arguments, **options):
         steps.append(0)
         if len(steps) == 20 and image.requires_grad:
             image.register_hook(lambda grad: grad.index_fill(0, torch.tensor([3]), float("nan")))
-        return loss(image, *arguments)
+        return loss(image, *arguments, **options)
 
     monkeypatch.setattr(trainer, "image_loss", poisoned)
     assert train(tmp_path) == 0

@@ -21,7 +21,11 @@ FAR_APART = 10.0  # in units of an image's usual range
 
 
 def image_loss(
-    image: torch.Tensor, target: torch.Tensor, lambda_dssim: float = 0.2, mask: torch.Tensor | None = None
+    image: torch.Tensor,
+    target: torch.Tensor,
+    lambda_dssim: float = 0.2,
+    mask: torch.Tensor | None = None,
+    clamped: bool = False,
 ) -> torch.Tensor:
     """(1 - lambda) mean |image - target| + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), a scalar.
 
@@ -34,6 +38,7 @@ def image_loss(
         target: [H, W, 3] float32, or uint8 to be divided by 255.
         lambda_dssim: share of the structural term, 0..1.
         mask: [H, W, 1] uint8, 1 for pixels that count, 0 for others.
+        clamped: compare the image within 0..1, without a gradient where it lies outside.
 
     Raises:
         InputError: if the shapes differ or are not [H, W, 3].
@@ -45,8 +50,8 @@ def image_loss(
             f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
         )
     if image.is_cuda:
-        return LossByConvolution.apply(image, target, lambda_dssim)
-    return ImageLoss.apply(image, target, lambda_dssim)
+        return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
+    return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
 
 
 def loss_by_convolution(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float) -> torch.Tensor:
@@ -110,12 +115,13 @@ class ImageLoss(torch.autograd.Function):
     """See :func:`image_loss`."""
 
     @staticmethod
-    def forward(ctx, image, target, lambda_dssim):
+    def forward(ctx, image, target, lambda_dssim, limits):
         with stage("loss"):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
             groups = -(-length // LANES)
             centers = _centers(image, target)
-            x, y = _pad(image, centers[0], groups), _pad(target, centers[1], groups)
+            image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
+            x, y = _pad(image, centers[0], groups, limits), _pad(target, centers[1], groups)
             moments, slopes = torch.empty(height, 5, groups, LANES), torch.empty(height, 3, groups, LANES)
             sums = torch.empty(height, 2)
             bounds = even_slices(height, SMALLEST_SLICE)
@@ -135,31 +141,38 @@ class ImageLoss(torch.autograd.Function):
                 bounds=bounds,
             )
             l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
-            ctx.save_for_backward(x, y, slopes)
-            ctx.shape, ctx.lambda_dssim, ctx.gap = image.shape, lambda_dssim, centers[0] - centers[1]
+            ctx.save_for_backward(image, x, y, slopes)
+            ctx.lambda_dssim, ctx.limits, ctx.gap = lambda_dssim, limits, centers[0] - centers[1]
             return torch.tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, adj_loss):
         with stage("adjoint of loss"):
-            x, y, slopes = ctx.saved_tensors
+            image, x, y, slopes = ctx.saved_tensors
             height, groups = x.shape[0], slopes.shape[2]
-            scale = adj_loss.item() / ctx.shape.numel()
-            blurred = torch.empty(height, 3, groups + 2, LANES)
-            adj = torch.empty(height, groups, LANES)
+            scale = adj_loss.item() / image.numel()
+            blurred, adj = torch.empty(height, 3, groups + 2, LANES), torch.empty_like(image)
             bounds = even_slices(height, SMALLEST_SLICE)
             launch(ssim.adj_blur_columns, height, [view(slopes, vec16)], [view(blurred, vec16)], bounds=bounds)
             weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
             launch(
                 ssim.adj_compare,
                 height,
-                [_taps(x), _taps(y), _taps(blurred.view(height, 3, -1)), ctx.gap, *weights],
-                [view(adj, vec16)],
+                [
+                    view(image, wp.float32),
+                    _taps(image),
+                    wp.vec2(*ctx.limits),
+                    _taps(x),
+                    _taps(y),
+                    _taps(blurred.view(height, 3, -1)),
+                    ctx.gap,
+                    *weights,
+                ],
+                [view(adj, wp.float32), _taps(adj)],
                 bounds=bounds,
             )
-            length = ctx.shape[1] * ctx.shape[2]
-            return adj.view(height, -1)[:, :length].reshape(ctx.shape), None, None
+            return adj.view(height, -1, ssim.CHANNELS), None, None, None
 
 
 def _centers(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
@@ -180,15 +193,20 @@ def _middle(image: torch.Tensor) -> float:
     return float(np.float32(middle)) if math.isfinite(middle) else 0.5
 
 
-def _pad(image: torch.Tensor, center: float, groups: int) -> torch.Tensor:
-    """Rows of the image minus ``center`` as float32 in [H, P], a group of zeros at either end."""
-    height, length = image.shape[0], image.shape[1] * image.shape[2]
-    padded = torch.empty(height, (groups + 2) * LANES)
-    padded[:, :LANES] = padded[:, LANES + length :] = 0.0
-    rows = padded[:, LANES : LANES + length]
-    values = image.detach().reshape(height, length)
-    torch.sub(values / 255.0 if image.dtype == torch.uint8 else values, center, out=rows)
-    return padded
+def _pad(
+    image: torch.Tensor, center: float, groups: int, limits: tuple[float, float] = (-math.inf, math.inf)
+) -> torch.Tensor:
+    """Rows [H, L] within the limits minus ``center`` as float32 in [H, P], a group of zeros at either end."""
+    height, bounds = len(image), even_slices(len(image), SMALLEST_SLICE)
+    padded = torch.empty(height, groups + 2, LANES)
+    out = [view(padded, vec16)]
+    if image.dtype == torch.uint8:
+        inputs = [view(image, wp.uint8), _taps(image, ssim.vec16b), center]
+        launch(ssim.pad_bytes, height, inputs, out, bounds=bounds)
+    else:
+        inputs = [view(image, wp.float32), _taps(image), center, wp.vec2(*limits)]
+        launch(ssim.pad, height, inputs, out, bounds=bounds)
+    return padded.view(height, -1)
 
 
 @functools.cache
@@ -202,8 +220,8 @@ def _missing(groups: int, length: int) -> torch.Tensor:
     return missing.view(groups, LANES)
 
 
-def _taps(rows: torch.Tensor) -> wp.array:
-    """[..., P] floats as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbours."""
-    shape = (*rows.shape[:-1], rows.shape[-1] - LANES + 1)
-    strides = tuple(4 * stride for stride in rows.stride())
-    return wp.array(ptr=rows.data_ptr(), dtype=vec16, shape=shape, strides=strides, device="cpu", copy=False)
+def _taps(rows: torch.Tensor, dtype=vec16) -> wp.array:
+    """[..., P] numbers as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbours."""
+    shape = (*rows.shape[:-1], max(rows.shape[-1] - LANES + 1, 0))
+    strides = tuple(rows.element_size() * stride for stride in rows.stride())
+    return wp.array(ptr=rows.data_ptr(), dtype=dtype, shape=shape, strides=strides, device="cpu", copy=False)

@@ -144,9 +144,12 @@ def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Ca
     Raises:
         InputError: as :func:`load_scene`, or if it is not known which scene that is.
     """
-    source = source_path or str(trained.get("source_path", ""))
+    trained_on = str(trained.get("source_path", ""))
+    source = source_path or trained_on
     if not source:
         raise InputError(f"{model_path}: it does not say what it was trained on; name the scene with -s.")
+    if trained_on and Path(source).resolve() != Path(trained_on).resolve():
+        say(f"The scene is {source}; the model was trained on {trained_on}.")
     resolution = trained.get("resolution", -1)
     if not isinstance(resolution, int):
         raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")

@@ -124,9 +124,8 @@ class Trainer:
             target = values + (1.0 - photograph.alpha / 255.0) * (background - self.background)
         if self.scene.linear:
             image, target = (LOSS_CURVES[config.loss_space](picture) for picture in (image, target))
-        else:  # clamped as in the reference's renderer; what is too bright learns nothing from being brighter still
-            image = image.clamp(0.0, 1.0)
-        loss = image_loss(image, target, config.lambda_dssim, photograph.mask)
+        # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
+        loss = image_loss(image, target, config.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
         loss.backward()
         if iteration < config.densify_until_iter:
             with stage("densify"):

@@ -34,6 +34,7 @@ RADIUS = WINDOW // 2
 CHANNELS = 3
 C1 = wp.constant(0.01**2)
 C2 = wp.constant(0.03**2)
+vec16b = wp.types.vector(length=LANES, dtype=wp.uint8)
 IOTA = wp.constant(vec16(*[float(lane) for lane in range(LANES)]))
 
 _bell = [math.exp(-((tap - RADIUS) ** 2) / (2.0 * 1.5**2)) for tap in range(WINDOW)]
@@ -47,6 +48,26 @@ def inside(values: vec16, start: int, length: int):
 
 
 @wp.func
+def neighbours(rows: wp.array2d[float], taps: wp.array2d[vec16], row: int, start: int):
+    """Floats ``start`` .. ``start + 15`` of a row, 0 beyond its end."""
+    length = rows.shape[1]
+    if start + LANES <= length:
+        return taps[row, start]
+    values = vec16(0.0)
+    for lane in range(length - start):
+        values[lane] = rows[row, start + lane]
+    return values
+
+
+@wp.func
+def between(values: vec16, limits: wp.vec2):
+    """``values`` no less than ``limits[0]``, no more than ``limits[1]``; NaN stays."""
+    low = vec16(limits[0])
+    high = vec16(limits[1])
+    return where_less(values, low, low, where_less(high, values, high, values))
+
+
+@wp.func
 def column_weights(row: int, height: int):
     """The window's weights for a column through ``row``, 0 for those outside the image."""
     weights = WEIGHTS
@@ -54,6 +75,54 @@ def column_weights(row: int, height: int):
         if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
             weights[tap] = 0.0
     return weights
+
+
+@wp.kernel
+def pad(
+    first: int,  # row of this slice
+    image: wp.array2d[float],  # [H, L]
+    taps: wp.array2d[vec16],  # [H, L - 15] the same: element p holds floats p .. p + 15 of a row
+    center: float,
+    limits: wp.vec2,
+    # out
+    padded_out: wp.array2d[vec16],  # [H, G + 2] the image within the limits, minus the center, between groups of zeros
+):
+    row = first + wp.tid()
+    groups = padded_out.shape[1] - 2
+    padded_out[row, 0] = vec16(0.0)
+    padded_out[row, groups + 1] = vec16(0.0)
+    for group in range(groups):
+        start = LANES * group
+        values = between(neighbours(image, taps, row, start), limits) - vec16(center)
+        padded_out[row, group + 1] = inside(values, start, image.shape[1])
+
+
+@wp.kernel
+def pad_bytes(
+    first: int,
+    image: wp.array2d[wp.uint8],  # [H, L], to be divided by 255
+    taps: wp.array2d[vec16b],
+    center: float,
+    # out
+    padded_out: wp.array2d[vec16],  # [H, G + 2]
+):
+    row = first + wp.tid()
+    length = image.shape[1]
+    groups = padded_out.shape[1] - 2
+    padded_out[row, 0] = vec16(0.0)
+    padded_out[row, groups + 1] = vec16(0.0)
+    for group in range(groups):
+        start = LANES * group
+        values = vec16(0.0)
+        if start + LANES <= length:
+            levels = taps[row, start]
+            for lane in range(LANES):
+                values[lane] = float(levels[lane])
+        else:
+            for lane in range(length - start):
+                values[lane] = float(image[row, start + lane])
+        values = over(values, vec16(255.0)) - vec16(center)
+        padded_out[row, group + 1] = inside(values, start, length)
 
 
 @wp.kernel
@@ -186,6 +255,9 @@ def adj_blur_columns(
 @wp.kernel
 def adj_compare(
     first: int,
+    image: wp.array2d[float],  # [H, L] as given to pad
+    taps: wp.array2d[vec16],
+    limits: wp.vec2,
     x: wp.array2d[vec16],  # [H, P - 15]
     y: wp.array2d[vec16],
     slopes: wp.array3d[vec16],  # [H, 3, P - 15] blurred along columns
@@ -193,10 +265,12 @@ def adj_compare(
     adj_l1: float,  # dL / d(sum of |x - y|)
     adj_ssim: float,  # dL / d(sum of SSIM)
     # out
-    adj_x_out: wp.array2d[vec16],  # [H, G]
+    adj_image_out: wp.array2d[float],  # [H, L]
+    adj_taps_out: wp.array2d[vec16],
 ):
     row = first + wp.tid()
-    for group in range(adj_x_out.shape[1]):
+    length = image.shape[1]
+    for group in range((length + LANES - 1) // LANES):
         dmu = vec16(0.0)
         dxx = vec16(0.0)
         dxy = vec16(0.0)
@@ -210,4 +284,12 @@ def adj_compare(
         zero = vec16(0.0)
         delta = a - b + vec16(gap)
         sign = where_less(zero, delta, vec16(1.0), where_less(delta, zero, vec16(-1.0), zero))
-        adj_x_out[row, group] = sign * adj_l1 + (dmu + times(a, dxx) * 2.0 + times(b, dxy)) * adj_ssim
+        adj = sign * adj_l1 + (dmu + times(a, dxx) * 2.0 + times(b, dxy)) * adj_ssim
+        start = LANES * group
+        given = neighbours(image, taps, row, start)
+        adj = where_less(vec16(limits[0]), given, where_less(given, vec16(limits[1]), adj, zero), zero)
+        if start + LANES <= length:
+            adj_taps_out[row, start] = adj
+        else:
+            for lane in range(length - start):
+                adj_image_out[row, start + lane] = adj[lane]
