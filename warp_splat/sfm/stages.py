@@ -23,7 +23,7 @@ from warp_splat.interrupts import interruptible
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
-BLOCK = 10  # images: pairs are matched in blocks of this size squared, and Ctrl-C is heard after each
+BLOCK = 10  # images: Ctrl-C is heard after as many squared pairs. Tried: 50, 36 s instead of 42 for 1,225 pairs
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
 
