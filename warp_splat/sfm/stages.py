@@ -23,8 +23,8 @@ from warp_splat.interrupts import interruptible
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
-# Pairs are matched in blocks of BLOCK x BLOCK images, and Ctrl-C is heard in between. Tried: 50, pycolmap's default: 36 s
-# for 1,225 pairs, of 540 x 960 px, instead of 42.
+# Pairs are matched in blocks of BLOCK x BLOCK images, and Ctrl-C is heard in between. Tried: pycolmap's 50, which takes
+# 36 s for 1,225 pairs of 540 x 960 px instead of 42.
 BLOCK = 10
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
