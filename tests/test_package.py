@@ -1,5 +1,6 @@
 """The package as others import it: public names in any order, threads, forks."""
 
+import gc
 import itertools
 import os
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -79,21 +81,29 @@ def test_a_forked_child_renders_too():
 
 
 def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
-    """An error in one slice reaches the caller, after the other slices have ended."""
+    """An error in one slice reaches the caller after the other slices have ended; what the caller held is free then."""
     threads = launch.get_threads()
     warp_splat.set_threads(2)
     image()
-    running = []
+    running, held = [], []
 
     def failing(*arguments, **options):
         running.append(options)
         raise RuntimeError("planted")
 
+    def caller():
+        tensor = torch.empty(9)
+        held.append(weakref.ref(tensor))
+        image()
+
     monkeypatch.setattr(launch.wp, "launch", failing)
+    gc.disable()
     try:
         with pytest.raises(RuntimeError, match="planted"):
-            image()
+            caller()
+        assert held[0]() is None, "it waits for the garbage collector"
     finally:
+        gc.enable()
         warp_splat.set_threads(threads)
     assert running
 

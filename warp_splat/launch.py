@@ -70,7 +70,10 @@ class _Job:
                 error, helpers = raised, 0
                 self.slices.clear()
         if error or self.error:
-            raise error or self.error
+            try:
+                raise error or self.error
+            finally:  # or its traceback, which knows this frame, would keep the callers' tensors in a cycle
+                error = self.error = None
 
     def _run_slices(self) -> None:
         while True:
