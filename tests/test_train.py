@@ -274,11 +274,11 @@ def fail_at(monkeypatch, target, call, error):
     module, name = target.rsplit(".", 1)
     function, calls = getattr(importlib.import_module(module), name), []
 
-    def failing(*arguments):
+    def failing(*arguments, **options):
         calls.append(0)
         if len(calls) == call:
             raise error
-        return function(*arguments)
+        return function(*arguments, **options)
 
     monkeypatch.setattr(target, failing)
 
