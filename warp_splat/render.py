@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
@@ -148,7 +149,7 @@ def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Ca
     source = source_path or trained_on
     if not source:
         raise InputError(f"{model_path}: it does not say what it was trained on; name the scene with -s.")
-    if trained_on and Path(source).resolve() != Path(trained_on).resolve():
+    if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):
         say(f"The scene is {source}; the model was trained on {trained_on}.")
     resolution = trained.get("resolution", -1)
     if not isinstance(resolution, int):
@@ -217,7 +218,7 @@ def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output
         for index, frame in enumerate(frames):
             save_png(folder / f"{index:05d}.png", frame)
         older = len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)
-        if older:
+        if older > 0:
             print(f"Warning: {older} older frames are in {folder}, too.")
     else:
         for _ in frames:

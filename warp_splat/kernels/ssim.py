@@ -60,6 +60,21 @@ def neighbours(rows: wp.array2d[float], taps: wp.array2d[vec16], row: int, start
 
 
 @wp.func
+def neighbours(rows: wp.array2d[wp.uint8], taps: wp.array2d[vec16b], row: int, start: int):
+    """The same of bytes, divided by 255."""
+    length = rows.shape[1]
+    values = vec16(0.0)
+    if start + LANES <= length:
+        levels = taps[row, start]
+        for lane in range(LANES):
+            values[lane] = float(levels[lane])
+    else:
+        for lane in range(length - start):
+            values[lane] = float(rows[row, start + lane])
+    return over(values, vec16(255.0))
+
+
+@wp.func
 def between(values: vec16, limits: wp.vec2):
     """``values`` no less than ``limits[0]``, no more than ``limits[1]``; NaN stays."""
     low = vec16(limits[0])
@@ -107,22 +122,13 @@ def pad_bytes(
     padded_out: wp.array2d[vec16],  # [H, G + 2]
 ):
     row = first + wp.tid()
-    length = image.shape[1]
     groups = padded_out.shape[1] - 2
     padded_out[row, 0] = vec16(0.0)
     padded_out[row, groups + 1] = vec16(0.0)
     for group in range(groups):
         start = LANES * group
-        values = vec16(0.0)
-        if start + LANES <= length:
-            levels = taps[row, start]
-            for lane in range(LANES):
-                values[lane] = float(levels[lane])
-        else:
-            for lane in range(length - start):
-                values[lane] = float(image[row, start + lane])
-        values = over(values, vec16(255.0)) - vec16(center)
-        padded_out[row, group + 1] = inside(values, start, length)
+        values = neighbours(image, taps, row, start) - vec16(center)
+        padded_out[row, group + 1] = inside(values, start, image.shape[1])
 
 
 @wp.kernel
