@@ -50,8 +50,8 @@ PROOFS = {
     "`.ply`": "test_ply.py:: test_exchange.py::test_round_trip_returns_the_scene",
     "`.splat`": "test_exchange.py::test_splat_bytes_are_the_documented_layout",
     "`.spz`": """
-        test_exchange.py::test_spz_bytes_are_the_documented_layout test_exchange.py::test_spz_version_2
-        test_exchange.py::test_spz_version_4_holds_the_same""",
+        test_spz.py::test_spz_bytes_are_the_documented_layout test_spz.py::test_spz_version_2
+        test_spz.py::test_spz_version_4_holds_the_same""",
     "`.glb`, `.gltf`": """
         test_exchange.py::test_gltf_holds_what_the_extension_says
         test_exchange.py::test_gltf_nodes_move_turn_and_scale""",
