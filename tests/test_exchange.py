@@ -15,6 +15,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.convert import losses
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import is_antialiased
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
@@ -264,6 +265,13 @@ def test_convert_refuses_in_one_sentence(tmp_path, capsys, source, target, sente
     assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert sentence in line and sorted(tmp_path.iterdir()) == before
+
+
+def test_convert_leaves_the_model_that_it_reads(tmp_path, capsys):
+    path = ply_path(tmp_path, 7)
+    save_gaussians(path, some_file(3))
+    assert main(["convert", str(tmp_path), str(path)]) == 1
+    assert "expected another file than the source" in capsys.readouterr().err
 
 
 def test_glb_has_a_largest_size(tmp_path, monkeypatch):

@@ -142,6 +142,13 @@ def test_the_number_of_threads_changes_no_bit():
         assert loss == results[0][0] and torch.equal(grad, results[0][1])
 
 
+def test_other_types_are_refused():
+    image, mask = torch.zeros(20, 30, 3), torch.ones(20, 30, 1, dtype=torch.uint8)
+    for arguments in ((image.double(), image), (image, image.long()), (image, image, 0.2, mask.float())):
+        with pytest.raises(InputError, match="expected"):
+            image_loss(*arguments)
+
+
 @pytest.mark.parametrize("shape", [(20, 30), (20, 30, 4), (21, 30, 3)])
 def test_other_shapes_are_refused(shape):
     with pytest.raises(InputError, match=r"\[H, W, 3\]"):

@@ -9,7 +9,7 @@ import numpy as np
 from warp_splat.config import ConvertConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import open_model
+from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path
 from warp_splat.formats.splats import COEFFICIENTS, LOG_SCALES, SH_C0, SplatArrays, SplatFile, sigmoid, unit_quats
 
 ROUNDING = 1e-6  # smaller changes, as a share of the largest value, are those of float32
@@ -22,9 +22,10 @@ def convert(config: ConvertConfig) -> int:
         InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
     """
     format_of(config.target)  # before anything is read
-    if os.path.exists(config.target) and os.path.samefile(config.source, config.target):
+    iteration, before, trained = open_model(config.source)
+    source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, iteration)
+    if os.path.exists(config.target) and os.path.samefile(source, config.target):
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")
-    _, before, trained = open_model(config.source)
     before = before._replace(antialiased=bool(trained["antialiasing"]))
     notes: list[str] = []
     save_gaussians(config.target, before, notes.append)
