@@ -90,5 +90,6 @@ def _spread_upstream(
             *(view(up, vec16), view(adj_final, vec16), view(adj_background, wp.float32)),
             *(view(bad, wp.int32), view(steps, wp.int32), view(slots, wp.float32)),
         ],
+        bounds=bins.slices,
     )
     return up, adj_final, adj_background, bad, steps

@@ -1,15 +1,17 @@
 """The CPU driver of the blend: one launch index per 16 x 16 tile, sixteen 4 x 4 blocks of pixels, a block in lanes.
 
 What keeps LLVM vectorising (measured in benchmarks/blend.py; against one scalar thread per pixel more than 20 times):
-state that lives across Gaussians stays in memory, in the rows of kernel-local matrices (phi nodes of 16 scalars defeat
-the SLP vectoriser, loads and stores of 64 bytes do not); no branch per lane; sums over pixels stay in lanes until the
-end. What keeps the loop over blocks short (each measured, together 1.7 times): matrices, since a local array reloads
-its pointer and strides at every access; ``block & 15``, since an index that may be negative is wrapped; ``while``,
-since Warp's range keeps more state; the next Gaussian's box found one Gaussian ahead, so that the processor knows how
+state that lives across Gaussians stays in memory, a row of lanes each (phi nodes of 16 scalars defeat the SLP
+vectoriser, loads and stores of 64 bytes do not); no branch per lane; sums over pixels stay in lanes until the end. What
+keeps the loop over blocks short (each measured): that memory is an array made in the kernel over a local matrix, whose
+strides are known (those of other arrays are not, and a local array reloads its own), and begins at a multiple of 64
+bytes, as the matrix does not: by the luck of where the stack lies, rows that cross two lines cost 15 %, and one that
+crosses two pages up to 25 %; ``block & 15``, since an index that may be negative is wrapped; ``while``, since Warp's
+range keeps more state; boxes found for 32 Gaussians at a time, so that their reads overlap and the processor knows how
 many blocks there are before it gets there.
 Tried: rows of 16 pixels instead of blocks, 22 % slower, because fewer blocks can be skipped; a jump over blocks where
-no lane sees the Gaussian, 5 % slower in both directions, because the test costs as much as it saves; state in global
-memory, which is aligned, as local matrices are not: 30 % slower, because strides are not known.
+no lane sees the Gaussian, 5 % slower in both directions, because the test costs as much as it saves; one loop over the
+blocks of a box instead of two nested ones, 5 and 20 % slower (adjoint, forward).
 """
 
 import functools
@@ -19,15 +21,13 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.blend import Splat2D, advance, alpha_of, exponent, make_exp, weight
 from warp_splat.kernels.build import FORWARD_ONLY, IN_LANES
-from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, total, vec16, where_less
+from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
 
 BLOCKS = TILE * TILE // LANES  # per tile
-STRIDE = 32  # instances between two looks at whether the whole tile has stopped
-
-MAX_FLOAT = wp.constant(3.4028234663852886e38)
+AHEAD = 32  # instances whose boxes are found together; then, whether the whole tile has stopped
 
 vec4i = wp.types.vector(length=4, dtype=int)
-mat_blocks = wp.types.matrix(shape=(BLOCKS, LANES), dtype=float)  # a number per pixel of a tile
+mat_boxes = wp.types.matrix(shape=(AHEAD, 4), dtype=int)
 
 
 @wp.func
@@ -58,17 +58,17 @@ def offset_y(mean: wp.vec2, y0: float, by: int):
 
 
 @wp.func
-def finite(x: float):
-    """Neither infinite nor NaN; wp.isfinite is a call on the CPU."""
-    return wp.abs(x) <= MAX_FLOAT
+def aligned(address: wp.uint64):
+    """The first multiple of 64 from ``address`` on."""
+    return (address + wp.uint64(63)) & wp.uint64(0xFFFFFFFFFFFFFFC0)
 
 
 @functools.cache
 def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
     """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
-    CHANNELS = 4 if depth else 3
-    STATE = BLOCKS * CHANNELS
-    mat_state = wp.types.matrix(shape=(STATE, LANES), dtype=float)
+    WALKED, RGB, DEPTH = BLOCKS, 2 * BLOCKS, 5 * BLOCKS
+    STATE = DEPTH + BLOCKS if depth else DEPTH
+    mat_room = wp.types.matrix(shape=(STATE + 1, LANES), dtype=float)
     exp2_minus = make_exp(exp_degree)
 
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
@@ -96,18 +96,24 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
         line = (tile // tiles_x) * TILE
         x0 = float(column) + 0.5
         y0 = float(line) + 0.5
-        t = mat_blocks(1.0)
-        count = mat_blocks(0.0)
-        c = mat_state(0.0)
-        last = span[0] + wp.min(span[1] - span[0], max_steps) - 1
-        ahead = vec4i(0)
-        for k in range(span[0], last + 1):
+        room = mat_room()
+        s = wp.array(
+            ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16
+        )  # T, instances walked, sums of w color
+        for block in range(BLOCKS):
+            s[block] = vec16(1.0)
+        for row in range(WALKED, s.shape[0]):  # as a constant, a blend that takes half as long again
+            s[row] = vec16(0.0)
+        end = span[0] + wp.min(span[1] - span[0], max_steps)
+        boxes = mat_boxes()
+        for k in range(span[0], end):
+            ahead = (k - span[0]) & (AHEAD - 1)
+            if ahead == 0:
+                for j in range(wp.min(AHEAD, end - k)):
+                    coming = splats[instances[k + j][0]]
+                    boxes[j] = reach(coming.mean, coming.extent, x0, y0)
             splat = splats[instances[k][0]]
-            box = ahead
-            if k == span[0]:
-                box = reach(splat.mean, splat.extent, x0, y0)
-            following = splats[instances[wp.min(k + 1, last)][0]]
-            ahead = reach(following.mean, following.extent, x0, y0)
+            box = boxes[ahead]
             walked = vec16(float(k - span[0] + 1))
             by = box[2]
             while by <= box[3]:
@@ -118,28 +124,28 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
                     dx = offset_x(splat.mean, x0, bx)
                     fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
                     alpha = alpha_of(fall * splat.opacity, alpha_min)
-                    behind = advance(t[block], alpha, t_min)
-                    w = weight(t[block], alpha, behind)
+                    behind = advance(s[block], alpha, t_min)
+                    w = weight(s[block], alpha, behind)
                     if wp.static(keep):
-                        kept_out[k, block] = t[block]
+                        kept_out[k, block] = s[block]
                     for channel in range(3):
-                        c[channel * BLOCKS + block] = c[channel * BLOCKS + block] + w * splat.color[channel]
+                        s[RGB + channel * BLOCKS + block] = s[RGB + channel * BLOCKS + block] + w * splat.color[channel]
                     if wp.static(depth):
-                        c[3 * BLOCKS + block] = c[3 * BLOCKS + block] + w * splat.depth
-                    t[block] = behind
-                    count[block] = where_less(behind, vec16(0.0), count[block], walked)
+                        s[DEPTH + block] = s[DEPTH + block] + w * splat.depth
+                    s[block] = behind
+                    s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
                     bx += 1
                 by += 1
-            if (k & (STRIDE - 1)) == STRIDE - 1:
+            if ahead == AHEAD - 1:
                 alive = vec16(0.0)
                 for block in range(BLOCKS):
-                    alive = alive + where_less(t[block], vec16(0.0), vec16(0.0), t[block])
+                    alive = alive + where_less(s[block], vec16(0.0), vec16(0.0), s[block])
                 if total(alive) == 0.0:
                     break
         for block in range(BLOCKS):
-            t[block] = wp.max(t[block], -t[block])
-            final_out[tile, block] = t[block]
-            count_out[tile, block] = count[block]
+            s[block] = wp.max(s[block], -s[block])
+            final_out[tile, block] = s[block]
+            count_out[tile, block] = s[WALKED + block]
         block = int(0)
         while block < BLOCKS:
             left = column + 4 * (block & 3)
@@ -148,12 +154,13 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
                 x = left + lane % 4
                 y = top + lane // 4
                 if y < image_out.shape[0] and x < image_out.shape[1]:
-                    final = t[block, lane]
+                    final = s[block][lane]
                     for channel in range(3):
-                        image_out[y, x, channel] = c[channel * BLOCKS + block, lane] + final * background[channel]
+                        light = s[RGB + channel * BLOCKS + block][lane] + final * background[channel]
+                        image_out[y, x, channel] = light
                     alpha_out[y, x] = 1.0 - final
                     if wp.static(depth):
-                        depth_out[y, x] = c[3 * BLOCKS + block, lane]
+                        depth_out[y, x] = s[DEPTH + block][lane]
             block += 1
 
     return blend
@@ -163,8 +170,7 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
 def make_upstream(depth: bool) -> wp.Kernel:
     """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
     CHANNELS = 4 if depth else 3
-    STATE = BLOCKS * CHANNELS
-    mat_state = wp.types.matrix(shape=(STATE, LANES), dtype=float)
+    mat_up = wp.types.matrix(shape=(CHANNELS + 1, LANES), dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def upstream(
@@ -179,7 +185,7 @@ def make_upstream(depth: bool) -> wp.Kernel:
         adj_alpha: wp.array2d[float],  # [H, W]
         adj_depth: wp.array2d[float],  # [H, W]
         # out
-        up_out: wp.array2d[vec16],  # [T, STATE] dL/d(sum of w color, and of w z)
+        up_out: wp.array2d[vec16],  # [T, BLOCKS CHANNELS] dL/d(sum of w color, and of w z)
         adj_final_out: wp.array2d[vec16],  # [T, BLOCKS] dL/d(final), through alpha and background
         adj_background_out: wp.array2d[float],  # [T, 3]
         dropped_out: wp.array[int],  # [T] pixels whose upstream gradient is not finite
@@ -189,46 +195,51 @@ def make_upstream(depth: bool) -> wp.Kernel:
         tile = first + wp.tid()
         column = (tile % tiles_x) * TILE
         line = (tile // tiles_x) * TILE
-        up = mat_state(0.0)
-        adj_final = mat_blocks(0.0)
-        t = mat_blocks()
-        for block in range(BLOCKS):
-            t[block] = final[tile, block]
+        zero = vec16(0.0)
         adj_background = wp.vec3(0.0)
-        dropped = int(0)
+        kept = float(0.0)
         block = int(0)
         while block < BLOCKS:
             left = column + 4 * (block & 3)
             top = line + 4 * (block >> 2)
-            for lane in range(LANES):
-                x = left + lane % 4
-                y = top + lane // 4
-                if y < adj_image.shape[0] and x < adj_image.shape[1]:
-                    u = wp.vec3(adj_image[y, x, 0], adj_image[y, x, 1], adj_image[y, x, 2])
-                    adj_t = -adj_alpha[y, x]
-                    far = float(0.0)
+            u = mat_up(0.0)  # the channels, and dL/dalpha
+            if top + 4 <= adj_image.shape[0] and left + 4 <= adj_image.shape[1]:
+                for lane in range(LANES):
+                    for channel in range(3):
+                        u[channel, lane] = adj_image[top + lane // 4, left + lane % 4, channel]
+                    u[CHANNELS, lane] = adj_alpha[top + lane // 4, left + lane % 4]
                     if wp.static(depth):
-                        far = adj_depth[y, x]
-                    if finite(u[0]) and finite(u[1]) and finite(u[2]) and finite(adj_t) and finite(far):
+                        u[3, lane] = adj_depth[top + lane // 4, left + lane % 4]
+            else:
+                for lane in range(LANES):
+                    y = top + lane // 4
+                    x = left + lane % 4
+                    if y < adj_image.shape[0] and x < adj_image.shape[1]:
                         for channel in range(3):
-                            up[block * CHANNELS + channel, lane] = u[channel]
-                            adj_t += u[channel] * background[channel]
-                            adj_background[channel] += u[channel] * t[block, lane]
+                            u[channel, lane] = adj_image[y, x, channel]
+                        u[CHANNELS, lane] = adj_alpha[y, x]
                         if wp.static(depth):
-                            up[block * CHANNELS + 3, lane] = far
-                        adj_final[block, lane] = adj_t
-                    else:
-                        dropped += 1
+                            u[3, lane] = adj_depth[y, x]
+            finite = vec16(1.0)
+            for row in range(CHANNELS + 1):
+                finite = where_less(wp.abs(u[row]), vec16(wp.inf), finite, zero)  # not where it is NaN, either
+            kept += total(finite)
+            adj_t = -where_less(zero, finite, u[CHANNELS], zero)
+            for channel in range(CHANNELS):
+                known = where_less(zero, finite, u[channel], zero)
+                up_out[tile, block * CHANNELS + channel] = known
+                if channel < 3:
+                    adj_t = adj_t + known * background[channel]
+                    adj_background[channel] += total(times(known, final[tile, block]))
+            adj_final_out[tile, block] = adj_t
             block += 1
-        for i in range(STATE):
-            up_out[tile, i] = up[i]
-        longest = float(0.0)
+        stopped = vec16(0.0)
         for block in range(BLOCKS):
-            adj_final_out[tile, block] = adj_final[block]
-            longest = wp.max(longest, wp.max(count[tile, block]))
+            stopped = wp.max(stopped, count[tile, block])
+        longest = wp.max(stopped)
         for channel in range(3):
             adj_background_out[tile, channel] = adj_background[channel]
-        dropped_out[tile] = dropped
+        dropped_out[tile] = LANES * BLOCKS - int(kept)
         steps_out[tile] = int(longest)
         for k in range(ranges[tile][0] + int(longest), ranges[tile][1]):
             for grad in range(slots_out.shape[1]):
