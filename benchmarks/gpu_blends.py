@@ -73,7 +73,7 @@ class Blends:
         self.upstream(self.slots)
         ranks = self.bins.instances[:, 0]
         # in place of the instance's slot, the Gaussian: with `add`, the kernel that is the product's writes there
-        self.by_gaussian = torch.stack([ranks, wp.to_torch(self.bins.order)[ranks.long()]], 1)
+        self.by_gaussian = torch.stack([ranks, wp.to_torch(self.bins.gaussians)[ranks.long()]], 1)
         self.rows = new(self.count, 9)
 
     def forward(self) -> None:
@@ -98,8 +98,8 @@ class Blends:
 
     def gather(self) -> list[torch.Tensor]:
         grads = [self.slots.new_zeros(self.count, width).squeeze(1) for width in (2, 3, 1, 3, 1)]
-        inputs = [self.bins.order, self.bins.slot_ends, view(self.slots, wp.float32)]
-        launch(tiles.gather, len(self.bins.order), inputs, views2d(grads), device=self.slots.device)
+        inputs = [self.bins.gaussians, self.bins.slot_ends, view(self.slots, wp.float32)]
+        launch(tiles.gather, len(self.bins.gaussians), inputs, views2d(grads), device=self.slots.device)
         return grads[:4]
 
     def by_atomics(self) -> torch.Tensor:

@@ -107,7 +107,7 @@ def count(gaussians: tuple[torch.Tensor, ...], camera: Camera, options: RasterOp
     blended, looked_at = pairs.sum(0).tolist()
     pixels = camera.width * camera.height
     coefficients = (cam.sh_degree + 1) ** 2
-    return Counts(len(gaussians[0]), coefficients, len(bins.order), pixels, len(bins.instances), blended, looked_at)
+    return Counts(len(gaussians[0]), coefficients, len(bins.gaussians), pixels, len(bins.instances), blended, looked_at)
 
 
 def mean(counts: list[Counts]) -> Counts:

@@ -26,8 +26,8 @@ def project(count=300, seed=0, size=SIZE, stretch=1.0, options=PLAIN):
 
 def lists(bins):
     """Gaussians of each tile, in order."""
-    order, ranges, instances = bins.order.numpy(), bins.ranges.numpy(), bins.instances.numpy()
-    return [order[instances[first:last, 0]].tolist() for first, last in ranges]
+    gaussians, ranges, instances = bins.gaussians.numpy(), bins.ranges.numpy(), bins.instances.numpy()
+    return [gaussians[instances[first:last, 0]].tolist() for first, last in ranges]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -50,13 +50,13 @@ def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
     assert spare < 0.12 * sum(map(len, found))  # ellipses that pass between the pixel centers of a tile
 
 
-def test_slots_number_the_instances_gaussian_by_gaussian():
+def test_slots_number_the_instances_splat_by_splat():
     camera, projected = project()
     bins = binning.bin_tiles(*projected, camera, RasterOptions())
-    rank, slot = bins.instances.numpy().T
+    splat, slot = bins.instances.numpy().T
     assert sorted(slot) == list(range(len(slot)))
     ends = np.concatenate([[0], bins.slot_ends.numpy()])
-    assert ((slot >= ends[rank]) & (slot < ends[rank + 1])).all()
+    assert ((slot >= ends[splat]) & (slot < ends[splat + 1])).all()
 
 
 def test_the_number_of_threads_changes_nothing():
@@ -77,20 +77,30 @@ def counted_and_sorted(camera, projected, options=PLAIN):
     return [bin_on(*projected, camera, options) for bin_on in (binning.bin_by_counting, binning.bin_by_sorting)]
 
 
+def listed(bins):
+    """Of each instance the Gaussian, and which of the Gaussian's instances it is."""
+    splat, slot = bins.instances.numpy().T
+    begins = np.concatenate([[0], bins.slot_ends.numpy()])
+    return np.stack([bins.gaussians.numpy()[splat], slot - begins[splat]])
+
+
+def by_gaussian(bins, drawn):
+    """The splats of the Gaussians drawn, as bytes, by Gaussian."""
+    return bins.splats.numpy()[:drawn][np.argsort(bins.gaussians.numpy()[:drawn])].tobytes()
+
+
 @pytest.mark.parametrize("options", [PLAIN, RasterOptions(extent="square"), RasterOptions(alpha_min=0.0)], ids=str)
 @pytest.mark.parametrize("size", [SIZE, (1, 1), (1, 2000), (2000, 1), (3000, 2900)], ids=str)
 @pytest.mark.parametrize(("count", "stretch"), [(300, 1.0), (5000, 1.0), (300, 3.0), (1, 1.0), (0, 1.0)])
 def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, options):
-    """What a GPU does, on the CPU: the same instances, slots and ranges, bit for bit."""
+    """What a GPU does, on the CPU: the same Gaussians by tile, their slots in the same order, and the same splats."""
     camera, projected = project(count, 4, size, stretch, options)
     counted, by_sorting = counted_and_sorted(camera, projected, options)
-    drawn = len(counted.order)
-    assert torch.equal(by_sorting.instances, counted.instances) and torch.equal(by_sorting.ranges, counted.ranges)
+    drawn = len(counted.gaussians)
+    assert (listed(by_sorting) == listed(counted)).all() and torch.equal(by_sorting.ranges, counted.ranges)
     assert by_sorting.instances.dtype == by_sorting.ranges.dtype == torch.int32
-    for name in ("order", "splats", "slot_ends"):
-        first, second = getattr(counted, name).numpy(), getattr(by_sorting, name).numpy()
-        assert first.tobytes() == second[:drawn].tobytes(), name
-        assert len(second) == count
+    assert by_gaussian(by_sorting, drawn) == by_gaussian(counted, drawn)
+    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.slot_ends) == count
     assert (by_sorting.slot_ends.numpy()[drawn:] == len(counted.instances)).all()
     assert int(by_sorting.invalid) == counted.invalid
 
@@ -102,7 +112,7 @@ def test_sorting_breaks_ties_by_index_and_leaves_out_what_is_invalid():
         depths[:] = (4.0 * depths).round() / 4.0
         radii[7] = -1
     counted, by_sorting = counted_and_sorted(camera, projected)
-    assert torch.equal(by_sorting.instances, counted.instances) and torch.equal(by_sorting.ranges, counted.ranges)
+    assert (listed(by_sorting) == listed(counted)).all() and torch.equal(by_sorting.ranges, counted.ranges)
     assert int(by_sorting.invalid) == counted.invalid == 1
 
 
@@ -130,8 +140,19 @@ def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
         binning.bin_tiles(*projected, camera, RasterOptions())
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
         binning.bin_by_sorting(*projected, camera, RasterOptions())
-    counts = binning.wp.array(np.full(3, 2**30, np.int64), dtype=binning.wp.int64, device="cpu")
-    assert binning._scan(counts) == 3 * 2**30  # a 32-bit scan would have wrapped
+
+
+@pytest.mark.parametrize("bin_on", [binning.bin_by_counting, binning.bin_by_sorting])
+def test_the_count_does_not_wrap(bin_on):
+    """70,000 Gaussians that cover 188 x 182 tiles each: 32 bits would see a negative number of instances."""
+    camera, projected = project(70_000, size=(3000, 2900), stretch=0.0)
+    *_, opacities, _, depths, extents, radii = projected
+    with torch.no_grad():
+        for tensor, value in ((opacities, 0.5), (depths, 4.0), (extents, 1e5), (radii, 100_000)):
+            tensor.fill_(value)
+        projected[1][:] = torch.tensor([1e-10, 0.0, 1e-10])
+    with pytest.raises(InputError, match=f"touch tiles {70_000 * 188 * 182} times, more than the 2147483647"):
+        bin_on(*projected, camera, RasterOptions(extent="ellipse"))
 
 
 @pytest.mark.parametrize("bin_on", [binning.bin_by_counting, binning.bin_by_sorting])

@@ -24,12 +24,12 @@ SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their 
 
 @dataclass
 class Bins:
-    """Tile lists: V Gaussians drawn (on a GPU: all, those not drawn behind), M tile instances, T tiles."""
+    """Tile lists: V splats (Gaussians drawn; on a GPU all, those not drawn behind), M tile instances, T tiles."""
 
-    order: wp.array  # [V] Gaussian, nearest first
+    gaussians: wp.array  # [V] Gaussian of each splat: ascending; on a GPU, nearest first
     splats: wp.array  # [V] Splat2D
-    slot_ends: wp.array  # [V] int64, inclusive scan of a Gaussian's instances
-    instances: torch.Tensor  # [M, 2] int32 (rank, slot), by tile, nearest first
+    slot_ends: wp.array  # [V] int64, inclusive scan of a splat's instances
+    instances: torch.Tensor  # [M, 2] int32 (splat, slot), by tile, nearest first
     ranges: torch.Tensor  # [T, 2] int32, first and last instance
     slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU
     tiles_x: int
@@ -39,7 +39,7 @@ class Bins:
 def bin_tiles(
     means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
 ) -> Bins:
-    """Sort the drawn Gaussians by depth (ties by index) and list those of each tile.
+    """List the Gaussians of each tile by depth (ties by index).
 
     Raises:
         InputError: if the tile instances are more than the kernels can number.
@@ -54,24 +54,28 @@ def bin_by_counting(
     """:func:`bin_tiles` for the CPU: a counting sort by tile, a band of Gaussians per thread."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     invalid = int(np.count_nonzero(radii.numpy() < 0))
-    order = sort_by_depth(depths, radii)
-    drawn = len(order)
-    splats = wp.empty(drawn, dtype=Splat2D, device="cpu")
-    row_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
-    slot_ends = wp.empty(drawn, dtype=wp.int64, device="cpu")
+    drawn = np.flatnonzero(radii.numpy() > 0).astype(np.int32)
+    count = len(drawn)
+    order = order_by_depth(depths.detach().numpy()[drawn])
+    splats, rows = wp.empty(count, dtype=Splat2D, device="cpu"), np.empty(count, dtype=np.int32)
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
-    square = int(options.extent == "square")
-    launch(tiles.pack, drawn, [order, *tensors, camera.height, options.alpha_min, square], [splats, row_ends])
-    rows = _scan(row_ends)
-    _check_count(rows, camera, drawn, radii.device)
-    spans = wp.empty(rows, dtype=wp.vec2i, device="cpu")
-    size = [camera.width, camera.height, tiles_x]
-    launch(tiles.find_spans, drawn, [splats, row_ends, *size, square], [spans, slot_ends])
-    count = _scan(slot_ends)
-    _check_count(count, camera, drawn, radii.device)
-    instances, ends = _sort_by_tile(spans, row_ends, slot_ends, count, tiles_x * tiles_y)
+    gaussians, square = _array(drawn), int(options.extent == "square")
+    inputs = [gaussians, *tensors, camera.height, options.alpha_min, square]
+    launch(tiles.pack, count, inputs, [splats, _array(rows)])
+    by_depth = rows[order]
+    row_ends = np.cumsum(by_depth, dtype=np.int64)  # a 32-bit scan wraps without a word
+    _check_count(_last(row_ends), camera, count, radii.device)
+    begins = np.empty_like(rows)
+    begins[order] = row_ends - by_depth
+    spans, counts = wp.empty(_last(row_ends), dtype=wp.vec2i, device="cpu"), np.empty(count, dtype=np.int64)
+    inputs = [splats, _array(rows), _array(begins), camera.width, camera.height, tiles_x, square]
+    launch(tiles.find_spans, count, inputs, [spans, _array(counts)])
+    slot_ends = np.cumsum(counts)
+    _check_count(_last(slot_ends), camera, count, radii.device)
+    slots = (slot_ends - counts).astype(np.int32)[order]
+    instances, ends = _sort_by_tile(order, slots, row_ends, spans, _last(slot_ends), tiles_x * tiles_y)
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
-    return Bins(order, splats, slot_ends, instances, ranges, balanced_slices(ends), tiles_x, invalid)
+    return Bins(gaussians, splats, _array(slot_ends), instances, ranges, balanced_slices(ends), tiles_x, invalid)
 
 
 def bin_by_sorting(
@@ -86,15 +90,11 @@ def bin_by_sorting(
     keys = torch.where(radii > 0, depths.detach(), torch.inf)
     order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
+    rows = torch.empty(total, dtype=torch.int32, device=device)
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
     square = int(options.extent == "square")
-    launch(
-        tiles.pack,
-        total,
-        [order, *tensors, camera.height, options.alpha_min, square],
-        [splats, view(counts, wp.int64)],
-        device=device,
-    )
+    inputs = [order, *tensors, camera.height, options.alpha_min, square]
+    launch(tiles.pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
     inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
 
     def list_tiles(slot_ends: torch.Tensor, *lists: torch.Tensor) -> None:
@@ -120,55 +120,49 @@ def bin_by_sorting(
 
 
 def _sort_by_tile(
-    spans: wp.array, row_ends: wp.array, slot_ends: wp.array, count: int, tile_count: int
+    order: np.ndarray, slots: np.ndarray, row_ends: np.ndarray, spans: wp.array, count: int, tile_count: int
 ) -> tuple[torch.Tensor, np.ndarray]:
-    """Instances [M, 2] (rank, slot) by tile, nearest first, and where each tile's end [T].
+    """Instances [M, 2] (splat, slot) by tile, nearest first, and where each tile's end [T].
 
-    A counting sort in bands of Gaussians, one per thread: each band counts its instances of every tile, then writes
+    A counting sort in bands of splats, one per thread: each band counts its instances of every tile, then writes
     them after those of the bands before it. The result is the same for any number of bands.
     """
-    ranks = np.array(even_slices(len(row_ends)), dtype=np.int32)
-    bands = len(ranks) - 1
+    bounds = np.array(even_slices(len(order)), dtype=np.int32)
+    bands = len(bounds) - 1
     one_each = list(range(bands + 1))
-    rows = np.concatenate([[0], row_ends.numpy()])[ranks].astype(np.int32)
+    rows = np.concatenate([[0], row_ends])[bounds].astype(np.int32)
     counts = np.zeros((bands, tile_count), dtype=np.int32)
-    to = lambda array: wp.array(array, dtype=int, copy=False, device="cpu")  # noqa: E731
-    launch(tiles.count_tiles, bands, [to(rows), spans], [to(counts)], bounds=one_each)
+    launch(tiles.count_tiles, bands, [_array(rows), spans], [_array(counts)], bounds=one_each)
     places = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
     _check_longest(int(counts.sum(0).max(initial=0)))
     cursor = np.ascontiguousarray((places - counts.T).T, dtype=np.int32)
     instances = torch.empty((count, 2), dtype=torch.int32)
-    launch(
-        tiles.scatter,
-        bands,
-        [to(ranks), spans, row_ends, slot_ends],
-        [to(cursor), view(instances, wp.vec2i)],
-        bounds=one_each,
-    )
+    inputs = [_array(bounds), _array(order), _array(slots), _array(row_ends), spans]
+    launch(tiles.scatter, bands, inputs, [_array(cursor), view(instances, wp.vec2i)], bounds=one_each)
     return instances, places[:, -1]
 
 
-def sort_by_depth(depths: torch.Tensor, radii: torch.Tensor) -> wp.array:
-    """Indices of the drawn Gaussians, nearest first, ties by index, [V] int32."""
-    drawn = np.flatnonzero(radii.numpy() > 0).astype(np.int32)
-    count = len(drawn)
-    if count == 0:
-        return wp.empty(0, dtype=int, device="cpu")
+def order_by_depth(depths: np.ndarray) -> np.ndarray:
+    """Indices of ``depths`` [V] from the least to the largest, ties by index, [V] int32."""
+    count = len(depths)
     keys = np.empty(2 * count, dtype=np.float32)  # the sort works in twice the space
     values = np.empty(2 * count, dtype=np.int32)
-    keys[:count] = depths.detach().numpy()[drawn]
-    values[:count] = drawn
-    pairs = (wp.array(array, dtype=dtype, copy=False, device="cpu") for array, dtype in ((keys, float), (values, int)))
-    wp.utils.radix_sort_pairs(*pairs, count)
-    return wp.array(values[:count], dtype=int, copy=False, device="cpu")
+    keys[:count] = depths
+    values[:count] = np.arange(count)
+    if count:
+        wp.utils.radix_sort_pairs(wp.array(keys, dtype=float, copy=False, device="cpu"), _array(values), count)
+    return values[:count]
 
 
-def _scan(counts: wp.array) -> int:
-    """Inclusive scan in place, in 64 bits (a 32-bit one wraps without a word); returns the total."""
-    if not len(counts):
-        return 0
-    wp.utils.array_scan(counts, counts, inclusive=True)
-    return int(counts.numpy()[-1])
+def _array(values: np.ndarray) -> wp.array:
+    """The same memory for a kernel."""
+    dtype = {np.dtype(np.int32): int, np.dtype(np.int64): wp.int64}[values.dtype]
+    return wp.array(values, dtype=dtype, copy=False, device="cpu")
+
+
+def _last(ends: np.ndarray) -> int:
+    """The total of an inclusive scan."""
+    return int(ends[-1]) if len(ends) else 0
 
 
 def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:

@@ -287,6 +287,6 @@ class Blend(torch.autograd.Function):
             ctx.dropped.pixel_count += bad.sum()
             rows, new = ctx.gaussian_count, slots.new_zeros
             grads = (new(rows, 2), new(rows, 3), new(rows), new(rows, 3), new(rows))
-            inputs = [bins.order, bins.slot_ends, view(slots, wp.float32)]
-            launch(tiles.gather, len(bins.order), inputs, views2d(grads), device=slots.device)
+            inputs = [bins.gaussians, bins.slot_ends, view(slots, wp.float32)]
+            launch(tiles.gather, len(bins.gaussians), inputs, views2d(grads), device=slots.device)
         return *grads, adj_background, None, None, None, None, None

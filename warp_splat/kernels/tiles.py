@@ -1,12 +1,15 @@
 """Which Gaussians touch which tile, in depth order. Forward only.
 
-Exact tile lists without a sort of tile instances: Gaussians come sorted by depth, so a counting sort by tile that
-keeps their order does it (Tried on the CPU: radix sort of the tile numbers, 11 ms for 1.14M instances). A Gaussian's
-tiles are found once, in floating point, as one span per row of tiles; all that follows is integer work, so that no
-two kernels can round differently. Slots, where the adjoint writes, number the instances Gaussian by Gaussian.
+Splats are the Gaussians that are drawn, on the CPU in the order in which they are stored: most is then read and
+written from one end to the other, and what lies near each other in space does so in the caches. A splat's tiles are
+found once, in floating point, as one span per row of tiles; all that follows is integer work, so that no two kernels
+can round differently. Slots, where the adjoint writes, number the instances splat by splat. Exact lists without a sort
+of tile instances: spans are written by depth, so a counting sort by tile that keeps their order does it (Tried: radix
+sort of the tile numbers, 11 ms for 1.14M instances). Random reads are left to numpy, whose short
+loops have many of them under way at a time (Tried: in these kernels, up to 10 ms each instead of 2 to 5 for 125,000).
 
-A GPU sorts the instances instead. There one kernel runs twice, first to count a Gaussian's tiles and then to write
-them: it is the same machine code, and rounds alike.
+A GPU stores splats by depth and sorts the instances. There one kernel runs twice, first to count a splat's tiles and
+then to write them: it is the same machine code, and rounds alike.
 """
 
 import warp as wp
@@ -41,8 +44,8 @@ def square_of(extent: wp.vec2, conic: wp.vec3, reach: float):
 
 @wp.kernel
 def pack(
-    first: int,  # rank of this slice
-    order: wp.array[int],  # [V] Gaussian, nearest first
+    first: int,  # splat of this slice
+    gaussians: wp.array[int],  # [V] Gaussian of each splat
     means2d: wp.array[wp.vec2],  # [N]
     conics: wp.array[wp.vec3],  # [N]
     opacities: wp.array[float],  # [N]
@@ -54,10 +57,10 @@ def pack(
     square: int,  # 1: look at the square of the reference instead of the ellipse
     # out
     splats_out: wp.array[Splat2D],  # [V]
-    rows_out: wp.array[wp.int64],  # [V] rows of tiles that the box touches
+    rows_out: wp.array[int],  # [V] rows of tiles that the box touches
 ):
-    rank = first + wp.tid()
-    i = order[rank]
+    v = first + wp.tid()
+    i = gaussians[v]
     splat = Splat2D()
     splat.mean = means2d[i]
     splat.extent = extents[i]
@@ -70,9 +73,9 @@ def pack(
         splat.extent = square_of(splat.extent, conics[i], reach)
     splat.color = colors[i]
     splat.depth = depths[i]
-    splats_out[rank] = splat
+    splats_out[v] = splat
     span = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
-    rows_out[rank] = wp.int64(wp.max(span[1] // TILE - span[0] // TILE + 1, 0))
+    rows_out[v] = wp.max(span[1] // TILE - span[0] // TILE + 1, 0)
 
 
 @wp.struct
@@ -121,32 +124,38 @@ def cut(splat: Splat2D, outline: Outline, row: int, width: int, square: int):
     return wp.vec2i(span[0] // TILE, wp.max(span[1] // TILE - span[0] // TILE + 1, 0))
 
 
+@wp.func
+def begin_of(ends: wp.array[wp.int64], i: int):
+    """Where what belongs to ``i`` begins, from the inclusive scan of the counts."""
+    begin = int(0)
+    if i > 0:
+        begin = int(ends[i - 1])
+    return begin
+
+
 @wp.kernel
 def find_spans(
     first: int,
     splats: wp.array[Splat2D],  # [V]
-    row_ends: wp.array[wp.int64],  # [V] inclusive scan of the rows
+    rows: wp.array[int],  # [V]
+    begins: wp.array[int],  # [V] where its rows go
     width: int,
     height: int,
     tiles_x: int,
     square: int,
     # out
-    spans_out: wp.array[wp.vec2i],  # [R] per row of tiles: first tile, number of tiles
+    spans_out: wp.array[wp.vec2i],  # [R] per row of tiles, nearest splat first: first tile, number of tiles
     instances_out: wp.array[wp.int64],  # [V] tiles in all
 ):
-    rank = first + wp.tid()
-    splat = splats[rank]
+    v = first + wp.tid()
+    splat = splats[v]
     outline = outline_of(splat, height)
-    end = int(row_ends[rank])
-    begin = int(0)
-    if rank > 0:
-        begin = int(row_ends[rank - 1])
     found = int(0)
-    for row in range(end - begin):
+    for row in range(rows[v]):
         span = cut(splat, outline, outline.top + row, width, square)
-        spans_out[begin + row] = wp.vec2i((outline.top + row) * tiles_x + span[0], span[1])
+        spans_out[begins[v] + row] = wp.vec2i((outline.top + row) * tiles_x + span[0], span[1])
         found += span[1]
-    instances_out[rank] = wp.int64(found)
+    instances_out[v] = wp.int64(found)
 
 
 @wp.kernel
@@ -168,8 +177,8 @@ def list_tiles(
     rank = first + wp.tid()
     writes = slot_ends.shape[0] > 0
     begin = int(0)
-    if writes and rank > 0:
-        begin = int(slot_ends[rank - 1])
+    if writes:
+        begin = begin_of(slot_ends, rank)
     found = int(0)
     if radii[order[rank]] > 0:
         splat = splats[rank]
@@ -203,27 +212,25 @@ def count_tiles(
 @wp.kernel
 def scatter(
     first: int,
-    ranks: wp.array[int],  # [B + 1] bounds of the bands in ranks
+    bounds: wp.array[int],  # [B + 1] of the bands in `order`
+    order: wp.array[int],  # [V] splat, nearest first
+    slots: wp.array[int],  # [V] first one of each, in that order
+    row_ends: wp.array[wp.int64],  # [V] likewise
     spans: wp.array[wp.vec2i],  # [R]
-    row_ends: wp.array[wp.int64],  # [V]
-    slot_ends: wp.array[wp.int64],  # [V] inclusive scan of the instances
     # out
     cursor_out: wp.array2d[int],  # [B, T] where a band's next instance of a tile goes
-    instances_out: wp.array[wp.vec2i],  # [M] (rank, slot), by tile, nearest first
+    instances_out: wp.array[wp.vec2i],  # [M] (splat, slot), by tile, nearest first
 ):
     band = first + wp.tid()
-    row = int(0)
-    slot = int(0)
-    if ranks[band] > 0:
-        row = int(row_ends[ranks[band] - 1])
-        slot = int(slot_ends[ranks[band] - 1])
-    for rank in range(ranks[band], ranks[band + 1]):
+    row = begin_of(row_ends, bounds[band])
+    for rank in range(bounds[band], bounds[band + 1]):
+        slot = slots[rank]
         end = int(row_ends[rank])
         while row < end:
             span = spans[row]
             for tile in range(span[0], span[0] + span[1]):
                 place = cursor_out[band, tile]
-                instances_out[place] = wp.vec2i(rank, slot)
+                instances_out[place] = wp.vec2i(order[rank], slot)
                 cursor_out[band, tile] = place + 1
                 slot += 1
             row += 1
@@ -232,7 +239,7 @@ def scatter(
 @wp.kernel
 def gather(
     first: int,
-    order: wp.array[int],  # [V]
+    gaussians: wp.array[int],  # [V]
     slot_ends: wp.array[wp.int64],  # [V]
     slots: wp.array2d[float],  # [M, 9 or 10]
     # out: gradients, zero where culled; those that nobody asked for have no rows
@@ -243,17 +250,14 @@ def gather(
     depths_out: wp.array[float],  # [N]
 ):
     """Sum each Gaussian's slots, in order: no atomics, the same bits for any number of threads."""
-    rank = first + wp.tid()
-    i = order[rank]
-    begin = int(0)
-    if rank > 0:
-        begin = int(slot_ends[rank - 1])
+    v = first + wp.tid()
+    i = gaussians[v]
     mean = wp.vec2(0.0)
     conic = wp.vec3(0.0)
     opacity = float(0.0)
     color = wp.vec3(0.0)
     depth = float(0.0)
-    for slot in range(begin, int(slot_ends[rank])):
+    for slot in range(begin_of(slot_ends, v), int(slot_ends[v])):
         mean += wp.vec2(slots[slot, 0], slots[slot, 1])
         conic += wp.vec3(slots[slot, 2], slots[slot, 3], slots[slot, 4])
         opacity += slots[slot, 5]
