@@ -22,7 +22,7 @@ NEVER = 10**9
 
 
 def make_gaussians(count: int, device: str) -> GaussianModel:
-    """Random Gaussians of SH degree 3 in a ball, the smaller the more there are, as in training.
+    """Random Gaussians of SH degree 3 in a ball, the smaller the more there are, and arranged, as in training.
 
     At 100,000 their standard deviation is 2 px seen from the orbit; the scale falls with the cube root of the count.
     """
@@ -39,7 +39,7 @@ def make_gaussians(count: int, device: str) -> GaussianModel:
             "scales": 0.3 + 0.8 * normal(count, 3) + math.log(pixel),
             "quats": normal(count, 4),
         }
-    )
+    ).arranged()
 
 
 def cameras(width: int, height: int, count: int) -> list[Camera]:

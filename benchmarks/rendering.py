@@ -72,7 +72,7 @@ def main() -> None:
     launch.prepare("cpu", 0)
     scene = load_scene(arguments.scene, eval=True, report=lambda _: None)
     cameras, rows = focus_orbit(scene, FRAMES), []
-    models = [GaussianModel.load(path) for path in arguments.models]
+    models = [GaussianModel.load(path).arranged() for path in arguments.models]
     for model in models:
         rows += measure(model, list(OPTIONS) if model is models[0] else [FULL], cameras, scene.test)
     calls = compare_calls(models[0], cameras)

@@ -74,7 +74,7 @@ def test_start_from_a_file(tmp_path, degree):
     first.model.save(tmp_path / "a.ply")
     scene, _ = load(root, start=str(tmp_path / "a.ply"))
     second = Trainer(scene, TrainConfig(device="cpu", sh_degree=degree))
-    for name, tensor in first.model.parameters.items():
+    for name, tensor in first.model.arranged().parameters.items():
         found = second.model.parameters[name]
         if name == "sh_rest":
             assert found.shape[1] == (degree + 1) ** 2 - 1

@@ -10,7 +10,7 @@ import torch
 from warp_splat.config import TrainConfig
 from warp_splat.distributed import ALONE, Processes
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.gaussians import GaussianModel
+from warp_splat.gaussians import GaussianModel, along_curve
 from warp_splat.optimizer import Optimizer
 from warp_splat.renderer import RenderOutput
 
@@ -56,8 +56,8 @@ class Densifier:
         """Take in the gradient of one view's 2D means."""
         if out.means2d.grad is None:
             return
-        x, y = (0.5 * size * out.means2d.grad[:, axis] for axis, size in enumerate((width, height)))
-        self.gradient += torch.nan_to_num(torch.sqrt(x * x + y * y), 0.0, 0.0, 0.0)
+        x, y = (out.means2d.grad * self.gradient.new_tensor([0.5 * width, 0.5 * height])).T
+        self.gradient += torch.nan_to_num(torch.hypot(x, y), 0.0, 0.0, 0.0)
         self.views += out.radii > 0
         if self.config.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
@@ -116,6 +116,7 @@ class Densifier:
             self._clear()
             return Change(0, 0, 0, refused=True)
         self.optimizer.replace(keep.nonzero()[:, 0], {name: rows[keep_added] for name, rows in added.items()})
+        self.optimizer.arrange(along_curve(self.model.parameters["means"]))
         self._clear()
         return Change(len(clone), len(split), pruned)
 

@@ -113,6 +113,15 @@ class Optimizer:
                 if moment in state:
                     state[moment] = torch.cat([state[moment][kept], torch.zeros_like(added[name])])
 
+    def arrange(self, order: torch.Tensor) -> None:
+        """Put the rows in ``order`` (indices), moments and all."""
+        for name in self.model.NAMES:
+            self._swap(name, self.model.parameters[name].detach()[order])
+            state = self.adam.state.get(self.model.parameters[name], {})
+            for moment in MOMENTS:
+                if moment in state:
+                    state[moment] = state[moment][order]
+
     def reset_opacities(self, ceiling: float) -> None:
         """Lower every opacity to at most ``ceiling`` and forget its moments."""
         logits = self.model.parameters["opacities"].detach()

@@ -44,7 +44,7 @@ def render(config: RenderConfig) -> int:
     metrics, absent = choose_metrics(config.lpips_weights)
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     folder, iteration, gaussians, trained = _open(config)
-    model = GaussianModel.from_splats(gaussians.splats)
+    model = GaussianModel.from_splats(gaussians.splats).arranged()
     scene = None
     if _needs_scene(config):
         scene = load_trained_scene(config.model_path, config.source_path, trained, say)

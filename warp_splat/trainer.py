@@ -86,7 +86,7 @@ class Trainer:
             model = GaussianModel.from_splats(scene.start.splats, config.sh_degree)
         else:
             model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
-        self.model = model.to(self.device)
+        self.model = model.arranged().to(self.device)
         self.optimizer = Optimizer(self.model, config, extent, processes.count)
         self.densifier = Densifier(self.model, self.optimizer, config, extent, processes)
         self.quarantine = Quarantine()

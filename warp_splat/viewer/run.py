@@ -37,7 +37,7 @@ def view(config: ViewConfig) -> int:
     free_port(config.port)  # before the scene is loaded
     device = settle_device(launch.prepare(config.device, config.threads), config.device)
     iteration, gaussians, trained = open_model(config.model, config.iteration)
-    model = GaussianModel.from_splats(gaussians.splats).to(device)
+    model = GaussianModel.from_splats(gaussians.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
     scene = _find_scene(config, trained)
     draw = make_draw(model, trained, is_linear(scene, trained))
