@@ -8,7 +8,8 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLU
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
 Tried: sixteen Gaussians in lanes, as in the blends; 330 lines to turn rows into columns and back, for 14 -> 11 and
 33 -> 25 ms of a step of 245 (195,000 Gaussians, degree 3): what limits both is reading and adding up rows of SH.
-Tried: SH of a degree as one matrix, its product with the basis Warp's; the adjoint takes 10 % longer.
+Tried: SH of a degree as one matrix, its product with the basis Warp's; the adjoint takes 10 % longer. Without the SLP
+vectoriser 15 % longer; regrouping of sums changes nothing.
 
 The exact outline of the ellipsoid x' Sigma^-1 x = k^2 instead (Qi, Cai and Han 2024, with k = 3) follows from its
 dual conic, K (k^2 Sigma - p p') K' for a centre p. With a3 = k / z (third row of W R S) and r = 1 - |a3|^2 that is,
