@@ -90,7 +90,7 @@ def bin_by_sorting(
     keys = torch.where(radii > 0, depths.detach(), torch.inf)
     order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
-    rows = torch.empty(total, dtype=torch.int32, device=device)
+    rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
     tensors = views2d((means2d, conics, opacities, colors, depths, extents))
     square = int(options.extent == "square")
     inputs = [order, *tensors, camera.height, options.alpha_min, square]

@@ -56,7 +56,7 @@ class Densifier:
         """Take in the gradient of one view's 2D means."""
         if out.means2d.grad is None:
             return
-        x, y = (out.means2d.grad * self.gradient.new_tensor([0.5 * width, 0.5 * height])).T
+        x, y = (0.5 * size * out.means2d.grad[:, axis] for axis, size in enumerate((width, height)))
         self.gradient += torch.nan_to_num(torch.hypot(x, y), 0.0, 0.0, 0.0)
         self.views += out.radii > 0
         if self.config.prune_screen_size:
