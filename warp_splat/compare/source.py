@@ -26,10 +26,11 @@ RULES = {
 }
 #: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
 _KNOWN = ("step.exp2_known", "step.opaque")
+_LOOP = ("adjoint_lanes.adj_blend", "adjoint_lanes.folded")
 _WALK = ("taped_lanes.walk", "taped_lanes.spread", "taped_lanes.collect", "taped_lanes.exp2_value", *_KNOWN)
 PLUMBING = {
-    "manual": ("adjoint_lanes.adj_blend", "adjoint_lanes._make_manual_body"),
-    "stepwise": ("adjoint_lanes.adj_blend", "adjoint_lanes._make_stepwise_body", "step.make_stepwise", *_KNOWN),
+    "manual": (*_LOOP, "adjoint_lanes._make_manual_body"),
+    "stepwise": (*_LOOP, "adjoint_lanes._make_stepwise_body", "step.make_stepwise", *_KNOWN),
     "reversible": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of"),
     "stored": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of_kept"),
     "generated": ("taped_lanes.walk", "taped_lanes.begin", "taped_lanes.front_of"),
