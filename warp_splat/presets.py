@@ -15,8 +15,8 @@ EMBEDDED_DEFAULTS: dict[str, dict[str, Any]] = {
         "sh_interval": 500,
     },
     "fast": {
-        "iterations": 1500,
-        "position_lr_max_steps": 1500,
+        "iterations": 1700,
+        "position_lr_max_steps": 1700,
         "feature_lr": 0.0075,
         "opacity_lr": 0.075,
         "scaling_lr": 0.015,
@@ -24,9 +24,9 @@ EMBEDDED_DEFAULTS: dict[str, dict[str, Any]] = {
         "cooldown": 0,
         "coarse_until_iter": 500,
         "densify_from_iter": 200,
-        "densify_until_iter": 1000,
+        "densify_until_iter": 1150,
         "max_gaussians": 50_000,
-        "sh_interval": 350,
+        "sh_interval": 400,
     },
 }
 
