@@ -194,8 +194,8 @@ def compare(
         xx = vec16(0.0)
         yy = vec16(0.0)
         xy = vec16(0.0)
-        # unrolled as in adj_blur_columns, five planes are slower: 7.5 ms against 5.2; so is a while loop, 9.6; strips of
-        # 8 groups, whose eleven rows fit in the first cache, change nothing
+        # unrolled as in adj_blur_columns, five planes are slower: 7.5 ms against 5.2; so is a while loop, 9.6; strips
+        # of 8 groups, whose eleven rows fit in the first cache, change nothing
         for other in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
             w = WEIGHTS[other - row + RADIUS]
             mx = mx + moments[other, 0, group] * w
