@@ -133,9 +133,11 @@ def test_schedule():
     assert torch.allclose(torch.sigmoid(white.parameters["opacities"].detach()), torch.tensor(0.01))
 
 
-def step(model, optimizer, gradient, radii=None):
+def step(model, optimizer, gradients, radii=None):
+    """One with a gradient for each Gaussian, all of whose numbers have the same."""
     for tensor in model.parameters.values():
-        tensor.grad = torch.full_like(tensor, gradient)
+        tensor.grad = torch.empty_like(tensor)
+        tensor.grad.T[:] = torch.as_tensor(gradients, dtype=torch.float32).expand(len(model))
     optimizer.step(torch.ones(len(model), dtype=torch.int32) if radii is None else radii)
 
 
@@ -144,8 +146,8 @@ def test_moments_follow_their_gaussians():
     model, optimizer, _ = setup(5)
     alone, other, _ = setup(5)
     for _ in range(3):
-        step(model, optimizer, 0.5)
-        step(alone, other, 0.5)
+        step(model, optimizer, [0.1, 0.2, -0.3, 0.4, 0.5])
+        step(alone, other, [0.1, 0.2, -0.3, 0.4, 0.5])
     added = {name: tensor.detach()[:1].clone() for name, tensor in model.parameters.items()}
     optimizer.replace(torch.tensor([1, 4]), added)
     step(model, optimizer, -0.25)
@@ -159,14 +161,14 @@ def test_moments_follow_their_gaussians():
 def test_moments_follow_when_rows_are_arranged():
     model, optimizer, _ = setup(5)
     alone, other, _ = setup(5)
-    order = torch.tensor([3, 0, 4, 1, 2])
-    for gradient in (0.5, -0.25):
-        step(model, optimizer, gradient)
-        step(alone, other, gradient)
-        optimizer.arrange(order)
-        other.arrange(torch.arange(5))
+    order, gradients = torch.tensor([3, 0, 4, 1, 2]), torch.tensor([0.1, 0.2, -0.3, 0.4, 0.5])
+    step(model, optimizer, gradients)
+    step(alone, other, gradients)
+    optimizer.arrange(order)
+    step(model, optimizer, -0.1)
+    step(alone, other, -0.1)
     for name, tensor in model.parameters.items():
-        assert torch.equal(tensor.detach(), alone.parameters[name].detach()[order][order])
+        assert torch.equal(tensor.detach(), alone.parameters[name].detach()[order])
 
 
 def test_densification_arranges_the_set_along_a_curve():

@@ -144,12 +144,19 @@ def test_the_number_of_threads_changes_no_bit():
 
 def test_other_types_are_refused():
     image, mask = torch.zeros(20, 30, 3), torch.ones(20, 30, 1, dtype=torch.uint8)
-    for arguments in ((image.double(), image), (image, image.long()), (image, image, 0.2, mask.float())):
-        with pytest.raises(InputError, match="expected"):
+    for arguments, said in (
+        ((image.double(), image), "float64"),
+        ((image, image.long()), "int64"),
+        ((image, image, 0.2, mask.float()), r"a mask \[20, 30, 1\] of uint8.* float32"),
+        ((image, image, 0.2, mask[1:]), r"got \[19, 30, 1\]"),
+    ):
+        with pytest.raises(InputError, match=said):
             image_loss(*arguments)
 
 
-@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 4), (21, 30, 3)])
-def test_other_shapes_are_refused(shape):
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 4), (21, 30, 3), (1, 1, 3)])
+def test_other_shapes_are_refused(shape, masked):
+    mask = torch.ones(20, 30, 1, dtype=torch.uint8) if masked else None
     with pytest.raises(InputError, match=r"\[H, W, 3\]"):
-        image_loss(torch.zeros(20, 30, 3), torch.zeros(shape))
+        image_loss(torch.zeros(20, 30, 3), torch.zeros(shape), 0.2, mask)

@@ -43,19 +43,22 @@ def image_loss(
     Raises:
         InputError: if the shapes differ or are not [H, W, 3], or a type is another.
     """
-    if mask is not None and (mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1)):
-        raise InputError(f"image_loss: expected a mask [H, W, 1] of uint8, got {list(mask.shape)} of {mask.dtype}.")
     if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
         raise InputError(
             f"image_loss: expected an image of float32 and a target of float32 or uint8, got {image.dtype} and "
             f"{target.dtype}; convert them."
         )
-    if mask is not None:
-        image, target = image * mask, target * mask
     if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS:
         raise InputError(
             f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
         )
+    if mask is not None:
+        if mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1):
+            raise InputError(
+                f"image_loss: expected a mask {[*image.shape[:2], 1]} of uint8, 1 for pixels that count, got "
+                f"{list(mask.shape)} of {mask.dtype}."
+            )
+        image, target = image * mask, target * mask
     if image.is_cuda:
         return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))

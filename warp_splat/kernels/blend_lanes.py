@@ -28,6 +28,7 @@ from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16,
 BLOCKS = TILE * TILE // LANES  # per tile
 AHEAD = 32  # instances whose boxes are found together; then, whether the whole tile has stopped
 
+ROWS_AHEAD = AHEAD * wp.types.type_size_in_bytes(Splat2D) // (4 * LANES)  # of lanes, in which that many splats fit
 vec4i = wp.types.vector(length=4, dtype=int)
 mat_boxes = wp.types.matrix(shape=(AHEAD, 4), dtype=int)
 
@@ -70,7 +71,7 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
     """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     WALKED, RGB, DEPTH = BLOCKS, 2 * BLOCKS, 5 * BLOCKS
     STATE = DEPTH + BLOCKS if depth else DEPTH
-    mat_room = wp.types.matrix(shape=(STATE + AHEAD + 1, LANES), dtype=float)
+    mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
     exp2_minus = make_exp(exp_degree)
 
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
