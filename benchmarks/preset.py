@@ -21,6 +21,7 @@ EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}
 PHOTOGRAPHS = {
     "full": ["-r", "1", "--eval", "--iterations", "7000"],
     "full, fast": ["-r", "1", "--eval", "--preset", "fast"],
+    **{f"full, fast, seed {seed}": ["-r", "1", "--eval", "--preset", "fast", "--seed", f"{seed}"] for seed in (1, 2)},
 }
 EARLY = 60  # s
 
@@ -72,7 +73,8 @@ def main() -> None:
     runs = dict(EMBEDDED)
     if arguments.scene:
         runs |= {name: ["-s", arguments.scene.resolve(), *flags] for name, flags in PHOTOGRAPHS.items()}
-    found = {name: run((arguments.models / name.replace(", ", "_")).resolve(), flags) for name, flags in runs.items()}
+    folders = {name: arguments.models / name.replace(",", "").replace(" ", "_") for name in runs}
+    found = {name: run(folders[name].resolve(), flags) for name, flags in runs.items()}
     headers = ("run", "iterations", f"PSNR dB by {EARLY} s", "PSNR dB", "SSIM", "s of steps", "wall s", "Gaussians")
     rows = [row_of(name, *results) for name, results in found.items()]
     note = "Held-out views; a few of them in the column of the first minute."

@@ -15,8 +15,6 @@ from warp_splat.kernels.lanes import LANES, times, vec16
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
 
 vec5 = wp.types.vector(length=5, dtype=float)
-
-
 vec8 = wp.types.vector(length=8, dtype=float)
 
 
