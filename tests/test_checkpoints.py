@@ -223,6 +223,9 @@ def test_another_scene_is_refused(whole, tmp_path, capsys):
     assert "training views" in fails(capsys, "train", *options, "--no-eval")
     message = fails(capsys, "train", *options, "-s", str(tmp_path))
     assert str(tmp_path) in message
+    before = {path: path.read_bytes() for path in whole.iterdir() if path.is_file()}
+    fails(capsys, "train", *options[:4], "--no-eval")
+    assert {path: path.read_bytes() for path in whole.iterdir() if path.is_file()} == before
 
 
 def test_resume_on(device, scene, tmp_path):

@@ -47,6 +47,8 @@ def put(value, *index):
         ("sh", lambda t: (t[:, :1], t[:, 1:3]), "6, 2, 3|3"),
         ("sh", lambda t: (t[:, :1], t[:5, 1:]), "5, 3, 3|5"),
         ("sh", lambda t: (t[:, :1], t[:, 1:2], t[:, 2:]), "3"),
+        ("means", lambda t: t.to_sparse(), "dense"),
+        ("sh", lambda t: t.to_sparse(), "dense"),
         ("background", lambda _: (0, 0), "2"),
         ("background", lambda _: torch.zeros(4), "4"),
         ("background", lambda _: torch.zeros(1, 3), "1, 3"),

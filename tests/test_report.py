@@ -26,6 +26,13 @@ def test_contact_sheet_size(tmp_path, count, columns):
     assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 132  # two lines at its head
 
 
+@pytest.mark.parametrize(("height", "width"), [(40, 1), (1, 40)])
+def test_contact_sheet_of_strips_stays_small(tmp_path, height, width):
+    """At the width of its cell, each would be 21,000 pixels high; a strip of 5,000 pixels took all memory."""
+    report.contact_sheet(tmp_path / "sheet.png", {"": [view(height=height, width=width)] * 2})
+    assert load_png(tmp_path / "sheet.png").shape[0] < 5000
+
+
 def test_contact_sheet_shows_the_amplified_difference(tmp_path):
     name, photo, _, said = view()
     render = photo.copy()

@@ -120,6 +120,7 @@ BAD = {
     ),
     "model": (trained_model, ["found a trained model", "folder of its scene"]),
     "resolution-0": (colmap_case(lambda root: None, resolution=0), ["resolution", "got 0"]),
+    "resolution-absurd": (colmap_case(lambda root: None, resolution=1_000_000), [".png", "1000000", "-r"]),
     "resolution-negative": (colmap_case(lambda root: None, resolution=-2), ["resolution", "got -2"]),
     "eval-one-image": (no_test_left, ["at least 2 images", "found 1", "--eval"]),
     "empty-sparse": (lambda root: ((root / "sparse").mkdir() or root, {}), ["sparse", "found none"]),

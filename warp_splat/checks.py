@@ -97,6 +97,8 @@ def _check_tensor(name: str, tensor, shape: tuple[int | None, ...], device: torc
         raise InputError(
             f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
         )
+    if tensor.layout != torch.strided:
+        raise InputError(f"{name}: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
     if device is not None and tensor.device != device:
         raise InputError(f"{name}: expected a tensor on {device}, as the means, got one on {tensor.device}.")
 

@@ -27,6 +27,7 @@ BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
 INK, FAINT = "#222222", "#d9d9d9"
 DPI = 200  # sharp on dense displays at the width of a README, about 850 px
 WIDTH = 8.0  # inches
+TALLEST = 4.0  # widths of its cell that a picture of a sheet may be high; one that is steeper is drawn narrower
 DIFFERENCE_GAIN = 4  # a difference of a quarter of the range is white
 NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
 
@@ -56,7 +57,8 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
         raise InputError("sections: expected at least one view, got none.")
     margin, gap, text, heading = 0.1, 0.04, 0.22, 0.26  # inches
     cell = (WIDTH - 2 * margin - (columns - 1) * 2 * gap) / (3 * columns)
-    heights = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) * (cell - gap) for _, line in lines]
+    shapes = [max(photo.shape[0] / photo.shape[1] for _, photo, *_ in line) for _, line in lines]
+    heights = [min(shape, TALLEST) * (cell - gap) for shape in shapes]
     titles = [heading * (bool(title) or number == 0) for number, (title, _) in enumerate(lines)]
     figure = new_figure(WIDTH, heading + sum(heights) + sum(titles) + len(lines) * (text + gap) + margin)
     top = figure.get_figheight()

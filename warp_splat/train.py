@@ -113,7 +113,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         say(f"Warning: {config.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
     trainer = Trainer(scene, config, processes)
     if leads:
-        _write_inputs(model_folder.prepare(run.folder), config, scene, continues=checkpoint is not None)
+        model_folder.prepare(run.folder)
     say("Preparing kernels (compiled once on a machine, about 15 s) ...")
     start = time.perf_counter()
     with _memory_explained(trainer):
@@ -122,9 +122,11 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         if checkpoint:
             restore(trainer, run, checkpoint)
             say(f"Continuing after {run.iteration} iterations, from {checkpoint.path}")
-            del checkpoint  # its arrays take as much memory as the trainer's
         else:
             keep(trainer, run)
+        if leads:  # only now: where a checkpoint is refused, the folder stays as it was
+            _write_inputs(run.folder, config, scene, continues=checkpoint is not None)
+        del checkpoint  # its arrays take as much memory as the trainer's
         if leads and config.tensorboard:
             run.events = EventLog.open(run.folder, run.iteration)
         if device.type == "cpu":

@@ -173,10 +173,16 @@ def load_views(photos: list[Photo], resolution: int, white_background: bool, inv
     """Decode ``photos`` at the size that ``resolution`` asks for (see :func:`target_size`), in their order.
 
     Raises:
-        InputError: if a file cannot be read.
+        InputError: if a file cannot be read, or that size is absurd.
     """
 
     def load(photo: Photo) -> View:
+        camera = photo.camera.resized(*target_size(photo.camera.width, photo.camera.height, resolution))
+        if camera.width * camera.height > PIXELS_MOST:
+            raise InputError(
+                f"{photo.path}: expected at most {PIXELS_MOST} pixels, got {camera.width} x {camera.height} from "
+                f"-r {resolution}, which is a width in px; name a smaller one."
+            )
         pixels = read_pixels(photo.path, float(white_background))
         height, width = pixels.color.shape[:2]
         mask = None if photo.mask is None else read_mask(photo.mask, (width, height), invert_masks)
@@ -184,7 +190,6 @@ def load_views(photos: list[Photo], resolution: int, white_background: bool, inv
         image = np.concatenate([pixels.color, *planes], axis=2) if planes else pixels.color
         if photo.sampling is not None:
             image = undistort(image, photo.sampling())
-        camera = photo.camera.resized(*target_size(photo.camera.width, photo.camera.height, resolution))
         if (camera.height, camera.width) != image.shape[:2]:
             image = _resize(image, camera.width, camera.height)
         color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
