@@ -137,7 +137,9 @@ def step(model, optimizer, gradients, radii=None):
     """One with a gradient for each Gaussian, all of whose numbers have the same."""
     for tensor in model.parameters.values():
         tensor.grad = torch.empty_like(tensor)
-        tensor.grad.T[:] = torch.as_tensor(gradients, dtype=torch.float32).expand(len(model))
+        tensor.grad.view(len(model), -1)[:] = torch.as_tensor(gradients, dtype=torch.float32).expand(len(model))[
+            :, None
+        ]
     optimizer.step(torch.ones(len(model), dtype=torch.int32) if radii is None else radii)
 
 
@@ -165,10 +167,10 @@ def test_moments_follow_when_rows_are_arranged():
     step(model, optimizer, gradients)
     step(alone, other, gradients)
     optimizer.arrange(order)
-    step(model, optimizer, -0.1)
-    step(alone, other, -0.1)
     for name, tensor in model.parameters.items():
-        assert torch.equal(tensor.detach(), alone.parameters[name].detach()[order])
+        expected, state, moments = alone.parameters[name], optimizer.adam.state[tensor], ("exp_avg", "exp_avg_sq")
+        assert torch.equal(tensor.detach(), expected.detach()[order])
+        assert all(torch.equal(state[moment], other.adam.state[expected][moment][order]) for moment in moments)
 
 
 def test_densification_arranges_the_set_along_a_curve():

@@ -257,3 +257,10 @@ def test_a_folder_that_is_no_scene_gets_one_sentence(tmp_path, capsys):
     assert main(["inspect", str(tmp_path / "photos")]) == 1
     assert "warp-splat sfm" in capsys.readouterr().err
     assert not (tmp_path / "output").exists()
+
+
+def test_photographs_of_one_column_have_a_page(tmp_path, capsys):
+    pixels = np.full((2400, 1, 3), 128, np.uint8)
+    scene = write_colmap(tmp_path / "strips", pixels=pixels, camera="PINHOLE 1 2400 20 20 0.5 1200")
+    _, page = examine(scene, tmp_path, capsys, 0)
+    assert page.read_text().count("<img") == 3

@@ -147,7 +147,7 @@ def test_other_types_are_refused():
     for arguments, said in (
         ((image.double(), image), "float64"),
         ((image, image.long()), "int64"),
-        ((image, image, 0.2, mask.float()), r"a mask \[20, 30, 1\] of uint8.* float32"),
+        ((image, image, 0.2, mask.float()), r"a mask \[20, 30, 1\] of uint8.*float32"),
         ((image, image, 0.2, mask[1:]), r"got \[19, 30, 1\]"),
     ):
         with pytest.raises(InputError, match=said):

@@ -2,6 +2,8 @@
 
 import argparse
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -179,6 +181,23 @@ def test_prepare_creates_and_leaves_nothing_behind(tmp_path):
     folder = model_folder.prepare(tmp_path / "a" / "b")
     assert folder.is_dir() and not list(folder.iterdir())
     model_folder.prepare(folder)
+
+
+def test_a_folder_is_claimed_by_one_training(tmp_path):
+    """Another process is refused while the block runs, and not any more once it has ended or was killed."""
+    program = (
+        "import sys; from pathlib import Path; from warp_splat.formats.model_folder import claimed\n"
+        f"with claimed(Path({str(tmp_path)!r})):\n    print('in', flush=True); sys.stdin.read()"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", program], **pipes) as other:
+        assert other.stdout.readline() == "in\n"
+        with pytest.raises(InputError, match="another training"), model_folder.claimed(tmp_path):
+            pass
+        other.kill()
+    with model_folder.claimed(tmp_path):
+        assert list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir())
 
 
 def test_prepare_refuses_before_training(tmp_path, monkeypatch):

@@ -120,6 +120,11 @@ def test_ends_of_the_ranges_are_good(device):
     assert not call(device, opacities=lambda t: t.clone().fill_(0)).alpha.any()
 
 
+def test_camera_too_large(device):
+    with pytest.raises(InputError, match=r"camera: expected at most .* pixels, got 1000000 x 1000000"):
+        call(device, camera=SCENE.camera.resized(10**6, 10**6))
+
+
 @pytest.mark.parametrize("camera", [None, {"width": 20}, np.eye(4)], ids=["None", "dict", "ndarray"])
 def test_camera(camera, device):
     with pytest.raises(InputError, match=rf"(?s)camera.*{type(camera).__name__}"):

@@ -33,7 +33,7 @@ PER_GAUSSIAN = sum(
 #: Floats of a tile instance.
 PER_INSTANCE = sum(
     (
-        2 + 9,  # (rank, slot), and its row of gradients
+        2 + 9,  # (splat, slot), and its row of gradients
         2,  # the span of a row of tiles that one Gaussian touches, at most one for each instance
     )
 )

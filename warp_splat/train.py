@@ -112,11 +112,11 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         which = "with" if scene.start.antialiased else "without"
         say(f"Warning: {config.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
     trainer = Trainer(scene, config, processes)
-    if leads:
-        model_folder.prepare(run.folder)
     say("Preparing kernels (compiled once on a machine, about 15 s) ...")
     start = time.perf_counter()
-    with _memory_explained(trainer):
+    with model_folder.claimed(run.folder) if leads else nullcontext(), _memory_explained(trainer):
+        if leads:
+            _refuse_other_training(run.folder, checkpoint)  # again: one may have ended meanwhile
         trainer.warm_up()
         say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
         if checkpoint:
@@ -174,13 +174,17 @@ def _choose_folder(config: TrainConfig, checkpoint: Checkpoint | None) -> Path:
     model_folder.check_place(folder)
     if config.source_path and folder.resolve() == Path(config.source_path).resolve():
         raise InputError(f"-m {folder}: expected another folder than the scene's; choose a new one.")
+    _refuse_other_training(folder, checkpoint)
+    return folder
+
+
+def _refuse_other_training(folder: Path, checkpoint: Checkpoint | None) -> None:
     continued = checkpoint and checkpoint.path.resolve() == (folder / LAST).resolve()
     if not continued and ((folder / LAST).exists() or any(folder.glob("point_cloud/*/*.ply"))):
         raise InputError(
             f"{folder}: this folder already holds a training; choose another with -m, move it, or continue where it "
             f"ended with --resume {folder}."
         )
-    return folder
 
 
 def embedded_scene() -> Path:

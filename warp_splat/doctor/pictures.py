@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from warp_splat.doctor.geometry import Measured, sample, worst_and_best
 from warp_splat.doctor.subject import THUMBNAIL, Subject
-from warp_splat.report import BLUE, INK, ORANGE, WIDTH, new_figure, plain_axes
+from warp_splat.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, plain_axes
 from warp_splat.scene.types import visible
 
 SHEET, COLUMNS = 60, 10  # thumbnails, at most, and in a row
@@ -48,9 +48,10 @@ def _encode(figure: Figure) -> str:
 
 
 def _grid(count: int, columns: int, aspect: float) -> tuple[Figure, list]:
-    """A figure with ``count`` cells of height / width ``aspect``."""
+    """A figure with ``count`` cells of height / width ``aspect``, or of TALLEST."""
     rows = math.ceil(count / columns)
-    figure = new_figure(WIDTH, rows * (WIDTH / columns * aspect * 0.97 + 0.2), layout="constrained")
+    height = WIDTH / columns * min(aspect, TALLEST) * 0.97 + 0.2
+    figure = new_figure(WIDTH, rows * height, layout="constrained")
     cells = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in cells:
         axes.set_axis_off()

@@ -10,7 +10,8 @@ import json
 import os
 import re
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,29 @@ def prepare(folder: str | Path) -> Path:
             f"{folder}: expected a folder that can be written ({error.strerror or error}); choose another model path."
         ) from error
     return folder
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """:func:`prepare` it, and keep other trainings out while the block runs.
+
+    Raises:
+        InputError: if the folder cannot be written, or a training in another process holds it.
+    """
+    from filelock import FileLock, Timeout  # noqa: PLC0415 - only training needs it
+
+    lock = FileLock(prepare(folder) / ".lock")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise InputError(
+            f"{folder}: another training writes into this folder; wait for its end, or choose another with -m."
+        ) from error
+    try:
+        yield
+    finally:
+        Path(lock.lock_file).unlink(missing_ok=True)
+        lock.release()
 
 
 def ply_path(folder: str | Path, iteration: int) -> Path:

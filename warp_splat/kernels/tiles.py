@@ -5,8 +5,8 @@ written from one end to the other, and what lies near each other in space does s
 found once, in floating point, as one span per row of tiles; all that follows is integer work, so that no two kernels
 can round differently. Slots, where the adjoint writes, number the instances splat by splat. Exact lists without a sort
 of tile instances: spans are written by depth, so a counting sort by tile that keeps their order does it (Tried: radix
-sort of the tile numbers, 11 ms for 1.14M instances). Random reads are left to numpy, whose short
-loops have many of them under way at a time (Tried: in these kernels, up to 10 ms each instead of 2 to 5 for 125,000).
+sort of the tile numbers, 11 ms for 1.14M instances). Random reads are left to numpy, whose short loops have many of
+them under way at a time (Tried: in these kernels, up to 10 ms each instead of 2 to 5 for 125,000).
 
 A GPU stores splats by depth and sorts the instances. There one kernel runs twice, first to count a splat's tiles and
 then to write them: it is the same machine code, and rounds alike.
