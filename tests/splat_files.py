@@ -1,11 +1,15 @@
-"""Gaussians to write into files, and a reader of glTF that shares nothing with the package."""
+"""Gaussians to write into files, and readers and writers of such files that share nothing with the package."""
 
+import gzip
 import json
 import struct
 from pathlib import Path
 
 import numpy as np
+import torch
+import zstandard
 
+from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.splats import SplatArrays, SplatFile
 
 ENDINGS = (".ply", ".splat", ".spz", ".glb", ".gltf")
@@ -75,3 +79,43 @@ def glb_attributes(path):
         values = np.frombuffer(binary, dtype, accessor["count"] * width, start)
         found[name] = values.reshape(-1, width) if width > 1 else values
     return found
+
+
+def silent(line):
+    raise AssertionError(f"unexpected: {line}")
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-np.asarray(x, np.float64)))
+
+
+def seen_colors(splats, directions):
+    """What a viewer sees along ``directions`` [N, 3], float64."""
+    degree = int(np.sqrt(splats.sh.shape[1])) - 1
+    basis = sh_basis(torch.from_numpy(directions), degree).numpy()
+    return np.einsum("nk,nkc->nc", basis[:, : splats.sh.shape[1]], splats.sh.astype(np.float64))
+
+
+def spz2(path, quats=(255, 128, 128)):
+    """One Gaussian of version 2, degree 0, at (1, 2, 3) in axes right, up, back."""
+    fixed = b"".join((value * 256).to_bytes(3, "little", signed=True) for value in (1, 2, 3))
+    body = (
+        struct.pack("<4sIIBBBB", b"NGSP", 2, 1, 0, 8, 0, 0) + fixed + bytes([128, 0, 128, 255, 160, 160, 176, *quats])
+    )
+    path.write_bytes(gzip.compress(body))
+
+
+def spz4(path, axes_number=None):
+    """The file rewritten as version 4, if wanted with an extension that names its axes."""
+    data = gzip.decompress(path.read_bytes())
+    _, _, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", data[:16])
+    streams, place = [], 16
+    for size in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
+        streams += [data[place : place + count * size]] if size else []
+        place += count * size
+    records = struct.pack("<II5s", 0x12340001, 5, b"other")
+    records += struct.pack("<III", 0xADBE0003, 4, axes_number) if axes_number is not None else b""
+    packed = [zstandard.compress(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags | 2, len(streams), 32 + len(records))
+    path.write_bytes(header + records + table + b"".join(packed))

@@ -4,13 +4,22 @@ import struct
 
 import numpy as np
 import pytest
-import torch
 from scenes import C0, make_camera
 from scipy.spatial.transform import Rotation
-from splat_files import ENDINGS, covariances, glb_attributes, glb_bytes, glb_parts, some_file, some_splats
+from splat_files import (
+    ENDINGS,
+    covariances,
+    glb_attributes,
+    glb_bytes,
+    glb_parts,
+    seen_colors,
+    sigmoid,
+    silent,
+    some_file,
+    some_splats,
+)
 
 from warp_splat.cli import main
-from warp_splat.compare.oracle import sh_basis
 from warp_splat.config import RasterOptions
 from warp_splat.convert import losses
 from warp_splat.errors import InputError
@@ -24,21 +33,6 @@ from warp_splat.render import make_picture
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward
-
-
-def silent(line):
-    raise AssertionError(f"unexpected: {line}")
-
-
-def sigmoid(x):
-    return 1 / (1 + np.exp(-np.asarray(x, np.float64)))
-
-
-def seen_colors(splats, directions):
-    """What a viewer sees along ``directions`` [N, 3], float64."""
-    degree = int(np.sqrt(splats.sh.shape[1])) - 1
-    basis = sh_basis(torch.from_numpy(directions), degree).numpy()
-    return np.einsum("nk,nkc->nc", basis[:, : splats.sh.shape[1]], splats.sh.astype(np.float64))
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from splat_files import glb_bytes, glb_parts, some_file
-from test_spz import spz2, spz4
+from splat_files import glb_bytes, glb_parts, some_file, spz2, spz4
 
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians, save_gaussians

@@ -5,9 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-import zstandard
-from splat_files import covariances, some_file, some_splats
-from test_exchange import seen_colors, sigmoid, silent
+from splat_files import covariances, seen_colors, sigmoid, silent, some_file, some_splats, spz2, spz4
 
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
@@ -49,15 +47,6 @@ def test_spz_bytes_are_the_documented_layout(tmp_path, degree):
         np.testing.assert_allclose(np.array(found), unit * np.sign(unit[largest]), atol=0.003)
 
 
-def spz2(path, quats=(255, 128, 128)):
-    """One Gaussian of version 2, degree 0, at (1, 2, 3) in axes right, up, back."""
-    fixed = b"".join((value * 256).to_bytes(3, "little", signed=True) for value in (1, 2, 3))
-    body = (
-        struct.pack("<4sIIBBBB", b"NGSP", 2, 1, 0, 8, 0, 0) + fixed + bytes([128, 0, 128, 255, 160, 160, 176, *quats])
-    )
-    path.write_bytes(gzip.compress(body))
-
-
 def test_spz_version_2(tmp_path):
     spz2(tmp_path / "a.spz")
     splats, antialiased = load_gaussians(tmp_path / "a.spz", report=silent)
@@ -66,22 +55,6 @@ def test_spz_version_2(tmp_path):
     np.testing.assert_allclose(splats.sh[0, 0], [-0.5 / 0.15, 0.002 / 0.15, 0.5 / 0.15], atol=0.001)
     assert not antialiased and abs(sigmoid(splats.opacities[0]) - 128 / 255) < 1e-6
     np.testing.assert_allclose(covariances(splats)[0], np.diag([1, 1, np.e**2]), atol=0.2)  # half a turn about x
-
-
-def spz4(path, axes_number=None):
-    """The file rewritten as version 4, if wanted with an extension that names its axes."""
-    data = gzip.decompress(path.read_bytes())
-    _, _, count, degree, bits, flags, _ = struct.unpack("<4sIIBBBB", data[:16])
-    streams, place = [], 16
-    for size in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
-        streams += [data[place : place + count * size]] if size else []
-        place += count * size
-    records = struct.pack("<II5s", 0x12340001, 5, b"other")
-    records += struct.pack("<III", 0xADBE0003, 4, axes_number) if axes_number is not None else b""
-    packed = [zstandard.compress(stream) for stream in streams]
-    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
-    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags | 2, len(streams), 32 + len(records))
-    path.write_bytes(header + records + table + b"".join(packed))
 
 
 @pytest.mark.parametrize("degree", [0, 3])
