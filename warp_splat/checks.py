@@ -11,16 +11,16 @@ from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
 
-PIXELS_NUMBERED = (2**31 - 1) // 3  # kernels number the values of an image with 32 bits
+CAMERA_PIXELS_MOST = 2**32  # 80 GiB of image, alpha and what the adjoint reads; kernels number tiles with 32 bits
 
 
 def check_camera(camera: Camera) -> None:
-    """Raise InputError if ``camera`` is something else, or its image too large for kernels to number."""
+    """Raise InputError if ``camera`` is something else, or its image absurdly large."""
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
-    if camera.width * camera.height > PIXELS_NUMBERED:
-        size = f"{camera.width} x {camera.height}"
-        raise InputError(f"camera: expected at most {PIXELS_NUMBERED} pixels, got {size}; resize it with .resized().")
+    if camera.width * camera.height > CAMERA_PIXELS_MOST:
+        most, size = CAMERA_PIXELS_MOST, f"{camera.width} x {camera.height}"
+        raise InputError(f"camera: expected at most {most} pixels, got {size}; resize it with .resized().")
 
 
 def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
