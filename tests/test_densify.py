@@ -135,11 +135,10 @@ def test_schedule():
 
 def step(model, optimizer, gradients, radii=None):
     """One with a gradient for each Gaussian, all of whose numbers have the same."""
+    column = torch.as_tensor(gradients, dtype=torch.float32).expand(len(model))[:, None]
     for tensor in model.parameters.values():
         tensor.grad = torch.empty_like(tensor)
-        tensor.grad.view(len(model), -1)[:] = torch.as_tensor(gradients, dtype=torch.float32).expand(len(model))[
-            :, None
-        ]
+        tensor.grad.view(len(model), -1)[:] = column
     optimizer.step(torch.ones(len(model), dtype=torch.int32) if radii is None else radii)
 
 
