@@ -18,7 +18,7 @@ import warp as wp
 from common import write_table
 
 from warp_splat.config import ADJOINTS
-from warp_splat.kernels import project, tiles
+from warp_splat.kernels import project, shade, tiles
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.adjoint_block import make_reverse_block, make_upstream_block
 from warp_splat.kernels.blend_block import make_blend_block
@@ -35,7 +35,13 @@ PROPERTIES = re.compile(r"Function (\S+):\s+REG:(\d+) STACK:(\d+) SHARED:(\d+)")
 
 def modules() -> dict[str, wp.Module]:
     """What runs on CUDA, by the name under which it is listed."""
-    found = {"project": project.project.module, "adam": make_adam(15, 3).module, "tiles": tiles.pack.module}
+    found = {
+        "project": project.make_project(1).module,
+        "shade": shade.shade.module,
+        "quarantine": project.quarantine.module,
+        "adam": make_adam(15, 3).module,
+        "tiles": tiles.pack.module,
+    }
     for depth in (False, True):
         suffix = ", depth" if depth else ""
         found[f"blend{suffix}"] = make_blend_block(depth, DEGREE, False).module

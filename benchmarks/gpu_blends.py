@@ -16,7 +16,8 @@ from warp_splat.config import RasterOptions
 from warp_splat.kernels import tiles
 from warp_splat.kernels.adjoint_block import make_reverse_block
 from warp_splat.launch import launch, launch_blocks, view
-from warp_splat.renderer import Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped
 
 #: Floating-point operations for one Gaussian at one pixel (operators of kernels/blend.py and kernels/step.py).
 #: Forward: offset 2, exponent 7, exponential 14, alpha 3, transmittance and weight 6, color 6, stop 1.

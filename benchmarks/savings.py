@@ -26,7 +26,8 @@ from step import add_arguments, synthetic, trained
 
 from warp_splat import lanes, launch, renderer
 from warp_splat.binning import Bins
-from warp_splat.renderer import Dropped, Project, camera_view, render
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped, render
 from warp_splat.scene.images import read_rgb
 from warp_splat.trainer import Trainer
 

@@ -26,7 +26,8 @@ from warp_splat.binning import bin_tiles
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.devices import peak_memory
 from warp_splat.forecast import pixel_floats, step_memory
-from warp_splat.renderer import Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped
 from warp_splat.report import BLUE, INK, ORANGE, format_table, new_figure, plain_axes, save_figure
 from warp_splat.trainer import Trainer
 

@@ -30,7 +30,8 @@ from warp_splat.kernels.build import IN_LANES
 from warp_splat.kernels.lanes import LANES, total, vec16, where_less
 from warp_splat.lanes import blend_lanes
 from warp_splat.launch import launch, view
-from warp_splat.renderer import Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped
 
 FORWARD, ADJOINT = 31, 49  # operations per pair
 PROJECT = 240  # per Gaussian drawn, two thirds of them for its shape; its adjoint: again, and twice that

@@ -11,8 +11,9 @@ from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE, RasterOptions
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.losses import image_loss
+from warp_splat.projection import Project, camera_view
 from warp_splat.render import load_trained_scene
-from warp_splat.renderer import Dropped, Project, camera_view, rasterize
+from warp_splat.renderer import Dropped, rasterize
 from warp_splat.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
 
 OUTLINES = 1500  # ellipses that are drawn

@@ -6,7 +6,8 @@ import torch
 
 from warp_splat import Camera, InputError, RasterOptions, binning, renderer, set_threads
 from warp_splat.launch import get_threads
-from warp_splat.renderer import Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped
 
 SIZE = (70, 53)
 PLAIN = RasterOptions()

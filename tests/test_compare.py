@@ -19,7 +19,8 @@ from warp_splat.kernels.blend_lanes import BLOCKS
 from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.kernels.taped_lanes import make_walk
 from warp_splat.launch import launch, view
-from warp_splat.renderer import Blend, Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Blend, Dropped
 
 PLAIN = RasterOptions()
 WITHOUT_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is accepted where there is one")

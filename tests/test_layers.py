@@ -10,7 +10,7 @@ LAYERS = [
     {"errors", "config", "flags", "presets", "color"},
     {"kernels"},
     {"camera", "devices", "launch", "distributed", "formats", "interrupts", "scene.types"},
-    {"checks", "binning", "adjoints", "lanes", "blocks", "renderer", "losses", "metrics", "scene"},
+    {"checks", "binning", "adjoints", "lanes", "blocks", "projection", "renderer", "losses", "metrics", "scene"},
     {"gaussians", "optimizer", "densify", "forecast", "perceptual", "ways"},
     {"trainer", "selftest", "report", "evaluate", "events", "gradcheck", "differences"},
     {"run", "train", "render", "convert", "page", "sfm", "doctor", "viewer"},

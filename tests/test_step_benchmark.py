@@ -11,7 +11,8 @@ import warp as wp
 
 from warp_splat import RasterOptions, launch
 from warp_splat.config import ALPHA_MIN, T_MIN
-from warp_splat.renderer import Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))

@@ -31,7 +31,8 @@ import torch
 from warp_splat.binning import bin_tiles
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.renderer import Blend, Dropped, Project, RenderOutput, camera_view, render
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Blend, Dropped, RenderOutput, render
 
 INPUTS = ("means", "quats", "scales", "opacities", "sh", "background")
 INTERMEDIATES = ("means2d", "conics", "opacities2d", "colors", "depths")  # in the order of the blend's arguments

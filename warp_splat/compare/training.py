@@ -30,7 +30,8 @@ from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.metrics import psnr, ssim
 from warp_splat.presets import EMBEDDED_DEFAULTS
-from warp_splat.renderer import Dropped, Project, camera_view
+from warp_splat.projection import Project, camera_view
+from warp_splat.renderer import Dropped
 from warp_splat.scene import Scene, View
 from warp_splat.trainer import Trainer
 

@@ -2,9 +2,11 @@
 
 import warp as wp
 
-from warp_splat.kernels.build import DIFFERENTIABLE
+from warp_splat.kernels.build import FORWARD_ONLY
 
-wp.set_module_options(DIFFERENTIABLE)
+wp.set_module_options(FORWARD_ONLY)
+
+vec15 = wp.types.vector(length=15, dtype=float)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -19,32 +21,38 @@ C3A, C3B, C3C, C3D, C3E = (
 
 
 @wp.func
-def evaluate_sh(
-    degree: int,
-    d: wp.vec3,
-    dc: wp.array2d[wp.vec3],  # [N, 1]
-    rest: wp.array2d[wp.vec3],  # [N, K - 1]
-    i: int,
-):
-    """Sum of the coefficients of Gaussian ``i`` up to ``degree``, in unit direction ``d``.
-
-    Reads arrays, unlike the other pieces, so that inactive degrees are neither loaded nor given a gradient.
-    """
-    color = C0 * dc[i, 0]
+def basis(degree: int, d: wp.vec3):
+    """Values of the functions of degree 1 to ``degree`` in unit direction ``d``; 0 beyond."""
+    b = vec15()
     if degree > 0:
         x = d[0]
         y = d[1]
         z = d[2]
-        color += C1 * (z * rest[i, 1] - y * rest[i, 0] - x * rest[i, 2])
+        b[0] = -C1 * y
+        b[1] = C1 * z
+        b[2] = -C1 * x
         if degree > 1:
             xx = x * x
             yy = y * y
             zz = z * z
-            color += C2A * (x * y * rest[i, 3] - y * z * rest[i, 4] - x * z * rest[i, 6])
-            color += C2B * (2.0 * zz - xx - yy) * rest[i, 5] + C2C * (xx - yy) * rest[i, 7]
+            b[3] = C2A * x * y
+            b[4] = -C2A * y * z
+            b[5] = C2B * (2.0 * zz - xx - yy)
+            b[6] = -C2A * x * z
+            b[7] = C2C * (xx - yy)
             if degree > 2:
-                color += C3B * x * y * z * rest[i, 9] - C3A * y * (3.0 * xx - yy) * rest[i, 8]
-                color -= C3C * (4.0 * zz - xx - yy) * (y * rest[i, 10] + x * rest[i, 12])
-                color += C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * rest[i, 11]
-                color += C3E * z * (xx - yy) * rest[i, 13] - C3A * x * (xx - 3.0 * yy) * rest[i, 14]
-    return color
+                shared = -C3C * (4.0 * zz - xx - yy)
+                b[8] = -C3A * y * (3.0 * xx - yy)
+                b[9] = C3B * x * y * z
+                b[10] = shared * y
+                b[11] = C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
+                b[12] = shared * x
+                b[13] = C3E * z * (xx - yy)
+                b[14] = -C3A * x * (xx - 3.0 * yy)
+    return b
+
+
+@wp.func
+def weighted_basis(degree: int, offset: wp.vec3, weights: vec15):
+    """Sum of the functions in the direction of ``offset``, weighted."""
+    return wp.dot(basis(degree, wp.normalize(offset)), weights)

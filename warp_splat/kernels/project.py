@@ -6,10 +6,11 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLU
     |a1 x a2|^2 + e (|a1|^2 + |a2|^2) + e^2,
 
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
-Tried: sixteen Gaussians in lanes, as in the blends; 330 lines to turn rows into columns and back, for 14 -> 11 and
-33 -> 25 ms of a step of 245 (195,000 Gaussians, degree 3): what limits both is reading and adding up rows of SH.
-Tried: SH of a degree as one matrix, its product with the basis Warp's; the adjoint takes 10 % longer. Without the SLP
-vectoriser 15 % longer; regrouping of sums changes nothing.
+
+Written out in numbers, because a number may be sixteen (:mod:`warp_splat.kernels.numbers`): against vectors and
+matrices of one Gaussian, 12.0 -> 3.5 ms and, the adjoint, 25.3 -> 8.2 (194,000 Gaussians, one thread). Tried: columns
+instead of rows in memory, which no processor reads ahead in sixty places at once; a function for the products of three
+(an adjoint of 12.9 ms); names of vectors of their own, which LLVM leaves as calls.
 
 The exact outline of the ellipsoid x' Sigma^-1 x = k^2 instead (Qi, Cai and Han 2024, with k = 3) follows from its
 dual conic, K (k^2 Sigma - p p') K' for a centre p. With a3 = k / z (third row of W R S) and r = 1 - |a3|^2 that is,
@@ -19,17 +20,20 @@ volume (warp_splat.compare.volume) its footprint is better than the affine one b
 to 6.
 """
 
+import functools
+
 import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR, OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.blend import reach_of
-from warp_splat.kernels.build import DIFFERENTIABLE
-from warp_splat.kernels.harmonics import evaluate_sh
+from warp_splat.kernels.build import DIFFERENTIABLE, DIFFERENTIABLE_LANES
+from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 
 wp.set_module_options(DIFFERENTIABLE)
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
+LEAST_REST = wp.constant(1.0 - (OUTLINE / OUTLINE_REACH) ** 2)
 INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
 
 
@@ -51,143 +55,208 @@ class CameraView:
     alpha_min: float
 
 
-@wp.func
-def largest(quat: wp.vec4):
-    """Largest entry, without a gradient: what is divided by it is normalized afterwards."""
-    return wp.max(wp.max(wp.abs(quat)), 1.0e-37)
+@functools.cache
+def make_project(lanes: int) -> wp.Kernel:
+    """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU. Its adjoint is Warp's."""
+    number, integer, fill, less, equal, some, pick, root, up, down, real, whole = make_numbers(lanes)
+    pair, _, join2 = make_rows2(lanes)
+    triple, split3, join3 = make_rows3(lanes)
+    quadruple, split4, _ = make_rows4(lanes)
+    mul, div = wp.cw_mul, wp.cw_div
 
+    @wp.func
+    def largest(a: number, b: number, c: number, d: number):
+        """The largest magnitude, without a gradient: what is divided by it is normalized afterwards."""
+        return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
 
-@wp.func_grad(largest)
-def adj_largest(quat: wp.vec4, adj_ret: float):
-    pass
+    @wp.func_grad(largest)
+    def adj_largest(a: number, b: number, c: number, d: number, adj_ret: number):
+        pass
 
+    @wp.func
+    def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
+        """Half sides of the box where alpha >= alpha_min, and the distance of its farthest point [px]; no gradient."""
+        reach = number()
+        for lane in range(lanes):
+            reach[lane] = reach_of(opacity[lane], alpha_min)
+        widest = (xx + yy + root(mul(xx - yy, xx - yy) + mul(xy, xy) * 4.0)) * 0.5  # variance of the long axis
+        return root(mul(reach, xx)), root(mul(reach, yy)), root(mul(reach, widest))
 
-@wp.func
-def rotation_matrix(quat: wp.vec4):
-    """Rotation of a quaternion (w, x, y, z) of any norm but 0; scaled first, so that denormals keep their direction."""
-    q = wp.normalize(quat * (1.0 / largest(quat)))
-    w = q[0]
-    x = q[1]
-    y = q[2]
-    z = q[3]
-    return wp.mat33(
-        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
-    )  # fmt: skip
+    @wp.func_grad(support)
+    def adj_support(
+        opacity: number, alpha_min: float, xx: number, xy: number, yy: number, a: number, b: number, c: number
+    ):
+        pass
 
+    @wp.func
+    def covers_pixel(mean: number, extent: number, size: float):
+        """Mask: a pixel centre of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
+        first = wp.max(up(mean - extent - number(0.5)), number(0.0))
+        last = wp.min(down(mean + extent - number(0.5)), number(size - 1.0))
+        return number(1.0) - less(last, first)
 
-@wp.func
-def support(opacity: float, alpha_min: float, xx: float, xy: float, yy: float):
-    """Half sides of the box where alpha >= alpha_min, and the distance of its farthest point [px]; no gradient."""
-    reach = reach_of(opacity, alpha_min)
-    widest = 0.5 * (xx + yy + wp.length(wp.vec2(xx - yy, 2.0 * xy)))  # variance of the long axis
-    return wp.vec3(wp.sqrt(reach * xx), wp.sqrt(reach * yy), wp.sqrt(reach * widest))
+    @wp.func_grad(covers_pixel)
+    def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
+        pass
 
-
-@wp.func_grad(support)
-def adj_support(opacity: float, alpha_min: float, xx: float, xy: float, yy: float, adj_ret: wp.vec3):
-    pass
-
-
-@wp.func
-def covers_pixel(mean: float, extent: float, size: float):
-    """Whether a pixel centre of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
-    first = wp.max(wp.ceil(mean - extent - 0.5), 0.0)
-    return first <= wp.min(wp.floor(mean + extent - 0.5), size - 1.0)
-
-
-@wp.kernel
-def project(
-    first: int,  # Gaussian of this slice
-    camera: CameraView,
-    means: wp.array[wp.vec3],  # [N] world
-    quats: wp.array[wp.vec4],  # [N] wxyz, any norm
-    scales: wp.array[wp.vec3],  # [N] world
-    opacities: wp.array[float],  # [N] 0..1
-    sh_dc: wp.array2d[wp.vec3],  # [N, 1]
-    sh_rest: wp.array2d[wp.vec3],  # [N, K - 1]
-    # out: zero where culled, so the caller clears them; all but the radii
-    means2d_out: wp.array[wp.vec2],  # [N] px
-    conics_out: wp.array[wp.vec3],  # [N] 1/px^2, (xx, xy, yy)
-    opacities_out: wp.array[float],  # [N] after antialiasing
-    colors_out: wp.array[wp.vec3],  # [N]
-    depths_out: wp.array[float],  # [N] z in the camera
-    extents_out: wp.array[wp.vec2],  # [N] px, half sides of the box where alpha >= alpha_min
-    radii_out: wp.array[int],  # [N] px, farthest point where alpha >= alpha_min; CULLED, INVALID if not; read first
-):
-    i = first + wp.tid()
-    if radii_out[i] <= 0:  # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
-        return
-    radii_out[i] = CULLED
-    mean = means[i]
-    quat = quats[i]
-    scale = scales[i]
-    opacity = opacities[i]
-    zero = wp.vec3(0.0)  # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
-    zero_if_finite = wp.dot(mean, zero) + wp.dot(quat, wp.vec4(0.0)) + wp.dot(scale, zero) + opacity * 0.0
-    if not zero_if_finite == 0.0 or quat == wp.vec4(0.0):
-        radii_out[i] = INVALID
-        return
-    offset = (mean - camera.center) - camera.center_low
-    p = camera.rotation * offset
-    z = p[2]
-    if not z > NEAR:
-        return
-    slope = wp.vec2(p[0] / z, p[1] / z)
-    u = slope[0]
-    v = slope[1]
-    if camera.ellipsoid == 0:  # the linearization is worthless far outside the image; the outline is not
-        u = wp.clamp(u, camera.slope_min[0], camera.slope_max[0])
-        v = wp.clamp(v, camera.slope_min[1], camera.slope_max[1])
-    toward = wp.vec3(camera.rotation[2, 0], camera.rotation[2, 1], camera.rotation[2, 2])
-    j1 = (camera.focal[0] / z) * (
-        wp.vec3(camera.rotation[0, 0], camera.rotation[0, 1], camera.rotation[0, 2]) - u * toward
-    )
-    j2 = (camera.focal[1] / z) * (
-        wp.vec3(camera.rotation[1, 0], camera.rotation[1, 1], camera.rotation[1, 2]) - v * toward
-    )
-    axes = rotation_matrix(quat)
-    a1 = wp.cw_mul(scale, j1 * axes)
-    a2 = wp.cw_mul(scale, j2 * axes)
-    mean2d = wp.vec2(camera.focal[0] * slope[0] + camera.principal[0], camera.focal[1] * slope[1] + camera.principal[1])
-    if camera.ellipsoid != 0:
-        a3 = (OUTLINE / z) * wp.cw_mul(scale, toward * axes)
-        rest = 1.0 - wp.dot(a3, a3)
-        if not rest > 1.0 - (OUTLINE / OUTLINE_REACH) * (OUTLINE / OUTLINE_REACH):
+    @wp.kernel(module="unique", module_options=dict(DIFFERENTIABLE_LANES))
+    def project(
+        first: int,  # group of Gaussians of this slice
+        camera: CameraView,
+        means: wp.array[triple],  # [N / lanes] world
+        quats: wp.array[quadruple],  # wxyz, any norm
+        scales: wp.array[triple],  # world
+        opacities: wp.array[number],  # 0..1
+        # out: zero where culled; the caller clears them, all but the radii
+        means2d_out: wp.array[pair],  # px
+        conics_out: wp.array[triple],  # 1/px^2, (xx, xy, yy)
+        opacities_out: wp.array[number],  # after antialiasing
+        depths_out: wp.array[number],  # z in the camera
+        extents_out: wp.array[pair],  # px, half sides of the box where alpha >= alpha_min
+        radii_out: wp.array[integer],  # px, farthest point where alpha >= alpha_min; CULLED, INVALID if not; read first
+    ):
+        g = first + wp.tid()
+        zero = fill(0.0)
+        one = fill(1.0)
+        mx, my, mz = split3(means[g])
+        qw, qx, qy, qz = split4(quats[g])
+        sx, sy, sz = split3(scales[g])
+        opacity = opacities[g]
+        # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
+        finite = equal(mul(mx + my + mz + qw + qx + qy + qz + sx + sy + sz + opacity, zero), zero)
+        size = largest(qw, qx, qy, qz)
+        valid = mul(finite, less(zero, size))
+        # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
+        here = mul(valid, less(zero, real(radii_out[g])))
+        radii_out[g] = whole(valid - one)  # CULLED or INVALID
+        ox = (pick(here, mx, zero) - fill(camera.center[0])) - fill(camera.center_low[0])
+        oy = (pick(here, my, zero) - fill(camera.center[1])) - fill(camera.center_low[1])
+        oz = (pick(here, mz, zero) - fill(camera.center[2])) - fill(camera.center_low[2])
+        r20 = fill(camera.rotation[2, 0])
+        r21 = fill(camera.rotation[2, 1])
+        r22 = fill(camera.rotation[2, 2])
+        depth = mul(r20, ox) + mul(r21, oy) + mul(r22, oz)
+        here = mul(here, less(fill(NEAR), depth))
+        if not some(here):
             return
-        shift = wp.vec2(wp.dot(a1, a3), wp.dot(a2, a3))
-        mean2d = mean2d - (OUTLINE / rest) * shift
-        stretch = 1.0 / (rest + wp.sqrt(rest))
-        a1 = (a1 + stretch * shift[0] * a3) / wp.sqrt(rest)
-        a2 = (a2 + stretch * shift[1] * a3) / wp.sqrt(rest)
-    area = wp.cross(a1, a2)
-    xx = wp.dot(a1, a1)
-    yy = wp.dot(a2, a2)
-    sharp = wp.dot(area, area)
-    det = sharp + BLUR * (xx + yy) + BLUR * BLUR
-    if camera.antialiasing != 0:  # before any test of the opacity
-        opacity = opacity * wp.sqrt(wp.max(sharp / det, COMPENSATION_MIN))
-    if not det * 0.0 == 0.0:  # too large for float32 numbers, about 4e9 px
-        radii_out[i] = INVALID
-        return
-    if not opacity >= camera.alpha_min:
-        return
-    xy = wp.dot(a1, a2)
-    extent = support(opacity, camera.alpha_min, xx + BLUR, xy, yy + BLUR)
-    if not (covers_pixel(mean2d[0], extent[0], camera.size[0]) and covers_pixel(mean2d[1], extent[1], camera.size[1])):
-        return
-    color = evaluate_sh(camera.sh_degree, wp.normalize(offset), sh_dc, sh_rest, i) + wp.vec3(0.5)
-    if not wp.dot(color, zero) == 0.0:
-        radii_out[i] = INVALID
-        return
-    means2d_out[i] = mean2d
-    conics_out[i] = wp.vec3(yy + BLUR, -xy, xx + BLUR) / det
-    opacities_out[i] = opacity
-    colors_out[i] = wp.max(color, wp.vec3(0.0))
-    depths_out[i] = z
-    extents_out[i] = wp.vec2(extent[0], extent[1])
-    radii_out[i] = int(wp.min(wp.ceil(extent[2]), 1.0e9))
+        # harmless numbers take the place of those that are left out
+        z = pick(here, depth, one)
+        size = pick(here, size, one)  # divided by first, so that denormals keep their direction
+        w = div(pick(here, qw, one), size)
+        x = div(pick(here, qx, zero), size)
+        y = div(pick(here, qy, zero), size)
+        q = div(pick(here, qz, zero), size)
+        norm = root(mul(w, w) + mul(x, x) + mul(y, y) + mul(q, q))
+        w = div(w, norm)
+        x = div(x, norm)
+        y = div(y, norm)
+        q = div(q, norm)
+        # R
+        two = fill(2.0)
+        m00 = one - mul(two, mul(y, y) + mul(q, q))
+        m01 = mul(two, mul(x, y) - mul(w, q))
+        m02 = mul(two, mul(x, q) + mul(w, y))
+        m10 = mul(two, mul(x, y) + mul(w, q))
+        m11 = one - mul(two, mul(x, x) + mul(q, q))
+        m12 = mul(two, mul(y, q) - mul(w, x))
+        m20 = mul(two, mul(x, q) - mul(w, y))
+        m21 = mul(two, mul(y, q) + mul(w, x))
+        m22 = one - mul(two, mul(x, x) + mul(y, y))
+        sx = pick(here, sx, one)
+        sy = pick(here, sy, one)
+        sz = pick(here, sz, one)
+        # the mean in the image
+        r00 = fill(camera.rotation[0, 0])
+        r01 = fill(camera.rotation[0, 1])
+        r02 = fill(camera.rotation[0, 2])
+        r10 = fill(camera.rotation[1, 0])
+        r11 = fill(camera.rotation[1, 1])
+        r12 = fill(camera.rotation[1, 2])
+        fx = fill(camera.focal[0])
+        fy = fill(camera.focal[1])
+        u = div(mul(r00, ox) + mul(r01, oy) + mul(r02, oz), z)
+        v = div(mul(r10, ox) + mul(r11, oy) + mul(r12, oz), z)
+        px = mul(fx, u) + fill(camera.principal[0])
+        py = mul(fy, v) + fill(camera.principal[1])
+        if camera.ellipsoid == 0:  # the linearization is worthless far outside the image; the outline is not
+            u_min = fill(camera.slope_min[0])
+            u_max = fill(camera.slope_max[0])
+            v_min = fill(camera.slope_min[1])
+            v_max = fill(camera.slope_max[1])
+            u = pick(less(u, u_min), u_min, pick(less(u_max, u), u_max, u))
+            v = pick(less(v, v_min), v_min, pick(less(v_max, v), v_max, v))
+        # J W
+        kx = div(fx, z)
+        ky = div(fy, z)
+        j00 = mul(kx, r00 - mul(u, r20))
+        j01 = mul(kx, r01 - mul(u, r21))
+        j02 = mul(kx, r02 - mul(u, r22))
+        j10 = mul(ky, r10 - mul(v, r20))
+        j11 = mul(ky, r11 - mul(v, r21))
+        j12 = mul(ky, r12 - mul(v, r22))
+        # a1, a2; scaled last, or needles would lose digits of the scales' gradients
+        a10 = mul(sx, mul(j00, m00) + mul(j01, m10) + mul(j02, m20))
+        a11 = mul(sy, mul(j00, m01) + mul(j01, m11) + mul(j02, m21))
+        a12 = mul(sz, mul(j00, m02) + mul(j01, m12) + mul(j02, m22))
+        a20 = mul(sx, mul(j10, m00) + mul(j11, m10) + mul(j12, m20))
+        a21 = mul(sy, mul(j10, m01) + mul(j11, m11) + mul(j12, m21))
+        a22 = mul(sz, mul(j10, m02) + mul(j11, m12) + mul(j12, m22))
+        if camera.ellipsoid != 0:
+            outline = fill(OUTLINE)
+            near = div(outline, z)
+            a30 = mul(mul(near, sx), mul(r20, m00) + mul(r21, m10) + mul(r22, m20))
+            a31 = mul(mul(near, sy), mul(r20, m01) + mul(r21, m11) + mul(r22, m21))
+            a32 = mul(mul(near, sz), mul(r20, m02) + mul(r21, m12) + mul(r22, m22))
+            rest = one - (mul(a30, a30) + mul(a31, a31) + mul(a32, a32))
+            here = mul(here, less(fill(LEAST_REST), rest))
+            rest = pick(here, rest, one)
+            shift1 = mul(a10, a30) + mul(a11, a31) + mul(a12, a32)
+            shift2 = mul(a20, a30) + mul(a21, a31) + mul(a22, a32)
+            px = px - mul(div(outline, rest), shift1)
+            py = py - mul(div(outline, rest), shift2)
+            shrink = root(rest)
+            shift1 = div(shift1, rest + shrink)
+            shift2 = div(shift2, rest + shrink)
+            a10 = div(a10 + mul(shift1, a30), shrink)
+            a11 = div(a11 + mul(shift1, a31), shrink)
+            a12 = div(a12 + mul(shift1, a32), shrink)
+            a20 = div(a20 + mul(shift2, a30), shrink)
+            a21 = div(a21 + mul(shift2, a31), shrink)
+            a22 = div(a22 + mul(shift2, a32), shrink)
+        c0 = mul(a11, a22) - mul(a12, a21)
+        c1 = mul(a12, a20) - mul(a10, a22)
+        c2 = mul(a10, a21) - mul(a11, a20)
+        xx = mul(a10, a10) + mul(a11, a11) + mul(a12, a12)
+        xy = mul(a10, a20) + mul(a11, a21) + mul(a12, a22)
+        yy = mul(a20, a20) + mul(a21, a21) + mul(a22, a22)
+        sharp = mul(c0, c0) + mul(c1, c1) + mul(c2, c2)
+        blur = fill(BLUR)
+        det = sharp + mul(blur, xx + yy) + mul(blur, blur)
+        xx = xx + blur
+        yy = yy + blur
+        opacity = pick(here, opacity, one)
+        if camera.antialiasing != 0:  # before any test of the opacity
+            least = fill(COMPENSATION_MIN)
+            share = div(sharp, det)
+            opacity = mul(opacity, root(pick(less(least, share), share, least)))
+        bounded = equal(mul(det, zero), zero)  # else too large for float32 numbers, about 4e9 px
+        code = valid - one - mul(here, one - bounded)
+        radii_out[g] = whole(code)
+        here = mul(mul(here, bounded), one - less(opacity, fill(camera.alpha_min)))
+        extent_x, extent_y, farthest = support(opacity, camera.alpha_min, xx, xy, yy)
+        here = mul(here, mul(covers_pixel(px, extent_x, camera.size[0]), covers_pixel(py, extent_y, camera.size[1])))
+        if not some(here):
+            return
+        means2d_out[g] = join2(pick(here, px, zero), pick(here, py, zero))
+        conics_out[g] = join3(
+            pick(here, div(yy, det), zero), pick(here, div(-xy, det), zero), pick(here, div(xx, det), zero)
+        )
+        opacities_out[g] = pick(here, opacity, zero)
+        depths_out[g] = pick(here, depth, zero)
+        extents_out[g] = join2(pick(here, extent_x, zero), pick(here, extent_y, zero))
+        radii_out[g] = whole(pick(here, wp.min(up(farthest), fill(1.0e9)), code))
+
+    return project
 
 
 @wp.kernel(enable_backward=False)
