@@ -110,6 +110,12 @@ def test_masked_loss(share, loss_of, bytes_):
     hidden = mask == 0
     again = loss(torch.where(hidden, 1 - image, image), torch.where(hidden, other, target))
     assert again[0] == value and torch.equal(again[1], gradient)
+    if loss_of == "kernels":  # nor does it matter what stands for "counts", or that a hidden pixel is no number
+        mask *= 255
+        again = loss(
+            torch.where(hidden, torch.nan, image), target if bytes_ else torch.where(hidden, torch.inf, target)
+        )
+        assert again[0] == value and torch.equal(again[1], gradient)
 
 
 def test_metrics_do_not_see_what_is_masked(tmp_path):

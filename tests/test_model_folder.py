@@ -200,6 +200,12 @@ def test_a_folder_is_claimed_by_one_training(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_lock_that_is_no_file_is_refused(tmp_path):
+    (tmp_path / ".lock").mkdir()
+    with pytest.raises(InputError, match=r"\.lock: expected a file.*remove it"), model_folder.claimed(tmp_path):
+        pass
+
+
 def test_prepare_refuses_before_training(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "model"):

@@ -37,28 +37,37 @@ def image_loss(
         image: [H, W, 3] float32, differentiable.
         target: [H, W, 3] float32, or uint8 to be divided by 255.
         lambda_dssim: share of the structural term, 0..1.
-        mask: [H, W, 1] uint8, 1 for pixels that count, 0 for others.
+        mask: [H, W, 1] uint8, 0 for pixels that do not count.
         clamped: compare the image within 0..1, without a gradient where it lies outside.
 
     Raises:
-        InputError: if the shapes differ or are not [H, W, 3], or a type is another.
+        InputError: if the shapes differ, are not [H, W, 3] or hold no pixel, a type is another, or ``lambda_dssim``
+            lies outside 0..1.
     """
+    if not isinstance(image, torch.Tensor) or not isinstance(target, torch.Tensor):
+        raise InputError(
+            f"image_loss: expected two tensors, got {type(image).__name__} and {type(target).__name__}; convert them."
+        )
+    if not isinstance(lambda_dssim, int | float) or not 0.0 <= lambda_dssim <= 1.0:
+        raise InputError(f"image_loss: expected lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}.")
     if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
         raise InputError(
             f"image_loss: expected an image of float32 and a target of float32 or uint8, got {image.dtype} and "
             f"{target.dtype}; convert them."
         )
-    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS:
+    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS or not image.numel():
         raise InputError(
-            f"image_loss: expected two images [H, W, 3] of one size, got {list(image.shape)} and {list(target.shape)}."
+            f"image_loss: expected two images [H, W, 3] of one size, 1 x 1 or more, got {list(image.shape)} and "
+            f"{list(target.shape)}."
         )
     if mask is not None:
         if mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1):
             raise InputError(
-                f"image_loss: expected a mask {[*image.shape[:2], 1]} of uint8, 1 for pixels that count, got "
+                f"image_loss: expected a mask {[*image.shape[:2], 1]} of uint8, 0 for pixels that do not count, got "
                 f"{list(mask.shape)} of {mask.dtype}."
             )
-        image, target = image * mask, target * mask
+        counts = mask != 0
+        image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))
     if image.is_cuda:
         return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))

@@ -80,6 +80,11 @@ def claimed(folder: Path) -> Iterator[None]:
         raise InputError(
             f"{folder}: another training writes into this folder; wait for its end, or choose another with -m."
         ) from error
+    except OSError as error:
+        raise InputError(
+            f"{lock.lock_file}: expected a file to write, which tells other trainings that this one is at work, found "
+            f"{error.strerror or error}; remove it, or choose another folder with -m."
+        ) from error
     try:
         yield
     finally:
