@@ -71,6 +71,8 @@ def test_options_of_a_video(told, capsys):
         (["--orbit", "--video", "path"], "expected one of them"),
         (["--video_output", "a.mp4"], "expected --video or --orbit"),
         (["--video", "path", "--frames", "0"], "--frames: expected at least 1"),
+        (["--frames", "3"], "--frames 3: expected --video"),
+        (["--orbit", "--video_output", "a.AVI"], "expected .mp4 or a folder, found .avi"),
     ):
         assert main(["render", "-m", str(told), *options]) == 1
         assert sentence in capsys.readouterr().err

@@ -30,6 +30,7 @@ from warp_splat.selftest import settle_device
 from warp_splat.trainer import to_bytes
 from warp_splat.ways import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
 
+OTHER_VIDEOS = {".avi", ".gif", ".mkv", ".mov", ".webm"}
 WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
 
 
@@ -70,6 +71,11 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"--video_output {config.video_output}: expected --video or --orbit beside it.")
     if config.frames < 1:
         raise InputError(f"--frames: expected at least 1, got {config.frames}.")
+    if config.frames != RenderConfig.frames and not config.video:
+        raise InputError(f"--frames {config.frames}: expected --video beside it.")
+    suffix = Path(config.video_output).suffix.lower()
+    if suffix in OTHER_VIDEOS:
+        raise InputError(f"--video_output {config.video_output}: expected .mp4 or a folder, found {suffix}; rename it.")
 
 
 def _needs_scene(config: RenderConfig) -> bool:
