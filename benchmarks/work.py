@@ -34,7 +34,7 @@ from warp_splat.projection import Project, camera_view
 from warp_splat.renderer import Dropped
 
 FORWARD, ADJOINT = 31, 49  # operations per pair
-PROJECT = 240  # per Gaussian drawn, two thirds of them for its shape; its adjoint: again, and twice that
+PROJECT = 240  # per Gaussian drawn, two thirds of them for its shape; its adjoint: again, and twice that, at most
 LOSS, ADJOINT_OF_LOSS = 159, 73  # per channel of a pixel: five planes blurred along rows and columns; three
 
 exp2_minus = make_exp(RasterOptions().exp_degree)

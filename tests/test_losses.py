@@ -147,8 +147,9 @@ def test_other_types_are_refused():
     for arguments, said in (
         ((image.double(), image), "float64"),
         ((image, image.long()), "int64"),
-        ((image, image, 0.2, mask.float()), r"a mask \[20, 30, 1\] of uint8.*float32"),
+        ((image, image, 0.2, mask.float()), r"a tensor \[20, 30, 1\] of uint8.*float32"),
         ((image, image, 0.2, mask[1:]), r"got \[19, 30, 1\]"),
+        ((image, image, 0.2, [[1]]), "got list"),
         ((image, None), "two tensors.*NoneType"),
         *(((image, image, share), "lambda_dssim.*0 to 1") for share in (-0.1, 1.1, float("nan"), "x")),
         ((image[:0], image[:0]), r"1 x 1 or more.*\[0, 30, 3\]"),

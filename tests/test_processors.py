@@ -16,7 +16,7 @@ import numpy as np, torch
 import warp_splat
 from warp_splat.kernels import build
 
-for options in (build.DIFFERENTIABLE, build.FORWARD_ONLY):  # before any kernel module reads them
+for options in (build.FORWARD_ONLY, build.IN_ORDER, build.IN_LANES, build.DIFFERENTIABLE_LANES):  # read later
     options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", sys.argv[1])
 from warp_splat.losses import image_loss
 from scenes import SCENES

@@ -7,6 +7,7 @@ import torch
 from warp_splat import projection
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
+from warp_splat.kernels.harmonics import C0, C1
 from warp_splat.projection import Project, camera_view
 from warp_splat.renderer import Dropped
 
@@ -31,21 +32,30 @@ def gaussians(count):
     opacities = torch.rand(count, generator=generator) ** 3
     sh_dc, sh_rest = normal(count, 1, 3), 0.3 * normal(count, 8, 3)
     if count > 16:
+        means[:7] = torch.tensor([0.0, 0.0, 3.0])
+        opacities[:7] = 1.0
         quats[1] = 0.0
-        scales[2] = 3.0e38
+        scales[2] = 1.0e30  # too large on the image
         means[3, 1] = torch.nan
         sh_rest[4, 0, 0] = torch.inf
-        means[4] = torch.tensor([0.0, 0.0, 3.0])
-        opacities[4] = 1.0
+        quats[5] = torch.tensor([3.0e38, 3.0e38, 0.0, 0.0])  # of any norm
+        means[6] = torch.tensor([-2.0e38, -2.0e38, -1.0e38])  # behind the camera
     return means, quats, scales, opacities, sh_dc, sh_rest
 
 
-def project(count, options, sets=1):
-    """Outputs, and gradients of their random weighting (asked for ``sets`` times)."""
+def project(count, options, sets=1, left_out=None, spread=False):
+    """Outputs, and gradients of their random weighting, which is ``left_out`` for those not drawn.
+
+    Gradients are asked for ``sets`` times; ``spread``: no tensor is contiguous.
+    """
     inputs = [tensor.requires_grad_() for tensor in gaussians(count)]
-    outputs = Project.apply(*inputs, camera_view(CAMERA, 8, options), Dropped())
+    given = [torch.stack([tensor, tensor], -1)[..., 0] for tensor in inputs] if spread else inputs
+    outputs = Project.apply(*given, camera_view(CAMERA, 8, options), Dropped())
     generator = torch.Generator().manual_seed(1)
     upstream = [torch.randn(output.shape, generator=generator) for output in outputs[:5]]
+    if left_out is not None:
+        for tensor in upstream:
+            tensor[outputs[6] <= 0] = left_out
     grads = [torch.autograd.grad(outputs[:5], inputs, upstream, retain_graph=True) for _ in range(sets)]
     return [output.detach() for output in outputs], grads
 
@@ -58,16 +68,65 @@ def test_sixteen_and_one_agree(count, name, monkeypatch):
     single, (single_grads,) = project(count, OPTIONS[name])
     torch.testing.assert_close(outputs[6], single[6], rtol=0, atol=0)
     if count == 100:
-        assert (outputs[6] > 0).sum() > 20 and (outputs[6] == 0).sum() > 20 and (outputs[6] == -1).sum() == 4
+        assert (outputs[6] > 0).sum() > 20 and (outputs[6] == 0).sum() > 20
+        # what reaches the camera's plane is left out as an ellipsoid before it is too large
+        assert outputs[6][:7].sign().tolist() == [1, -1, 0 if name == "ellipsoid" else -1, -1, -1, 1, 0]
     for found, wanted in zip((*outputs[:6], *grads), (*single[:6], *single_grads), strict=True):
         torch.testing.assert_close(found, wanted, rtol=2e-5, atol=1e-6 * float(wanted.abs().max() if count else 0))
 
 
-def test_gradients_of_those_left_out_are_zero():
-    outputs, (grads,) = project(100, OPTIONS["plain"])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_those_left_out_have_no_influence(name):
+    """Nor do their neighbors see what comes from upstream for them."""
+    outputs, (grads,) = project(100, OPTIONS[name], left_out=0.0)
     left_out = outputs[6] <= 0
+    _, (others,) = project(100, OPTIONS[name], left_out=torch.nan)
+    for grad, other in zip(grads, others, strict=True):
+        torch.testing.assert_close(grad, other, rtol=0, atol=0)
     for tensor in (*outputs[:6], *grads):
         assert not tensor[left_out].any()
+
+
+def test_a_color_is_finite_even_if_the_sum_of_its_channels_is_not():
+    means, quats, scales, opacities, sh_dc, sh_rest = gaussians(1)
+    means[0], opacities[0] = torch.tensor([0.0, 0.0, 3.0]), 1.0
+    sh_dc[0], sh_rest[0, 1] = 3.4e38, 2.0e38
+    outputs = Project.apply(
+        means, quats, scales, opacities, sh_dc, sh_rest, camera_view(CAMERA, 3, OPTIONS["plain"]), Dropped()
+    )
+    assert outputs[6][0] > 0
+    torch.testing.assert_close(outputs[3], torch.full((1, 3), 3.4e38 * C0 + 2.0e38 * C1))
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_inactive_degrees_have_no_gradient(degree):
+    torch.full((100, 8, 3), torch.nan)  # what the next tensor of that size may find in memory
+    _, (grads,) = project(100, RasterOptions(sh_degree=degree))
+    assert grads[5][:, :3].any() == (degree > 0) and not grads[5][:, (degree + 1) ** 2 - 1 :].any()
+
+
+@pytest.mark.parametrize("center", [(1e6 + 0.3, -2e6 + 0.7, 3e6 + 0.1), (5e5 + 0.01, 4e6 + 0.13, 100.0)])
+def test_colors_far_from_the_origin(center):
+    """Where float32 knows a camera's place to a quarter of a unit, colors are those of float64 all the same."""
+    center = torch.tensor(center, dtype=torch.float64)
+    camera = Camera(70, 53, 60.0, 55.0, 30.0, 27.0, np.eye(3), -center.numpy())
+    generator = torch.Generator().manual_seed(2)
+    means = (center + torch.randn(50, 3, generator=generator) + torch.tensor([0.0, 0.0, 4.0])).float()
+    sh = torch.randn(50, 4, 3, generator=generator)
+    still = (torch.tensor([[1.0, 0, 0, 0]]).repeat(50, 1), torch.full((50, 3), 0.1), torch.ones(50))
+    outputs = Project.apply(
+        means.requires_grad_(), *still, sh[:, :1], sh[:, 1:], camera_view(camera, 3, RasterOptions()), Dropped()
+    )
+    weights = torch.randn(50, 3, generator=generator)
+    (grad,) = torch.autograd.grad(outputs[3], means, weights)
+    exact = means.detach().double().requires_grad_()
+    x, y, z = torch.nn.functional.normalize(exact - center, dim=1).unbind(1)
+    functions = torch.stack([torch.full_like(x, C0), -C1 * y, C1 * z, -C1 * x], 1)
+    colors = torch.relu(torch.einsum("nk,nkc->nc", functions, sh.double()) + 0.5) * (outputs[6] > 0)[:, None]
+    (wanted,) = torch.autograd.grad(colors, exact, weights.double())
+    assert (outputs[6] > 0).sum() > 20
+    assert (outputs[3] - colors).abs().max() < 1e-5
+    assert (grad - wanted).norm() < 1e-5 * wanted.norm()
 
 
 def test_gradients_can_be_asked_for_twice():
@@ -77,10 +136,7 @@ def test_gradients_can_be_asked_for_twice():
 
 
 def test_inputs_need_not_be_contiguous():
-    inputs = gaussians(40)
-    spread = [torch.stack([tensor, tensor], -1)[..., 0] for tensor in inputs]
-    view = camera_view(CAMERA, 8, RasterOptions())
-    for found, wanted in zip(
-        Project.apply(*spread, view, Dropped()), Project.apply(*inputs, view, Dropped()), strict=True
-    ):
+    outputs, (grads,) = project(40, OPTIONS["plain"])
+    others, (other_grads,) = project(40, OPTIONS["plain"], spread=True)
+    for found, wanted in zip((*others, *other_grads), (*outputs, *grads), strict=True):
         torch.testing.assert_close(found, wanted, rtol=0, atol=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from numbers import Real
 
 import numpy as np
 import torch
@@ -48,7 +49,7 @@ def image_loss(
         raise InputError(
             f"image_loss: expected two tensors, got {type(image).__name__} and {type(target).__name__}; convert them."
         )
-    if not isinstance(lambda_dssim, int | float) or not 0.0 <= lambda_dssim <= 1.0:
+    if not isinstance(lambda_dssim, Real) or not 0.0 <= lambda_dssim <= 1.0:
         raise InputError(f"image_loss: expected lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}.")
     if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
         raise InputError(
@@ -61,10 +62,12 @@ def image_loss(
             f"{list(target.shape)}."
         )
     if mask is not None:
-        if mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1):
+        is_tensor = isinstance(mask, torch.Tensor)
+        if not is_tensor or mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1):
+            found = f"{list(mask.shape)} of {mask.dtype}" if is_tensor else type(mask).__name__
             raise InputError(
-                f"image_loss: expected a mask {[*image.shape[:2], 1]} of uint8, 0 for pixels that do not count, got "
-                f"{list(mask.shape)} of {mask.dtype}."
+                f"image_loss: expected a mask, a tensor {[*image.shape[:2], 1]} of uint8, 0 for pixels that do not "
+                f"count, got {found}."
             )
         counts = mask != 0
         image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))

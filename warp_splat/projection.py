@@ -16,9 +16,7 @@ from warp_splat.kernels.lanes import LANES
 from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
 from warp_splat.kernels.shade import adj_shade, shade
-from warp_splat.launch import even_slices, launch, stage, view
-
-SMALLEST_SLICE = 1024  # Gaussians
+from warp_splat.launch import SMALLEST_SLICE, even_slices, launch, stage, view
 
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView:

@@ -83,7 +83,7 @@ def claimed(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(
             f"{lock.lock_file}: expected a file to write, which tells other trainings that this one is at work, found "
-            f"{error.strerror or error}; remove it, or choose another folder with -m."
+            f"{error.strerror or error}; remove it if no training is at work there, or choose another folder with -m."
         ) from error
     try:
         yield

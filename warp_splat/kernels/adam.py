@@ -4,10 +4,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.build import DIFFERENTIABLE
-
-# sums keep their order: regrouped, v would overflow for gradients above 1e19
-OPTIONS = {**DIFFERENTIABLE, "enable_backward": False}
+from warp_splat.kernels.build import IN_ORDER
 
 
 @functools.cache
@@ -25,7 +22,7 @@ def make_adam(columns: int, pieces: int) -> wp.Kernel:
             r[column] = wp.sqrt(x[column])
         return r
 
-    @wp.kernel(module="unique", module_options=dict(OPTIONS))
+    @wp.kernel(module="unique", module_options=dict(IN_ORDER))  # regrouped, v overflows for gradients above 1e19
     def adam_rows(
         first: int,
         radii: wp.array[int],  # [N] px; Gaussians with 0 keep their value and moments

@@ -6,22 +6,22 @@ width is an upper bound that AVX2 or NEON cut down. No flag lets the compiler as
 
 _FLAGS = "-march=native -ffp-contract=fast -fno-signed-zeros"
 
-#: Of the modules whose adjoint is Warp's. Sums keep their order: (mean - center) - center_low needs it.
-DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS}
-
-#: Of the modules that never need a generated adjoint. Sums over lanes may be regrouped, or they would not vectorize.
+#: Of most modules. Sums over lanes may be regrouped, or they would not vectorize.
 FORWARD_ONLY = {
     "enable_backward": False,
     "optimization_level": 3,
     "cpu_compiler_flags": f"{_FLAGS} -mreassociate -mprefer-vector-width=512",
 }
 
+#: Of those whose sums keep their order: (mean - center) - center_low is nothing but that.
+IN_ORDER = {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": _FLAGS}
+
 #: Of the loops over blocks in lanes: they are short, and vectorized across blocks they take three times as long.
 IN_LANES = {**FORWARD_ONLY, "cpu_compiler_flags": f"{FORWARD_ONLY['cpu_compiler_flags']} -fno-vectorize"}
 
-#: Of lanes that Warp differentiates. Loops over lanes must reach LLVM as loops. Unrolled by LLVM, they are so many
-#: scalars that it takes minutes to find the vectors again; by Warp, functions too long to be inlined: twice the time.
-#: (The blends become 25 to 65 times slower without LLVM's unrolling.)
+#: Of lanes that Warp differentiates; their sums keep their order, too. Loops over lanes must reach LLVM as loops.
+#: Unrolled by LLVM, they are so many scalars that it takes minutes to find the vectors again; by Warp, functions too
+#: long to be inlined: twice the time. (The blends become 25 to 65 times slower without LLVM's unrolling.)
 DIFFERENTIABLE_LANES = {
     "max_unroll": 0,
     "optimization_level": 3,

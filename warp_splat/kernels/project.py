@@ -26,10 +26,10 @@ import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR, OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.blend import reach_of
-from warp_splat.kernels.build import DIFFERENTIABLE, DIFFERENTIABLE_LANES
+from warp_splat.kernels.build import DIFFERENTIABLE_LANES, IN_ORDER
 from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 
-wp.set_module_options(DIFFERENTIABLE)
+wp.set_module_options(IN_ORDER)
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
@@ -123,7 +123,9 @@ def make_project(lanes: int) -> wp.Kernel:
         sx, sy, sz = split3(scales[g])
         opacity = opacities[g]
         # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
-        finite = equal(mul(mx + my + mz + qw + qx + qy + qz + sx + sy + sz + opacity, zero), zero)
+        nought = mul(mx, zero) + mul(my, zero) + mul(mz, zero) + mul(opacity, zero)
+        nought = nought + mul(qw, zero) + mul(qx, zero) + mul(qy, zero) + mul(qz, zero)
+        finite = equal(nought + mul(sx, zero) + mul(sy, zero) + mul(sz, zero), zero)
         size = largest(qw, qx, qy, qz)
         valid = mul(finite, less(zero, size))
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
@@ -259,7 +261,7 @@ def make_project(lanes: int) -> wp.Kernel:
     return project
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel
 def quarantine(
     first: int,
     radii: wp.array[int],  # [N]

@@ -7,11 +7,11 @@ as long, 16.5 ms instead of 7.0 for 137,000 Gaussians of degree 3, with the same
 
 import warp as wp
 
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.build import IN_ORDER
 from warp_splat.kernels.harmonics import C0, basis, vec15, weighted_basis
 from warp_splat.kernels.project import INVALID, CameraView
 
-wp.set_module_options(FORWARD_ONLY)
+wp.set_module_options(IN_ORDER)
 
 
 @wp.kernel
