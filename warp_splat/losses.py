@@ -49,6 +49,16 @@ def image_loss(
         raise InputError(
             f"image_loss: expected two tensors, got {type(image).__name__} and {type(target).__name__}; convert them."
         )
+    for tensor in (image, target, mask):
+        if isinstance(tensor, torch.Tensor) and (tensor.layout, tensor.device) != (torch.strided, image.device):
+            raise InputError(
+                f"image_loss: expected dense tensors on one device, got one of {tensor.layout} on {tensor.device} "
+                f"beside an image on {image.device}; convert it."
+            )
+    if image.device.type not in ("cpu", "cuda"):
+        raise InputError(
+            f"image_loss: expected tensors on the CPU or an NVIDIA GPU, got one on {image.device}; convert it."
+        )
     if not isinstance(lambda_dssim, Real) or not 0.0 <= lambda_dssim <= 1.0:
         raise InputError(f"image_loss: expected lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}.")
     if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):

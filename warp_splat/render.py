@@ -30,7 +30,7 @@ from warp_splat.selftest import settle_device
 from warp_splat.trainer import to_bytes
 from warp_splat.ways import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
 
-OTHER_VIDEOS = {".avi", ".gif", ".mkv", ".mov", ".webm"}
+OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}
 WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
 
 
@@ -217,7 +217,7 @@ def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output
     else:
         rendered = map(picture, tqdm(cameras, disable=config.quiet, unit="frame"))
     frames = _watched(rendered)
-    if output.endswith(".mp4"):
+    if Path(output).suffix.lower() == ".mp4":
         save_video(output, frames, FPS)
     elif output:
         folder = model_folder.prepare(output)

@@ -112,7 +112,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         which = "with" if scene.start.antialiased else "without"
         say(f"Warning: {config.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
     trainer = Trainer(scene, config, processes)
-    say("Preparing kernels (compiled once on a machine, about 15 s) ...")
+    say("Preparing kernels (compiled once on a machine, about 40 s) ...")
     start = time.perf_counter()
     with model_folder.claimed(run.folder) if leads else nullcontext(), _memory_explained(trainer):
         if leads:

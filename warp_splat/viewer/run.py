@@ -41,7 +41,7 @@ def view(config: ViewConfig) -> int:
     print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
     scene = _find_scene(config, trained)
     draw = make_draw(model, trained, is_linear(scene, trained))
-    print("Preparing kernels (compiled once on a machine, about 15 s) ...")
+    print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
         memory_explained(device, model, [LARGEST], advice),
