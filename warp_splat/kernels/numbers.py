@@ -132,7 +132,10 @@ def make_numbers(lanes: int) -> Numbers:
 
 
 class Rows(NamedTuple):
-    """Rows of a few numbers, as they lie in memory, and their columns; the gradient of either is the other."""
+    """Rows of a few numbers, as they lie in memory, and their columns; the gradient of either is the other.
+
+    Tried: one factory for any width, a column at a time, 80 lines less; projection and adjoint take half as long again.
+    """
 
     row: type
     split: wp.Function  # rows to columns
