@@ -144,11 +144,11 @@ def test_commands(page, folder, monkeypatch):
     """Each in its order, with few steps; what waits for a browser is ended by Ctrl-C."""
     lines = [line for language, text in blocks(page) if not language for line in text.splitlines()]
     makes_scene = any("warp-splat sfm" in line for line in lines)
+    for name in ("mine", "again"):  # of other pages
+        shutil.rmtree(folder / "output" / name, ignore_errors=True)
     if lines and makes_scene:
         room.write_photos(folder / "path/to/photos", PHOTOGRAPHS)
         shutil.rmtree(folder / "path/to/scene", ignore_errors=True)
-        for name in ("mine", "again"):  # of other pages
-            shutil.rmtree(folder / "output" / name, ignore_errors=True)
     elif not (folder / "path/to/scene").exists():
         shutil.copytree(SCENE, folder / "path/to/scene")
     monkeypatch.chdir(folder)
