@@ -36,13 +36,12 @@ class Lanes:
         self.scene, self.upstream = scene, upstream
         self.order = wp.array(np.arange(len(splats), dtype=np.int32), dtype=int, device="cpu")
         self.splats = wp.array(splats, dtype=Splat2D, device="cpu")
-        self.slot_ends = wp.array(scene.slot_ends, dtype=wp.int64, device="cpu")
-        self.instances, self.ranges = torch.from_numpy(scene.instances), torch.from_numpy(scene.ranges)
+        instances, places, self.ranges = map(torch.from_numpy, (scene.instances, scene.places, scene.ranges))
+        self.lists = (instances, places, wp.array(scene.place_ends, dtype=wp.int64, device="cpu"))
 
     def forward(self) -> None:
         slices = balanced_slices(self.scene.ranges[:, 1])
-        arrays = (self.order, self.splats, self.slot_ends, self.instances, self.ranges)
-        bins = Bins(*arrays, slices, self.scene.tiles_x, invalid=0)
+        bins = Bins(self.order, self.splats, *self.lists, self.ranges, slices, self.scene.tiles_x, invalid=0)
         black = torch.zeros(3)
         self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), self.mode, Dropped())
 
@@ -60,7 +59,7 @@ class Scalar:
         self.inputs = [
             scene.tiles_x,
             to(scene.ranges, wp.vec2i),
-            to(scene.instances, wp.vec2i),
+            to(scene.instances, int),
             to(scene.splats, Splat2D),
         ]
         self.image, self.final = (

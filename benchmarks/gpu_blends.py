@@ -24,7 +24,7 @@ from warp_splat.renderer import Dropped
 #: Adjoint: lit 7, offset 2, exponent 7, exponential 14, alpha 4, odds 2, transmittance 2, dL/dalpha 9, moments 5,
 #: channels 4, and an addition for each of the ten sums over the block.
 FORWARD, ADJOINT = 39, 66
-SPLAT, INSTANCE, ROW = 48, 8, 36  # bytes
+SPLAT, INSTANCE, ROW = 48, 4, 36  # bytes; a place takes as many as an instance
 ROUNDS, UNROLLED, CHAINS = 1024, 16, 4  # of multiply-adds; on sm_90 the compiler makes 64 FFMA of a round
 
 SHARE_HEADERS = ("kernel", "ms", "GB", "% of the card's copy", "G operations", "% of its multiply-adds")
@@ -52,8 +52,8 @@ def multiply_add(first: int, rounds: int, factor: float, values_out: wp.array[wp
 
 
 @wp.func
-def add(rows: wp.array2d[float], row: int, column: int, value: float):
-    wp.atomic_add(rows, row, column, value)
+def add(rows: wp.array2d[float], instance: int, splat: int, column: int, value: float):
+    wp.atomic_add(rows, splat, column, value)
 
 
 class Blends:
@@ -72,10 +72,7 @@ class Blends:
         pixels = (torch.ones_like(self.image), torch.zeros_like(self.image[..., 0]), new(0, 0))
         self.adj_pixels = pixels
         self.upstream(self.slots)
-        ranks = self.bins.instances[:, 0]
-        # in place of the instance's slot, the Gaussian: with `add`, the kernel that is the product's writes there
-        self.by_gaussian = torch.stack([ranks, wp.to_torch(self.bins.gaussians)[ranks.long()]], 1)
-        self.rows = new(self.count, 9)
+        self.rows = new(len(self.bins.gaussians), 9)
 
     def forward(self) -> None:
         self.image, _, _, saved = blend_blocks(self.bins, self.camera, self.background, self.options, False)
@@ -86,27 +83,38 @@ class Blends:
         found = spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
         self.up, self.adj_final, _, _, self.steps = found
 
-    def reverse(self, instances: torch.Tensor, rows: torch.Tensor, *write: wp.Function) -> None:
+    def reverse(self, rows: torch.Tensor, *write: wp.Function) -> None:
         lists = list_inputs(self.bins, self.options)
-        lists[2] = view(instances, wp.vec2i)
         states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
         inputs = [*lists, *states, view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
         kernel = make_reverse_block("manual", False, self.options.exp_degree, *write)
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
 
     def into_slots(self) -> None:
-        self.reverse(self.bins.instances, self.slots)
+        self.reverse(self.slots)
 
     def gather(self) -> list[torch.Tensor]:
         grads = [self.slots.new_zeros(self.count, width).squeeze(1) for width in (2, 3, 1, 3, 1)]
-        inputs = [self.bins.gaussians, self.bins.slot_ends, view(self.slots, wp.float32)]
-        launch(tiles.gather, len(self.bins.gaussians), inputs, views2d(grads), device=self.slots.device)
+        lists = [self.bins.gaussians, self.bins.place_ends, view(self.bins.places, wp.int32)]
+        launch(
+            tiles.gather,
+            len(self.bins.gaussians),
+            [*lists, view(self.slots, wp.float32)],
+            views2d(grads),
+            device=self.slots.device,
+        )
         return grads[:4]
 
     def by_atomics(self) -> torch.Tensor:
         self.rows.zero_()
-        self.reverse(self.by_gaussian, self.rows, add)
+        self.reverse(self.rows, add)
         return self.rows
+
+    def by_gaussian(self, rows: torch.Tensor) -> torch.Tensor:
+        """What is by splat: these are the Gaussians drawn, or all of them in another order."""
+        found = rows.new_zeros(self.count, rows.shape[1])
+        found[wp.to_torch(self.bins.gaussians).long()] = rows
+        return found
 
 
 def card_rates(device: str, count: int) -> tuple[float, float]:
@@ -140,7 +148,7 @@ def measure_blends(
     work = {
         "forward": (walked * (SPLAT + INSTANCE) + 24 * pixels, FORWARD * walked * THREADS),
         "adjoint into slots": (walked * (SPLAT + INSTANCE + ROW) + 28 * pixels, ADJOINT * walked * THREADS),
-        "gather": (instances * ROW + blends.count * (ROW + 12), 9 * instances),
+        "gather": (instances * (INSTANCE + ROW) + blends.count * (ROW + 12), 9 * instances),
     }
     shares = [
         [name, f"{times[name]:.3f}", f"{size / 1e9:.3f}", f"{100e3 * size / times[name] / bandwidth:.1f}",
@@ -158,7 +166,7 @@ def _against_atomics(blends: Blends, times: dict[str, float], size: str) -> tupl
     repeated = torch.equal(first, blends.by_atomics())
     blends.into_slots()
     summed = torch.cat([grad.reshape(blends.count, -1) for grad in blends.gather()], 1)
-    error = float((first - summed).norm() / summed.norm())
+    error = float((blends.by_gaussian(first) - summed).norm() / summed.norm())
     ways = {"slots": ("upstream", "adjoint into slots", "gather"),
             "atomics": ("upstream without slots", "adjoint by atomics")}  # fmt: skip
     rows = []

@@ -25,7 +25,7 @@ def exponential(splat: Splat2D, dx: float, dy: float):
 def blend(
     tiles_x: int,
     ranges: wp.array[wp.vec2i],  # [T]
-    instances: wp.array[wp.vec2i],  # [M]
+    instances: wp.array[int],  # [M]
     splats: wp.array[Splat2D],  # [V]
     # out
     image_out: wp.array2d[wp.vec3],  # [H, W]
@@ -38,7 +38,7 @@ def blend(
     c = wp.vec3(0.0)
     last = span[0]
     for k in range(span[0], span[1]):
-        splat = splats[instances[k][0]]
+        splat = splats[instances[k]]
         dx = splat.mean[0] - float(x) - 0.5
         dy = splat.mean[1] - float(y) - 0.5
         raw = splat.opacity * exponential(splat, dx, dy)
@@ -59,7 +59,7 @@ def blend(
 def adj_blend(
     tiles_x: int,
     ranges: wp.array[wp.vec2i],
-    instances: wp.array[wp.vec2i],
+    instances: wp.array[int],
     splats: wp.array[Splat2D],
     final: wp.array2d[float],
     last: wp.array2d[int],
@@ -73,7 +73,7 @@ def adj_blend(
     t = final[y, x]
     behind = float(0.0)
     for back in range(last[y, x] - first):
-        i = instances[last[y, x] - 1 - back][0]
+        i = instances[last[y, x] - 1 - back]
         splat = splats[i]
         dx = splat.mean[0] - float(x) - 0.5
         dy = splat.mean[1] - float(y) - 0.5

@@ -18,8 +18,9 @@ class BlendScene(NamedTuple):
     tiles_x: int
     splats: np.ndarray  # [V] Splat2D
     ranges: np.ndarray  # [T, 2] int32, first and last instance
-    instances: np.ndarray  # [M, 2] int32, (splat, slot)
-    slot_ends: np.ndarray  # [V] int64
+    instances: np.ndarray  # [M] int32, splats
+    places: np.ndarray  # [M] int32, where in ``instances``, splat by splat
+    place_ends: np.ndarray  # [V] int64
 
 
 def blend_scene(count: int = 100_000, width: int = 980, height: int = 545, seed: int = 0) -> BlendScene:
@@ -52,10 +53,9 @@ def _bin(splats: np.ndarray, radius: np.ndarray, width: int, height: int) -> Ble
     local = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     across = np.repeat(high[:, 0] - low[:, 0], counts)
     tile = (low[splat, 1] + local // across) * tiles[0] + low[splat, 0] + local % across
-    slot = np.argsort(tile, kind="stable")  # splats are in depth order already
-    ends = np.searchsorted(tile[slot], np.arange(tiles.prod()), "right")
+    order = np.argsort(tile, kind="stable")  # splats are in depth order already
+    ends = np.searchsorted(tile[order], np.arange(tiles.prod()), "right")
     ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], 1)
-    instances = np.stack([splat[slot], slot], 1)
-    return BlendScene(
-        width, height, int(tiles[0]), splats, ranges.astype(np.int32), instances.astype(np.int32), np.cumsum(counts)
-    )
+    places = np.argsort(order)
+    lists = (table.astype(np.int32) for table in (ranges, splat[order], places))
+    return BlendScene(width, height, int(tiles[0]), splats, *lists, np.cumsum(counts))

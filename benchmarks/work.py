@@ -45,7 +45,7 @@ def count_pairs(
     first: int,
     tiles_x: int,
     ranges: wp.array[wp.vec2i],  # [T]
-    instances: wp.array[wp.vec2i],  # [M]
+    instances: wp.array[int],  # [M]
     splats: wp.array[Splat2D],  # [V]
     alpha_min: float,
     count: wp.array2d[vec16],  # [T, BLOCKS] instances walked before the pixel stopped
@@ -64,7 +64,7 @@ def count_pairs(
     blended = wp.int64(0)
     looked_at = wp.int64(0)
     for k in range(start, start + int(longest)):
-        splat = splats[instances[k][0]]
+        splat = splats[instances[k]]
         box = reach(splat.mean, splat.extent, x0, y0)
         hits = vec16(0.0)
         for by in range(box[2], box[3] + 1):
@@ -128,7 +128,7 @@ def work_of(counts: Counts) -> dict[str, tuple[float, float]]:
         # shapes in; radii out; of those drawn, SH in and the rest out
         "project": (n * (44 + 4) + drawn * (sh + 48), PROJECT * drawn),
         # radii and projected Gaussians in; splats, where each came from and where its instances end, and the instances
-        # (splat 4, slot 4) out
+        # (splat 4, place 4) out
         "bin": (n * 4 + drawn * (48 + 48 + 12) + counts.instances * 8, 0),
         # instances and Gaussians in; image, alpha, and for the adjoint final T and count out
         "blend": (counts.instances * 8 + drawn * 48 + pixels * 24, FORWARD * counts.pairs),

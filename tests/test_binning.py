@@ -28,7 +28,7 @@ def project(count=300, seed=0, size=SIZE, stretch=1.0, options=PLAIN):
 def lists(bins):
     """Gaussians of each tile, in order."""
     gaussians, ranges, instances = bins.gaussians.numpy(), bins.ranges.numpy(), bins.instances.numpy()
-    return [gaussians[instances[first:last, 0]].tolist() for first, last in ranges]
+    return [gaussians[instances[first:last]].tolist() for first, last in ranges]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -51,13 +51,13 @@ def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
     assert spare < 0.12 * sum(map(len, found))  # ellipses that pass between the pixel centers of a tile
 
 
-def test_slots_number_the_instances_splat_by_splat():
+def test_places_are_those_of_each_splat():
     camera, projected = project()
-    bins = binning.bin_tiles(*projected, camera, RasterOptions())
-    splat, slot = bins.instances.numpy().T
-    assert sorted(slot) == list(range(len(slot)))
-    ends = np.concatenate([[0], bins.slot_ends.numpy()])
-    assert ((slot >= ends[splat]) & (slot < ends[splat + 1])).all()
+    for bins in counted_and_sorted(camera, projected):
+        ends = bins.place_ends.numpy()
+        splats = np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))
+        assert (bins.instances.numpy()[bins.places.numpy()] == splats).all() and len(splats) > 300
+        assert sorted(bins.places.numpy()) == list(range(len(splats)))
 
 
 def test_the_number_of_threads_changes_nothing():
@@ -71,7 +71,9 @@ def test_the_number_of_threads_changes_nothing():
     finally:
         set_threads(threads)
     for other in results[1:]:
-        assert torch.equal(other.instances, results[0].instances) and torch.equal(other.ranges, results[0].ranges)
+        assert all(
+            torch.equal(getattr(other, name), getattr(results[0], name)) for name in ("instances", "places", "ranges")
+        )
 
 
 def counted_and_sorted(camera, projected, options=PLAIN):
@@ -80,9 +82,9 @@ def counted_and_sorted(camera, projected, options=PLAIN):
 
 def listed(bins):
     """Of each instance the Gaussian, and which of the Gaussian's instances it is."""
-    splat, slot = bins.instances.numpy().T
-    begins = np.concatenate([[0], bins.slot_ends.numpy()])
-    return np.stack([bins.gaussians.numpy()[splat], slot - begins[splat]])
+    splat, number = bins.instances.numpy(), np.argsort(bins.places.numpy())
+    begins = np.concatenate([[0], bins.place_ends.numpy()])
+    return np.stack([bins.gaussians.numpy()[splat], number - begins[splat]])
 
 
 def by_gaussian(bins, drawn):
@@ -94,15 +96,15 @@ def by_gaussian(bins, drawn):
 @pytest.mark.parametrize("size", [SIZE, (1, 1), (1, 2000), (2000, 1), (3000, 2900)], ids=str)
 @pytest.mark.parametrize(("count", "stretch"), [(300, 1.0), (5000, 1.0), (300, 3.0), (1, 1.0), (0, 1.0)])
 def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, options):
-    """What a GPU does, on the CPU: the same Gaussians by tile, their slots in the same order, and the same splats."""
+    """What a GPU does, on the CPU: the same Gaussians by tile, their places in the same order, and the same splats."""
     camera, projected = project(count, 4, size, stretch, options)
     counted, by_sorting = counted_and_sorted(camera, projected, options)
     drawn = len(counted.gaussians)
     assert (listed(by_sorting) == listed(counted)).all() and torch.equal(by_sorting.ranges, counted.ranges)
     assert by_sorting.instances.dtype == by_sorting.ranges.dtype == torch.int32
     assert by_gaussian(by_sorting, drawn) == by_gaussian(counted, drawn)
-    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.slot_ends) == count
-    assert (by_sorting.slot_ends.numpy()[drawn:] == len(counted.instances)).all()
+    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.place_ends) == count
+    assert (by_sorting.place_ends.numpy()[drawn:] == len(counted.instances)).all()
     assert int(by_sorting.invalid) == counted.invalid
 
 

@@ -46,7 +46,7 @@ def test_what_is_differentiated_is_the_blend(mode):
     final, count, kept = image.grad_fn.saved_tensors[1:]
     lists, steps = list_inputs(bins, PLAIN), count.amax((1, 2)).int()
     if mode == "generated":
-        lists[3] = wp.array(bins.splats.numpy()[bins.instances.numpy()[:, 0]], dtype=bins.splats.dtype, device="cpu")
+        lists[3] = wp.array(bins.splats.numpy()[bins.instances.numpy()], dtype=bins.splats.dtype, device="cpu")
     color, behind = torch.zeros(len(final), 3 * BLOCKS, LANES), torch.zeros_like(final)
     slots = torch.zeros(len(bins.instances), 9)
     states = [view(state, vec16) for state in (final, count, kept)]

@@ -33,7 +33,7 @@ def test_atomics_and_slots_give_the_gradients_of_the_product(fibers):
     camera = gpu_scene.cameras(60, 40, 1)[0]
     blends = gpu_blends.Blends(gaussians, camera)
     blends.into_slots()
-    found = {"slots": blends.gather(), "atomics": blends.by_atomics().split([2, 3, 1, 3], 1)}
+    found = {"slots": blends.gather(), "atomics": blends.by_gaussian(blends.by_atomics()).split([2, 3, 1, 3], 1)}
     leaves = [tensor.detach().requires_grad_() for tensor in blends.projected[:5]]
     image, *_ = Blend.apply(*leaves, torch.zeros(3), blends.bins, camera, RasterOptions(), "manual", Dropped())
     expected = torch.autograd.grad(image.sum(), leaves[:4])

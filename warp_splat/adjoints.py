@@ -25,7 +25,7 @@ SPLATS = 3  # place of the Gaussians in the list
 
 def list_inputs(bins: Bins, options: RasterOptions) -> list:
     """What every blend kernel reads first."""
-    ranges, instances = view(bins.ranges, wp.vec2i), view(bins.instances, wp.vec2i)
+    ranges, instances = view(bins.ranges, wp.vec2i), view(bins.instances, wp.int32)
     return [bins.tiles_x, ranges, instances, bins.splats, options.alpha_min]
 
 
@@ -68,8 +68,8 @@ def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list
         launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
         return
     copies, adj_copies = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
-    copies.assign(bins.splats.numpy()[bins.instances.numpy()[:, 0]])
+    copies.assign(bins.splats.numpy()[bins.instances.numpy()])
     adj_copies.zero_()
     lists[SPLATS], adjoint["adj_inputs"][SPLATS] = copies, adj_copies
     launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
-    launch(rows_of_copies, len(bins.instances), [view(bins.instances, wp.vec2i), copies, adj_copies], [rows])
+    launch(rows_of_copies, len(bins.instances), [copies, adj_copies], [rows])

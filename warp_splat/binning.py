@@ -28,8 +28,9 @@ class Bins:
 
     gaussians: wp.array  # [V] Gaussian of each splat: ascending; on a GPU, nearest first
     splats: wp.array  # [V] Splat2D
-    slot_ends: wp.array  # [V] int64, inclusive scan of a splat's instances
-    instances: torch.Tensor  # [M, 2] int32 (splat, slot), by tile, nearest first
+    instances: torch.Tensor  # [M] int32, splats, by tile, nearest first
+    places: torch.Tensor  # [M] int32, where in ``instances`` a splat stands, splat by splat
+    place_ends: wp.array  # [V] int64, inclusive scan of how often it does
     ranges: torch.Tensor  # [T, 2] int32, first and last instance
     slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU
     tiles_x: int
@@ -70,12 +71,13 @@ def bin_by_counting(
     spans, counts = wp.empty(_last(row_ends), dtype=wp.vec2i, device="cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, _array(rows), _array(begins), camera.width, camera.height, tiles_x, square]
     launch(tiles.find_spans, count, inputs, [spans, _array(counts)])
-    slot_ends = np.cumsum(counts)
-    _check_count(_last(slot_ends), camera, count, radii.device)
-    slots = (slot_ends - counts).astype(np.int32)[order]
-    instances, ends = _sort_by_tile(order, slots, row_ends, spans, _last(slot_ends), tiles_x * tiles_y)
+    place_ends = np.cumsum(counts)
+    _check_count(_last(place_ends), camera, count, radii.device)
+    begins = (place_ends - counts).astype(np.int32)[order]
+    instances, places, ends = _sort_by_tile(order, begins, row_ends, spans, _last(place_ends), tiles_x * tiles_y)
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
-    return Bins(gaussians, splats, _array(slot_ends), instances, ranges, balanced_slices(ends), tiles_x, invalid)
+    lists = (instances, places, _array(place_ends), ranges)
+    return Bins(gaussians, splats, *lists, balanced_slices(ends), tiles_x, invalid)
 
 
 def bin_by_sorting(
@@ -97,32 +99,33 @@ def bin_by_sorting(
     launch(tiles.pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
     inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
 
-    def list_tiles(slot_ends: torch.Tensor, *lists: torch.Tensor) -> None:
+    def list_tiles(place_ends: torch.Tensor, *lists: torch.Tensor) -> None:
         outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]
-        launch(tiles.list_tiles, total, [*inputs, view(slot_ends, wp.int64)], outputs, device=device)
+        launch(tiles.list_tiles, total, [*inputs, view(place_ends, wp.int64)], outputs, device=device)
 
     list_tiles(counts[:0], *torch.empty(2, 0, dtype=torch.int32, device=device))
-    slot_ends = torch.cumsum(counts, 0)
-    count = int(slot_ends[-1]) if total else 0
+    place_ends = torch.cumsum(counts, 0)
+    count = int(place_ends[-1]) if total else 0
     _check_count(count, camera, total, device)
     listed, ranks = torch.empty(2, count, dtype=torch.int32, device=device)
-    list_tiles(slot_ends, listed, ranks)
+    list_tiles(place_ends, listed, ranks)
     # the fewer bits, the fewer passes of the sort
     narrow = torch.int16 if tiles_x * tiles_y < 2**15 else torch.int32
-    listed, slots = torch.sort(listed.to(narrow), stable=True)
-    instances = torch.stack([ranks[slots], slots.int()], 1)
+    listed, numbers = torch.sort(listed.to(narrow), stable=True)
+    instances, places = ranks[numbers], torch.empty_like(ranks)
+    places[numbers] = torch.arange(count, dtype=torch.int32, device=device)
     bounds = torch.searchsorted(listed, torch.arange(tiles_x * tiles_y + 1, dtype=narrow, device=device)).int()
     ranges = torch.stack([bounds[:-1], bounds[1:]], 1)
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
         _check_longest(int(bounds.diff().max()))
     invalid = torch.count_nonzero(radii < 0)
-    return Bins(order, splats, wp.from_torch(slot_ends), instances, ranges, [], tiles_x, invalid)
+    return Bins(order, splats, instances, places, wp.from_torch(place_ends), ranges, [], tiles_x, invalid)
 
 
 def _sort_by_tile(
-    order: np.ndarray, slots: np.ndarray, row_ends: np.ndarray, spans: wp.array, count: int, tile_count: int
-) -> tuple[torch.Tensor, np.ndarray]:
-    """Instances [M, 2] (splat, slot) by tile, nearest first, and where each tile's end [T].
+    order: np.ndarray, begins: np.ndarray, row_ends: np.ndarray, spans: wp.array, count: int, tile_count: int
+) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
+    """Instances [M] by tile, nearest first, their places [M], and where each tile's end [T].
 
     A counting sort in bands of splats, one per thread: each band counts its instances of every tile, then writes
     them after those of the bands before it. The result is the same for any number of bands.
@@ -133,13 +136,14 @@ def _sort_by_tile(
     rows = np.concatenate([[0], row_ends])[bounds].astype(np.int32)
     counts = np.zeros((bands, tile_count), dtype=np.int32)
     launch(tiles.count_tiles, bands, [_array(rows), spans], [_array(counts)], bounds=one_each)
-    places = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
+    ends = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
     _check_longest(int(counts.sum(0).max(initial=0)))
-    cursor = np.ascontiguousarray((places - counts.T).T, dtype=np.int32)
-    instances = torch.empty((count, 2), dtype=torch.int32)
-    inputs = [_array(bounds), _array(order), _array(slots), _array(row_ends), spans]
-    launch(tiles.scatter, bands, inputs, [_array(cursor), view(instances, wp.vec2i)], bounds=one_each)
-    return instances, places[:, -1]
+    cursor = np.ascontiguousarray((ends - counts.T).T, dtype=np.int32)
+    instances, places = (torch.empty(count, dtype=torch.int32) for _ in range(2))
+    inputs = [_array(bounds), _array(order), _array(begins), _array(row_ends), spans]
+    outputs = [_array(cursor), view(instances, wp.int32), view(places, wp.int32)]
+    launch(tiles.scatter, bands, inputs, outputs, bounds=one_each)
+    return instances, places, ends[:, -1]
 
 
 def order_by_depth(depths: np.ndarray) -> np.ndarray:

@@ -73,7 +73,7 @@ def spread_upstream(
     launch_blocks(
         make_upstream_block(options.depth),
         tile_count,
-        [*list_inputs(bins, options)[:3], *inputs],
+        [*list_inputs(bins, options)[:2], *inputs],
         [*outputs, view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],
         background.device,
     )

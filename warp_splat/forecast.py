@@ -26,14 +26,14 @@ PER_GAUSSIAN = sum(
         2 + 3 + 1 + 3 + 1,  # their gradients, without those of the last three
         3 + 1 + 1,  # gradients of scales and opacities before activation, and whether one is not finite
         2 + 2 + 3,  # depths and indices in the sort, indices of the drawn (32 and 64 bits)
-        12 + 2 + 2,  # Splat2D, and where its rows and slots end (64 bits)
+        12 + 2 + 2,  # Splat2D, and where its rows and places end (64 bits)
         3 + 3,  # densification: its statistics, and what is added to them
     )
 )
 #: Floats of a tile instance.
 PER_INSTANCE = sum(
     (
-        2 + 9,  # (splat, slot), and its row of gradients
+        2 + 9,  # splat and place, and its row of gradients
         2,  # the span of a row of tiles that one Gaussian touches, at most one for each instance
     )
 )
@@ -43,8 +43,8 @@ PER_PIXEL = sum(
     (
         3 + 1 + 1 + 1,  # image, alpha, transmittance and steps in blocks
         3 + 3,  # the image clamped, the photograph as floats
-        3 + 3 + 15 + 9,  # loss: both images with margins, five moments and three slopes of SSIM
-        9 + 3 + 3,  # their adjoints: slopes blurred, image, image before it was clamped
+        9,  # loss: three slopes of SSIM
+        3 + 3,  # gradients of the image, and of it before it was clamped
         3 + 1 + 1,  # upstream gradients of image and transmittance in blocks, of alpha
     )
 )

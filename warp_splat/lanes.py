@@ -81,14 +81,14 @@ def _spread_upstream(
     up = torch.empty(tile_count, BLOCKS * (4 if options.depth else 3), LANES)
     adj_final, adj_background = torch.empty_like(final), torch.empty(tile_count, 3)
     bad, steps = torch.empty(tile_count, dtype=torch.int32), torch.empty(tile_count, dtype=torch.int32)
-    lists = [bins.tiles_x, view(bins.ranges, wp.vec2i), view(bins.instances, wp.vec2i)]
+    lists, row = [bins.tiles_x, view(bins.ranges, wp.vec2i)], wp.types.vector(length=slots.shape[1], dtype=float)
     launch(
         make_upstream(options.depth),
         tile_count,
         [*lists, view(background, wp.float32), view(final, vec16), view(count, vec16), *_pixel_views(*adj_pixels)],
         [
             *(view(up, vec16), view(adj_final, vec16), view(adj_background, wp.float32)),
-            *(view(bad, wp.int32), view(steps, wp.int32), view(slots, wp.float32)),
+            *(view(bad, wp.int32), view(steps, wp.int32), view(slots, row)),
         ],
         bounds=bins.slices,
     )

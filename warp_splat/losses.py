@@ -17,7 +17,7 @@ from warp_splat.kernels import ssim
 from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.launch import even_slices, launch, stage, view
 
-SMALLEST_SLICE = 16  # rows
+SMALLEST_SLICE = 64  # rows; a slice begins with the ten that its neighbours blur, too
 FAR_APART = 10.0  # in units of an image's usual range
 
 
@@ -150,61 +150,75 @@ class ImageLoss(torch.autograd.Function):
     def forward(ctx, image, target, lambda_dssim, limits):
         with stage("loss"):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
-            groups = -(-length // LANES)
-            centers = _centers(image, target)
+            groups, centers = -(-length // LANES), _centers(image, target)
             image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
-            x, y = _pad(image, centers[0], groups, limits), _pad(target, centers[1], groups)
-            moments, slopes = torch.empty(height, 5, groups, LANES), torch.empty(height, 3, groups, LANES)
+            bounds, bands = _bands(height)
+            padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, ssim.RING, groups, ssim.MOMENTS)
+            blurred, slopes = _lanes(bands, ssim.ROWS, groups, ssim.MOMENTS), _lanes(height, ssim.SLOPES, groups + 2)
             sums = torch.empty(height, 2)
-            bounds = even_slices(height, SMALLEST_SLICE)
-            launch(ssim.blur_rows, height, [_taps(x), _taps(y)], [view(moments, vec16)], bounds=bounds)
             launch(
                 ssim.compare,
-                height,
+                bands,
                 [
-                    _taps(x),
-                    _taps(y),
-                    view(moments, vec16),
-                    view(_missing(groups, length), vec16),
+                    view(bounds, wp.int32),
+                    *_pictures(image, limits, target),
                     wp.vec2(*centers),
-                    length,
+                    view(_missing(groups, length), vec16),
                 ],
-                [view(sums, wp.float32), view(slopes, vec16)],
-                bounds=bounds,
+                [
+                    *(view(lanes, vec16) for lanes in (padded, ring, blurred)),
+                    view(sums, wp.float32),
+                    view(slopes, vec16),
+                ],
+                bounds=list(range(bands + 1)),
             )
             l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
-            ctx.save_for_backward(image, x, y, slopes)
-            ctx.lambda_dssim, ctx.limits, ctx.gap = lambda_dssim, limits, centers[0] - centers[1]
+            ctx.save_for_backward(image, target, slopes)
+            ctx.lambda_dssim, ctx.limits, ctx.centers = lambda_dssim, limits, centers
             return torch.tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), dtype=torch.float32)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, adj_loss):
         with stage("adjoint of loss"):
-            image, x, y, slopes = ctx.saved_tensors
-            height, groups = x.shape[0], slopes.shape[2]
-            scale = adj_loss.item() / image.numel()
-            blurred, adj = torch.empty(height, 3, groups + 2, LANES), torch.empty_like(image)
-            bounds = even_slices(height, SMALLEST_SLICE)
-            launch(ssim.adj_blur_columns, height, [view(slopes, vec16)], [view(blurred, vec16)], bounds=bounds)
+            image, target, slopes = ctx.saved_tensors
+            height, groups = len(image), slopes.shape[2] - 2
+            bounds, bands = _bands(height)
+            ring, blurred = (_lanes(bands, rows, groups, ssim.SLOPES) for rows in (ssim.RING, ssim.ROWS))
+            adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
             weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
             launch(
                 ssim.adj_compare,
-                height,
+                bands,
                 [
-                    view(image, wp.float32),
-                    _taps(image),
-                    wp.vec2(*ctx.limits),
-                    _taps(x),
-                    _taps(y),
-                    _taps(blurred.view(height, 3, -1)),
-                    ctx.gap,
-                    *weights,
+                    *(view(bounds, wp.int32), *_pictures(image, ctx.limits, target)),
+                    *(wp.vec2(*ctx.centers), view(slopes, vec16), *weights),
                 ],
-                [view(adj, wp.float32), _taps(adj)],
-                bounds=bounds,
+                [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)],
+                bounds=list(range(bands + 1)),
             )
             return adj.view(height, -1, ssim.CHANNELS), None, None, None
+
+
+def _lanes(*shape: int) -> torch.Tensor:
+    return torch.empty(*shape, LANES)
+
+
+def _bands(height: int) -> tuple[torch.Tensor, int]:
+    """Bounds of bands of rows, one for each thread [B + 1], and their number."""
+    bounds = even_slices(height, SMALLEST_SLICE)
+    return torch.tensor(bounds, dtype=torch.int32), len(bounds) - 1
+
+
+def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor) -> list:
+    """What both kernels read of [H, L]: the image and its limits; the target as floats, and as bytes: one of them."""
+    floats, levels = (
+        target if target.dtype == dtype else torch.empty(0, 0, dtype=dtype) for dtype in (torch.float32, torch.uint8)
+    )
+    return [
+        *(view(image, wp.float32), _taps(image), wp.vec2(*limits)),
+        *(view(floats, wp.float32), _taps(floats), view(levels, wp.uint8), _taps(levels, ssim.vec16b)),
+    ]
 
 
 def _centers(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
@@ -223,22 +237,6 @@ def _middle(image: torch.Tensor) -> float:
     low, high = image.aminmax()
     middle = 0.5 * low.item() + 0.5 * high.item()
     return float(np.float32(middle)) if math.isfinite(middle) else 0.5
-
-
-def _pad(
-    image: torch.Tensor, center: float, groups: int, limits: tuple[float, float] = (-math.inf, math.inf)
-) -> torch.Tensor:
-    """Rows [H, L] within the limits minus ``center`` as float32 in [H, P], a group of zeros at either end."""
-    height, bounds = len(image), even_slices(len(image), SMALLEST_SLICE)
-    padded = torch.empty(height, groups + 2, LANES)
-    out = [view(padded, vec16)]
-    if image.dtype == torch.uint8:
-        inputs = [view(image, wp.uint8), _taps(image, ssim.vec16b), center]
-        launch(ssim.pad_bytes, height, inputs, out, bounds=bounds)
-    else:
-        inputs = [view(image, wp.float32), _taps(image), center, wp.vec2(*limits)]
-        launch(ssim.pad, height, inputs, out, bounds=bounds)
-    return padded.view(height, -1)
 
 
 @functools.cache

@@ -219,6 +219,6 @@ class Blend(torch.autograd.Function):
             ctx.dropped.pixel_count += bad.sum()
             rows, new = ctx.gaussian_count, slots.new_zeros
             grads = (new(rows, 2), new(rows, 3), new(rows), new(rows, 3), new(rows))
-            inputs = [bins.gaussians, bins.slot_ends, view(slots, wp.float32)]
+            inputs = [bins.gaussians, bins.place_ends, view(bins.places, wp.int32), view(slots, wp.float32)]
             launch(tiles.gather, len(bins.gaussians), inputs, views2d(grads), device=slots.device)
         return *grads, adj_background, None, None, None, None, None

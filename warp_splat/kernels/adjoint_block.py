@@ -49,7 +49,6 @@ def make_upstream_block(depth: bool) -> wp.Kernel:
     def upstream(
         tiles_x: int,
         ranges: wp.array[wp.vec2i],  # [T]
-        instances: wp.array[wp.vec2i],  # [M]
         background: wp.array[float],  # [3]
         final: wp.array2d[float],  # [T, THREADS]
         count: wp.array2d[int],  # [T, THREADS]
@@ -98,15 +97,15 @@ def make_upstream_block(depth: bool) -> wp.Kernel:
             k = first + batch * THREADS + thread
             if k < ranges[tile][1]:
                 for grad in range(slots_out.shape[1]):
-                    slots_out[instances[k][1], grad] = 0.0
+                    slots_out[k, grad] = 0.0
 
     return upstream
 
 
 @wp.func
-def put(rows: wp.array2d[float], row: int, column: int, value: float):
+def put(slots: wp.array2d[float], instance: int, splat: int, column: int, value: float):
     """Write a gradient to its place, which is nobody else's."""
-    rows[row, column] = value
+    slots[instance, column] = value
 
 
 @functools.cache
@@ -120,7 +119,7 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
     def adj_blend(
         tiles_x: int,
         ranges: wp.array[wp.vec2i],
-        instances: wp.array[wp.vec2i],
+        instances: wp.array[int],
         splats: wp.array[Splat2D],
         alpha_min: float,
         final: wp.array2d[float],
@@ -144,13 +143,9 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
         for batch in range((steps[tile] + THREADS - 1) // THREADS):
             last = steps[tile] - 1 - batch * THREADS
             mine = vec10(0.0)
-            slot = int(0)
             if last - thread >= 0:
-                instance = instances[start + last - thread]
-                mine = staged_of(splats[instance[0]])
-                slot = instance[1]
+                mine = staged_of(splats[instances[start + last - thread]])
             staged = wp.tile(mine, preserve_type=True)
-            slots = wp.tile(slot)
             for j in range(wp.min(THREADS, last + 1)):
                 g = staged[j]
                 dx = g[0] - x
@@ -189,7 +184,8 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
                         row = row_from_moments(sums, g)
                     else:
                         row = row_from_root(sums, wp.vec3(g[2], g[3], g[4]))
+                    k = start + last - j
                     for grad in range(GRADS):
-                        write(slots_out, slots[j], grad, row[grad])
+                        write(slots_out, k, instances[k], grad, row[grad])
 
     return adj_blend

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.blend import Splat2D, exponent
-from warp_splat.kernels.blend_lanes import AHEAD, BLOCKS, aligned, mat_boxes, offset_x, offset_y, reach
+from warp_splat.kernels.blend_lanes import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
 from warp_splat.kernels.build import IN_LANES
 from warp_splat.kernels.lanes import LANES, times, vec16
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
@@ -156,7 +156,7 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
     GRADS = 6 + CHANNELS
     # all in one matrix: a matrix of which only rows of known numbers are used would be taken apart into scalars
     ADJ_T, WALKED, UP, SUMS = BLOCKS, 2 * BLOCKS, 3 * BLOCKS, (3 + CHANNELS) * BLOCKS
-    mat_room = wp.types.matrix(shape=(SUMS + GRADS + 1, LANES), dtype=float)
+    mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
     vec_grads = wp.types.vector(length=GRADS, dtype=float)
     make_body = {"manual": _make_manual_body, "stepwise": _make_stepwise_body}[mode]
     body, adj_geometry = make_body(depth, exp_degree)
@@ -166,7 +166,7 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
         first: int,
         tiles_x: int,
         ranges: wp.array[wp.vec2i],
-        instances: wp.array[wp.vec2i],
+        instances: wp.array[int],
         splats: wp.array[Splat2D],
         alpha_min: float,
         final: wp.array2d[vec16],
@@ -175,7 +175,7 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
         up: wp.array2d[vec16],
         adj_final: wp.array2d[vec16],
         # out
-        slots_out: wp.array2d[float],  # [M, GRADS] one row per tile instance
+        slots_out: wp.array2d[float],  # [M, GRADS]
     ):
         tile = first + wp.tid()
         start = ranges[tile][0]
@@ -184,6 +184,7 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
         room = mat_room()
         # T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
+        near = wp.array(ptr=s.ptr + wp.uint64(64 * (SUMS + GRADS)), shape=(AHEAD,), dtype=Splat2D)
         for block in range(BLOCKS):
             s[block] = final[tile, block]
             s[ADJ_T + block] = adj_final[tile, block]
@@ -202,9 +203,10 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
             ahead = back & (AHEAD - 1)
             if ahead == 0:
                 for j in range(wp.min(AHEAD, steps[tile] - back)):
-                    coming = splats[instances[k - j][0]]
-                    boxes[j] = reach(coming.mean, coming.extent, x0, y0)
-            splat = splats[instances[k][0]]
+                    near[j] = splats[instances[k - j]]
+                for j in range(wp.min(AHEAD, steps[tile] - back)):
+                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
+            splat = near[ahead]
             box = boxes[ahead]
             here = vec16(float(k - start))
             for grad in range(GRADS):
@@ -233,13 +235,12 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
                 sums[grad] = folded(halves, quarters, grad)
                 grad += 1
             adj_mean, adj_conic = adj_geometry(vec5(sums[0], sums[1], sums[2], sums[3], sums[4]), splat)
-            slot = instances[k][1]
-            slots_out[slot, 0] = adj_mean[0]
-            slots_out[slot, 1] = adj_mean[1]
-            slots_out[slot, 2] = adj_conic[0]
-            slots_out[slot, 3] = adj_conic[1]
-            slots_out[slot, 4] = adj_conic[2]
+            slots_out[k, 0] = adj_mean[0]
+            slots_out[k, 1] = adj_mean[1]
+            slots_out[k, 2] = adj_conic[0]
+            slots_out[k, 3] = adj_conic[1]
+            slots_out[k, 4] = adj_conic[2]
             for grad in range(5, GRADS):
-                slots_out[slot, grad] = sums[grad]
+                slots_out[k, grad] = sums[grad]
 
     return adj_blend

@@ -36,7 +36,7 @@ def make_blend_block(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kern
     def blend(
         tiles_x: int,
         ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
-        instances: wp.array[wp.vec2i],  # [M] (splat, slot), by tile, front to back
+        instances: wp.array[int],  # [M] splats, by tile, front to back
         splats: wp.array[Splat2D],  # [V]
         alpha_min: float,
         t_min: float,
@@ -68,7 +68,7 @@ def make_blend_block(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kern
             first = batch * THREADS
             mine = vec10(0.0)
             if first + thread < length:
-                mine = staged_of(splats[instances[start + first + thread][0]])
+                mine = staged_of(splats[instances[start + first + thread]])
             staged = wp.tile(mine, preserve_type=True)
             for j in range(wp.min(THREADS, length - first)):
                 g = staged[j]

@@ -79,7 +79,7 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
         first: int,  # tile of this slice
         tiles_x: int,
         ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
-        instances: wp.array[wp.vec2i],  # [M] (splat, slot), by tile, front to back
+        instances: wp.array[int],  # [M] splats, by tile, front to back
         splats: wp.array[Splat2D],  # [V]
         alpha_min: float,
         t_min: float,
@@ -113,7 +113,7 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
             ahead = (k - span[0]) & (AHEAD - 1)
             if ahead == 0:
                 for j in range(wp.min(AHEAD, end - k)):  # alone, many reads are under way at a time
-                    near[j] = splats[instances[k + j][0]]
+                    near[j] = splats[instances[k + j]]
                 for j in range(wp.min(AHEAD, end - k)):
                     boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
             splat = near[ahead]
@@ -174,6 +174,8 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
 def make_upstream(depth: bool) -> wp.Kernel:
     """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
     CHANNELS = 4 if depth else 3
+    vec_grads = wp.types.vector(length=CHANNELS + 6, dtype=float)
+    mat_background = wp.types.matrix(shape=(3, LANES), dtype=float)
     mat_up = wp.types.matrix(shape=(CHANNELS + 1, LANES), dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
@@ -181,7 +183,6 @@ def make_upstream(depth: bool) -> wp.Kernel:
         first: int,
         tiles_x: int,
         ranges: wp.array[wp.vec2i],  # [T]
-        instances: wp.array[wp.vec2i],  # [M]
         background: wp.array[float],  # [3]
         final: wp.array2d[vec16],  # [T, BLOCKS]
         count: wp.array2d[vec16],  # [T, BLOCKS]
@@ -194,14 +195,14 @@ def make_upstream(depth: bool) -> wp.Kernel:
         adj_background_out: wp.array2d[float],  # [T, 3]
         dropped_out: wp.array[int],  # [T] pixels whose upstream gradient is not finite
         steps_out: wp.array[int],  # [T] instances that the adjoint walks
-        slots_out: wp.array2d[float],  # [M, GRADS] zeros for those that it does not
+        slots_out: wp.array[vec_grads],  # [M] zeros for those that it does not
     ):
         tile = first + wp.tid()
         column = (tile % tiles_x) * TILE
         line = (tile // tiles_x) * TILE
         zero = vec16(0.0)
-        adj_background = wp.vec3(0.0)
-        dropped = float(0.0)
+        adj_background = mat_background()
+        dropped = zero
         height = adj_image.shape[0]
         width = adj_image.shape[1]
         block = int(0)
@@ -222,14 +223,14 @@ def make_upstream(depth: bool) -> wp.Kernel:
             finite = inside
             for row in range(CHANNELS + 1):
                 finite = where_less(wp.abs(u[row]), vec16(wp.inf), finite, zero)  # not where it is NaN, either
-            dropped += total(inside - finite)
+            dropped = dropped + inside - finite
             adj_t = -where_less(zero, finite, u[CHANNELS], zero)
             for channel in range(CHANNELS):
                 known = where_less(zero, finite, u[channel], zero)
                 up_out[tile, block * CHANNELS + channel] = known
                 if channel < 3:
                     adj_t = adj_t + known * background[channel]
-                    adj_background[channel] += total(times(known, final[tile, block]))
+                    adj_background[channel] = adj_background[channel] + times(known, final[tile, block])
             adj_final_out[tile, block] = adj_t
             block += 1
         stopped = vec16(0.0)
@@ -237,11 +238,10 @@ def make_upstream(depth: bool) -> wp.Kernel:
             stopped = wp.max(stopped, count[tile, block])
         longest = wp.max(stopped)
         for channel in range(3):
-            adj_background_out[tile, channel] = adj_background[channel]
-        dropped_out[tile] = int(dropped)
+            adj_background_out[tile, channel] = total(adj_background[channel])
+        dropped_out[tile] = int(total(dropped))
         steps_out[tile] = int(longest)
         for k in range(ranges[tile][0] + int(longest), ranges[tile][1]):
-            for grad in range(slots_out.shape[1]):
-                slots_out[instances[k][1], grad] = 0.0
+            slots_out[k] = vec_grads(0.0)
 
     return upstream

@@ -18,6 +18,10 @@ e11 = blur((x - p)^2), e12 = blur((x - p) (y - q)) and s = blur(1) (below 1 near
     dSSIM/dm1 = 2 (mu2 B - (mu2 - q) A) / (C D) - 2 SSIM (mu1 / C - (mu1 - p) / D)
     dSSIM/de11 = -SSIM / D,   dSSIM/de12 = 2 A / (C D)
     dL/dx = blur(dL/dm1) + 2 (x - p) blur(dL/de11) + (y - q) blur(dL/de12)
+
+A launch index is a band of rows: what has been blurred along rows waits in a ring of the band, in the cache, to be
+blurred along columns. (Tried: whole planes in memory, half as long again, and on two threads as slow as on one. One
+group of lanes through all steps before the next: no faster. Four rows at once instead of two: no faster.)
 """
 
 import math
@@ -37,8 +41,16 @@ C2 = wp.constant(0.03**2)
 vec16b = wp.types.vector(length=LANES, dtype=wp.uint8)
 IOTA = wp.constant(vec16(*[float(lane) for lane in range(LANES)]))
 
+ROWS = 2  # blurred along columns at once: all but two of the rows that their windows cover are the same
+RING = 16  # rows kept, a power of two that holds those windows
+MOMENTS, SLOPES = 5, 3  # planes: x, y, x x, y y, x y; dSSIM / dm1, de11, de12
+
 _bell = [math.exp(-((tap - RADIUS) ** 2) / (2.0 * 1.5**2)) for tap in range(WINDOW)]
-WEIGHTS = wp.constant(wp.types.vector(length=WINDOW, dtype=float)(*[value / sum(_bell) for value in _bell]))
+_weights = [value / sum(_bell) for value in _bell]
+WEIGHTS = wp.constant(wp.types.vector(length=WINDOW, dtype=float)(*_weights))
+#: The same between zeros: of rows that only the next row's window covers, or only the last row's.
+WEIGHTS_OF_ROWS = wp.constant(vec16(*[0.0] * (ROWS - 1), *_weights, *[0.0] * (LANES - WINDOW - ROWS + 1)))
+NOT_NEGATIVE = wp.constant(0x7FFFFFFF)  # of an index, which is wrapped if the compiler must fear that it may be
 
 
 @wp.func
@@ -75,6 +87,21 @@ def neighbours(rows: wp.array2d[wp.uint8], taps: wp.array2d[vec16b], row: int, s
 
 
 @wp.func
+def photograph(
+    target: wp.array2d[float],
+    target_taps: wp.array2d[vec16],
+    levels: wp.array2d[wp.uint8],
+    level_taps: wp.array2d[vec16b],
+    row: int,
+    start: int,
+):
+    """:func:`neighbours` of the one of the two that has rows."""
+    if levels.shape[0] > 0:
+        return neighbours(levels, level_taps, row, start)
+    return neighbours(target, target_taps, row, start)
+
+
+@wp.func
 def between(values: vec16, limits: wp.vec2):
     """``values`` no less than ``limits[0]``, no more than ``limits[1]``; NaN stays."""
     low = vec16(limits[0])
@@ -83,73 +110,31 @@ def between(values: vec16, limits: wp.vec2):
 
 
 @wp.func
-def column_weights(row: int, height: int):
-    """The window's weights for a column through ``row``, 0 for those outside the image."""
-    weights = WEIGHTS
-    for tap in range(WINDOW):
-        if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
-            weights[tap] = 0.0
-    return weights
+def part(rows: wp.uint64, groups: int, number: int):
+    """The row of lanes ``number`` of those from an address on: an array whose strides the compiler knows."""
+    return wp.array(ptr=rows + wp.uint64(4 * LANES * groups) * wp.uint64(number), shape=(groups,), dtype=vec16)
 
 
-@wp.kernel
-def pad(
-    first: int,  # row of this slice
-    image: wp.array2d[float],  # [H, L]
-    taps: wp.array2d[vec16],  # [H, L - 15] the same: element p holds floats p .. p + 15 of a row
-    center: float,
-    limits: wp.vec2,
-    # out
-    padded_out: wp.array2d[vec16],  # [H, G + 2] the image within the limits, minus the center, between groups of zeros
-):
-    row = first + wp.tid()
-    groups = padded_out.shape[1] - 2
-    padded_out[row, 0] = vec16(0.0)
-    padded_out[row, groups + 1] = vec16(0.0)
-    for group in range(groups):
-        start = LANES * group
-        values = between(neighbours(image, taps, row, start), limits) - vec16(center)
-        padded_out[row, group + 1] = inside(values, start, image.shape[1])
+@wp.func
+def seen_by(tap: int, padded: wp.array[vec16]):
+    """A padded row as one of the window's taps sees it: element g is what lies that far from group g."""
+    address = padded.ptr + wp.uint64(4 * (LANES + CHANNELS * (tap - RADIUS)))
+    return wp.array(ptr=address, shape=(padded.shape[0],), dtype=vec16)
 
 
-@wp.kernel
-def pad_bytes(
-    first: int,
-    image: wp.array2d[wp.uint8],  # [H, L], to be divided by 255
-    taps: wp.array2d[vec16b],
-    center: float,
-    # out
-    padded_out: wp.array2d[vec16],  # [H, G + 2]
-):
-    row = first + wp.tid()
-    groups = padded_out.shape[1] - 2
-    padded_out[row, 0] = vec16(0.0)
-    padded_out[row, groups + 1] = vec16(0.0)
-    for group in range(groups):
-        start = LANES * group
-        values = neighbours(image, taps, row, start) - vec16(center)
-        padded_out[row, group + 1] = inside(values, start, image.shape[1])
-
-
-@wp.kernel
-def blur_rows(
-    first: int,  # row of this slice
-    x: wp.array2d[vec16],  # [H, P - 15] element p holds floats p .. p + 15 of a padded row
-    y: wp.array2d[vec16],
-    # out
-    moments_out: wp.array3d[vec16],  # [H, 5, G] x, y, x x, y y, x y, blurred along rows
-):
-    row = first + wp.tid()
-    for group in range(moments_out.shape[2]):
+@wp.func
+def blur_moments(x: wp.array[vec16], y: wp.array[vec16], moments_out: wp.array2d[vec16]):
+    """The moments [G, MOMENTS] of two padded rows [G + 2], blurred along them."""
+    for group in range(moments_out.shape[0]):
+        place = group & NOT_NEGATIVE
         mx = vec16(0.0)
         my = vec16(0.0)
         xx = vec16(0.0)
         yy = vec16(0.0)
         xy = vec16(0.0)
         for tap in range(WINDOW):
-            place = LANES * (group + 1) + CHANNELS * (tap - RADIUS)
-            a = x[row, place]
-            b = y[row, place]
+            a = seen_by(tap, x)[place]
+            b = seen_by(tap, y)[place]
             wa = a * WEIGHTS[tap]
             wb = b * WEIGHTS[tap]
             mx = mx + wa
@@ -157,146 +142,204 @@ def blur_rows(
             xx = xx + times(wa, a)
             yy = yy + times(wb, b)
             xy = xy + times(wa, b)
-        moments_out[row, 0, group] = mx
-        moments_out[row, 1, group] = my
-        moments_out[row, 2, group] = xx
-        moments_out[row, 3, group] = yy
-        moments_out[row, 4, group] = xy
+        moments_out[group, 0] = mx
+        moments_out[group, 1] = my
+        moments_out[group, 2] = xx
+        moments_out[group, 3] = yy
+        moments_out[group, 4] = xy
+
+
+@wp.func
+def blur_slopes(dmu: wp.array[vec16], dxx: wp.array[vec16], dxy: wp.array[vec16], slopes_out: wp.array2d[vec16]):
+    """Padded rows [G + 2] of the slopes, blurred along them, [G, SLOPES]."""
+    for group in range(slopes_out.shape[0]):
+        place = group & NOT_NEGATIVE
+        mu = vec16(0.0)
+        xx = vec16(0.0)
+        xy = vec16(0.0)
+        for tap in range(WINDOW):
+            mu = mu + seen_by(tap, dmu)[place] * WEIGHTS[tap]
+            xx = xx + seen_by(tap, dxx)[place] * WEIGHTS[tap]
+            xy = xy + seen_by(tap, dxy)[place] * WEIGHTS[tap]
+        slopes_out[group, 0] = mu
+        slopes_out[group, 1] = xx
+        slopes_out[group, 2] = xy
+
+
+def make_blur_columns(planes: int):
+    """A function that blurs ``planes`` planes along columns, for ROWS rows at once."""
+    mat_sums = wp.types.matrix(shape=(ROWS * planes, LANES), dtype=float)
+
+    @wp.func
+    def blur_columns(ring: wp.array3d[vec16], row: int, ahead: int, blurred_out: wp.array3d[vec16]):
+        """From the ring [RING, G, planes], with rows before ``ahead``, to those from ``row`` on [ROWS, G, planes]."""
+        for group in range(ring.shape[1]):
+            sums = mat_sums()
+            for other in range(wp.max(row - RADIUS, 0), ahead):
+                for plane in range(planes):
+                    value = ring[other & (RING - 1), group, plane]
+                    for which in range(ROWS):
+                        weight = WEIGHTS_OF_ROWS[(other - row + RADIUS + ROWS - 1 - which) & (LANES - 1)]
+                        sums[which * planes + plane] = sums[which * planes + plane] + value * weight
+            for which in range(ROWS):
+                for plane in range(planes):
+                    blurred_out[which, group, plane] = sums[which * planes + plane]
+
+    return blur_columns
+
+
+blur_moments_along_columns = make_blur_columns(MOMENTS)
+blur_slopes_along_columns = make_blur_columns(SLOPES)
 
 
 @wp.kernel
 def compare(
-    first: int,
-    x: wp.array2d[vec16],  # [H, P - 15]
-    y: wp.array2d[vec16],
-    moments: wp.array3d[vec16],  # [H, 5, G]
-    missing: wp.array[vec16],  # [G] share of the window beyond the ends of a row
+    first: int,  # band of this slice
+    bounds: wp.array[int],  # [B + 1] rows where bands begin
+    image: wp.array2d[float],  # [H, L]
+    image_taps: wp.array2d[vec16],  # [H, L - 15] the same: element p holds floats p .. p + 15 of a row
+    limits: wp.vec2,
+    target: wp.array2d[float],  # [H, L], or nothing
+    target_taps: wp.array2d[vec16],
+    levels: wp.array2d[wp.uint8],  # [H, L], to be divided by 255, or nothing
+    level_taps: wp.array2d[vec16b],
     centers: wp.vec2,  # p, q
-    length: int,  # floats in a row of the image
+    missing: wp.array[vec16],  # [G] share of the window beyond the ends of a row
     # out
+    padded_out: wp.array3d[vec16],  # [B, 2, G + 2] a row of the image within the limits minus p, and of the target
+    ring_out: wp.array4d[vec16],  # [B, RING, G, MOMENTS] blurred along rows
+    blurred_out: wp.array4d[vec16],  # [B, ROWS, G, MOMENTS] along columns, too
     sums_out: wp.array2d[float],  # [H, 2] sum of |x - y| and of SSIM over the row
-    slopes_out: wp.array3d[vec16],  # [H, 3, G] dSSIM / dm1, de11, de12; 0 outside the image
+    slopes_out: wp.array3d[vec16],  # [H, SLOPES, G + 2] 0 outside the image
 ):
-    row = first + wp.tid()
-    height = moments.shape[0]
-    difference = vec16(0.0)
-    similarity = vec16(0.0)
-    one = vec16(1.0)
+    band = first + wp.tid()
+    height = image.shape[0]
+    length = image.shape[1]
+    groups = missing.shape[0]
     p = centers[0]
     q = centers[1]
-    weights = column_weights(row, height)
-    above = float(0.0)  # share of the window above or below the image
-    for tap in range(WINDOW):
-        above += WEIGHTS[tap] - weights[tap]
-    for group in range(moments.shape[2]):
-        mx = vec16(0.0)
-        my = vec16(0.0)
-        xx = vec16(0.0)
-        yy = vec16(0.0)
-        xy = vec16(0.0)
-        # unrolled as in adj_blur_columns, five planes are slower: 7.5 ms against 5.2; so is a while loop, 9.6; strips
-        # of 8 groups, whose eleven rows fit in the first cache, change nothing
-        for other in range(wp.max(row - RADIUS, 0), wp.min(row + RADIUS + 1, height)):
-            w = WEIGHTS[other - row + RADIUS]
-            mx = mx + moments[other, 0, group] * w
-            my = my + moments[other, 1, group] * w
-            xx = xx + moments[other, 2, group] * w
-            yy = yy + moments[other, 3, group] * w
-            xy = xy + moments[other, 4, group] * w
-        outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
-        inner = one - outside
-        mu_x = mx + inner * p
-        mu_y = my + inner * q
-        covariance = xy - times(mx, my) + times(outside, my * p + mx * q + inner * (p * q))
-        variances = xx + yy - times(mx, mx) - times(my, my)
-        variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
-        a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
-        b = covariance * 2.0 + fill(C2, mu_x)
-        c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
-        d = over(one, wp.max(variances, vec16(0.0)) + fill(C2, mu_x))  # rounding must not make it negative
-        scale = times(c, d)
-        ssim = times(times(a, b), scale)
-        start = LANES * group
-        similarity = similarity + inside(ssim, start, length)
-        delta = x[row, start + LANES] - y[row, start + LANES] + inside(vec16(p - q), start, length)
-        difference = difference + wp.max(delta, -delta)
-        far_x = mu_x - vec16(p)
-        far_y = mu_y - vec16(q)
-        slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
-        slopes_out[row, 0, group] = inside(slope * 2.0, start, length)
-        slopes_out[row, 1, group] = inside(-times(ssim, d), start, length)
-        slopes_out[row, 2, group] = inside(times(a, scale) * 2.0, start, length)
-    sums_out[row, 0] = total(difference)
-    sums_out[row, 1] = total(similarity)
-
-
-@wp.kernel
-def adj_blur_columns(
-    first: int,
-    slopes: wp.array3d[vec16],  # [H, 3, G]
-    # out
-    slopes_out: wp.array3d[vec16],  # [H, 3, G + 2] blurred along columns, a group of zeros at either end
-):
-    row = first + wp.tid()
-    height = slopes.shape[0]
-    groups = slopes.shape[2]
-    for which in range(3):
-        slopes_out[row, which, 0] = vec16(0.0)
-        slopes_out[row, which, groups + 1] = vec16(0.0)
-    weights = column_weights(row, height)
-    for group in range(groups):
-        dmu = vec16(0.0)
-        dxx = vec16(0.0)
-        dxy = vec16(0.0)
-        for tap in range(WINDOW):
-            w = weights[tap]
-            other = wp.clamp(row + tap - RADIUS, 0, height - 1)
-            dmu = dmu + slopes[other, 0, group] * w
-            dxx = dxx + slopes[other, 1, group] * w
-            dxy = dxy + slopes[other, 2, group] * w
-        slopes_out[row, 0, group + 1] = dmu
-        slopes_out[row, 1, group + 1] = dxx
-        slopes_out[row, 2, group + 1] = dxy
+    one = vec16(1.0)
+    zero = vec16(0.0)
+    x = part(padded_out.ptr, groups + 2, 2 * band)
+    y = part(padded_out.ptr, groups + 2, 2 * band + 1)
+    for side in range(2):
+        x[side * (groups + 1)] = zero
+        y[side * (groups + 1)] = zero
+    ring = ring_out[band]
+    blurred = blurred_out[band]
+    row = bounds[band]
+    ahead = wp.max(row - RADIUS, 0)
+    while row < bounds[band + 1]:
+        while ahead < wp.min(row + ROWS + RADIUS, height):
+            difference = zero
+            for group in range(groups):
+                start = LANES * group
+                a = between(neighbours(image, image_taps, ahead, start), limits) - vec16(p)
+                b = photograph(target, target_taps, levels, level_taps, ahead, start) - vec16(q)
+                x[group + 1] = inside(a, start, length)
+                y[group + 1] = inside(b, start, length)
+                delta = inside(a - b + vec16(p - q), start, length)
+                difference = difference + wp.max(delta, -delta)
+            if ahead >= bounds[band] and ahead < bounds[band + 1]:
+                sums_out[ahead, 0] = total(difference)
+            blur_moments(x, y, ring[ahead & (RING - 1)])
+            ahead += 1
+        blur_moments_along_columns(ring, row, ahead, blurred)
+        which = int(0)
+        while which < ROWS and row < bounds[band + 1]:
+            above = float(0.0)  # share of the window above or below the image
+            for tap in range(WINDOW):
+                if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
+                    above += WEIGHTS[tap]
+            for plane in range(SLOPES):
+                slopes_out[row, plane, 0] = zero
+                slopes_out[row, plane, groups + 1] = zero
+            similarity = zero
+            for group in range(groups):
+                mx = blurred[which, group, 0]
+                my = blurred[which, group, 1]
+                squares = blurred[which, group, 2] + blurred[which, group, 3]
+                outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
+                inner = one - outside
+                mu_x = mx + inner * p
+                mu_y = my + inner * q
+                covariance = blurred[which, group, 4] - times(mx, my)
+                covariance = covariance + times(outside, my * p + mx * q + inner * (p * q))
+                variances = squares - times(mx, mx) - times(my, my)
+                variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
+                a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
+                b = covariance * 2.0 + fill(C2, mu_x)
+                c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
+                d = over(one, wp.max(variances, zero) + fill(C2, mu_x))  # rounding must not make it negative
+                scale = times(c, d)
+                ssim = times(times(a, b), scale)
+                far_x = mu_x - vec16(p)
+                far_y = mu_y - vec16(q)
+                slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
+                start = LANES * group
+                similarity = similarity + inside(ssim, start, length)
+                slopes_out[row, 0, group + 1] = inside(slope * 2.0, start, length)
+                slopes_out[row, 1, group + 1] = inside(-times(ssim, d), start, length)
+                slopes_out[row, 2, group + 1] = inside(times(a, scale) * 2.0, start, length)
+            sums_out[row, 1] = total(similarity)
+            which += 1
+            row += 1
 
 
 @wp.kernel
 def adj_compare(
     first: int,
-    image: wp.array2d[float],  # [H, L] as given to pad
-    taps: wp.array2d[vec16],
+    bounds: wp.array[int],  # [B + 1]
+    image: wp.array2d[float],  # [H, L]
+    image_taps: wp.array2d[vec16],
     limits: wp.vec2,
-    x: wp.array2d[vec16],  # [H, P - 15]
-    y: wp.array2d[vec16],
-    slopes: wp.array3d[vec16],  # [H, 3, P - 15] blurred along columns
-    gap: float,  # p - q
+    target: wp.array2d[float],
+    target_taps: wp.array2d[vec16],
+    levels: wp.array2d[wp.uint8],
+    level_taps: wp.array2d[vec16b],
+    centers: wp.vec2,
+    slopes: wp.array3d[vec16],  # [H, SLOPES, G + 2]
     adj_l1: float,  # dL / d(sum of |x - y|)
     adj_ssim: float,  # dL / d(sum of SSIM)
     # out
+    ring_out: wp.array4d[vec16],  # [B, RING, G, SLOPES]
+    blurred_out: wp.array4d[vec16],  # [B, ROWS, G, SLOPES]
     adj_image_out: wp.array2d[float],  # [H, L]
     adj_taps_out: wp.array2d[vec16],
 ):
-    row = first + wp.tid()
+    band = first + wp.tid()
+    height = image.shape[0]
     length = image.shape[1]
-    for group in range((length + LANES - 1) // LANES):
-        dmu = vec16(0.0)
-        dxx = vec16(0.0)
-        dxy = vec16(0.0)
-        for tap in range(WINDOW):
-            place = LANES * (group + 1) + CHANNELS * (tap - RADIUS)
-            dmu = dmu + slopes[row, 0, place] * WEIGHTS[tap]
-            dxx = dxx + slopes[row, 1, place] * WEIGHTS[tap]
-            dxy = dxy + slopes[row, 2, place] * WEIGHTS[tap]
-        a = x[row, LANES * (group + 1)]
-        b = y[row, LANES * (group + 1)]
-        zero = vec16(0.0)
-        delta = a - b + vec16(gap)
-        sign = where_less(zero, delta, vec16(1.0), where_less(delta, zero, vec16(-1.0), zero))
-        adj = sign * adj_l1 + (dmu + times(a, dxx) * 2.0 + times(b, dxy)) * adj_ssim
-        start = LANES * group
-        given = neighbours(image, taps, row, start)
-        adj = where_less(vec16(limits[0]), given, where_less(given, vec16(limits[1]), adj, zero), zero)
-        if start + LANES <= length:
-            adj_taps_out[row, start] = adj
-        else:
-            for lane in range(length - start):
-                adj_image_out[row, start + lane] = adj[lane]
+    groups = slopes.shape[2] - 2
+    zero = vec16(0.0)
+    ring = ring_out[band]
+    blurred = blurred_out[band]
+    row = bounds[band]
+    ahead = wp.max(row - RADIUS, 0)
+    while row < bounds[band + 1]:
+        while ahead < wp.min(row + ROWS + RADIUS, height):
+            dmu = part(slopes.ptr, groups + 2, SLOPES * ahead)
+            dxx = part(slopes.ptr, groups + 2, SLOPES * ahead + 1)
+            dxy = part(slopes.ptr, groups + 2, SLOPES * ahead + 2)
+            blur_slopes(dmu, dxx, dxy, ring[ahead & (RING - 1)])
+            ahead += 1
+        blur_slopes_along_columns(ring, row, ahead, blurred)
+        which = int(0)
+        while which < ROWS and row < bounds[band + 1]:
+            for group in range(groups):
+                start = LANES * group
+                given = neighbours(image, image_taps, row, start)
+                a = between(given, limits) - vec16(centers[0])
+                b = photograph(target, target_taps, levels, level_taps, row, start) - vec16(centers[1])
+                delta = a - b + vec16(centers[0] - centers[1])
+                sign = where_less(zero, delta, vec16(1.0), where_less(delta, zero, vec16(-1.0), zero))
+                adj = blurred[which, group, 0] + times(a, blurred[which, group, 1]) * 2.0
+                adj = sign * adj_l1 + (adj + times(b, blurred[which, group, 2])) * adj_ssim
+                adj = where_less(vec16(limits[0]), given, where_less(given, vec16(limits[1]), adj, zero), zero)
+                if start + LANES <= length:
+                    adj_taps_out[row, start] = adj
+                else:
+                    for lane in range(length - start):
+                        adj_image_out[row, start + lane] = adj[lane]
+            which += 1
+            row += 1

@@ -112,7 +112,7 @@ def make_walk_block(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel
     def walk(
         tiles_x: int,
         ranges: wp.array[wp.vec2i],
-        instances: wp.array[wp.vec2i],
+        instances: wp.array[int],
         splats: wp.array[Splat2D],
         alpha_min: float,
         final: wp.array2d[float],
@@ -132,7 +132,7 @@ def make_walk_block(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel
         t = begin(final[tile, thread])
         color = wp.vec4(0.0)
         for k in range(start, start + steps[tile]):
-            g = read(splats[instances[k][0]], slots, instances[k][1], thread)
+            g = read(splats[instances[k]], slots, k, thread)
             z = exponent(g[0] - x, g[1] - y, g[2], g[3], g[4])
             raw = exp2_known(z, exp2_value(z)) * g[5]
             alpha = opaque(raw, alpha_min, float(k - start), walked)

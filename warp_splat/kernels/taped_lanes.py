@@ -113,7 +113,6 @@ def adj_collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slo
 @wp.kernel(enable_backward=False)
 def rows_of_copies(
     first: int,
-    instances: wp.array[wp.vec2i],  # [M] (splat, slot)
     copies: wp.array[Splat2D],  # [M] a Gaussian per tile instance
     adj_copies: wp.array[Splat2D],  # [M]
     # out
@@ -123,15 +122,14 @@ def rows_of_copies(
     k = first + wp.tid()
     adj = adj_copies[k]
     conic = conic_from_root(adj.root, copies[k].root)
-    slot = instances[k][1]
-    slots_out[slot, 0] = adj.mean[0]
-    slots_out[slot, 1] = adj.mean[1]
+    slots_out[k, 0] = adj.mean[0]
+    slots_out[k, 1] = adj.mean[1]
     for i in range(3):
-        slots_out[slot, 2 + i] = conic[i]
-        slots_out[slot, 6 + i] = adj.color[i]
-    slots_out[slot, 5] = adj.opacity
+        slots_out[k, 2 + i] = conic[i]
+        slots_out[k, 6 + i] = adj.color[i]
+    slots_out[k, 5] = adj.opacity
     if slots_out.shape[1] > 9:
-        slots_out[slot, 9] = adj.depth
+        slots_out[k, 9] = adj.depth
 
 
 @functools.cache
@@ -156,7 +154,7 @@ def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
         first: int,
         tiles_x: int,
         ranges: wp.array[wp.vec2i],
-        instances: wp.array[wp.vec2i],
+        instances: wp.array[int],
         splats: wp.array[Splat2D],  # [V]; a copy per instance for ``generated``, [M]
         alpha_min: float,
         final: wp.array2d[vec16],
@@ -184,8 +182,8 @@ def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
             if wp.static(mode == "generated"):
                 splat = splats[k]
             else:
-                splat = splats[instances[k][0]]
-                collect(m, splat.root, slots, instances[k][1])
+                splat = splats[instances[k]]
+                collect(m, splat.root, slots, k)
             box = reach(splat.mean, splat.extent, x0, y0)
             here = vec16(float(k - start))
             for by in range(box[2], box[3] + 1):

@@ -3,10 +3,14 @@
 Splats are the Gaussians that are drawn, on the CPU in the order in which they are stored: most is then read and
 written from one end to the other, and what lies near each other in space does so in the caches. A splat's tiles are
 found once, in floating point, as one span per row of tiles; all that follows is integer work, so that no two kernels
-can round differently. Slots, where the adjoint writes, number the instances splat by splat. Exact lists without a sort
-of tile instances: spans are written by depth, so a counting sort by tile that keeps their order does it (Tried: radix
-sort of the tile numbers, 11 ms for 1.14M instances). Random reads are left to numpy, whose short loops have many of
-them under way at a time (Tried: in these kernels, up to 10 ms each instead of 2 to 5 for 125,000).
+can round differently. Exact lists without a sort of tile instances: spans are written by depth, so a counting sort by
+tile that keeps their order does it (Tried: radix sort of the tile numbers, 11 ms for 1.14M instances). Random reads
+are left to numpy, whose short loops have many of them under way at a time (Tried: in these kernels, up to 10 ms each
+instead of 2 to 5 for 125,000).
+
+The adjoint writes a row of gradients for each instance, in the order of the lists, and places tell each splat where its
+rows are. (Tried: rows in the order of the splats. Writing here and there waits for memory, where reading here and there
+has many reads under way: full size 20 ms longer on one thread. A row to a line of the cache: no faster.)
 
 A GPU stores splats by depth and sorts the instances. There one kernel runs twice, first to count a splat's tiles and
 then to write them: it is the same machine code, and rounds alike.
@@ -168,17 +172,17 @@ def list_tiles(
     height: int,
     tiles_x: int,
     square: int,
-    slot_ends: wp.array[wp.int64],  # [N] inclusive scan of what the first run counted; [0] in that run
+    place_ends: wp.array[wp.int64],  # [N] inclusive scan of what the first run counted; [0] in that run
     # out
     instances_out: wp.array[wp.int64],  # [N] tiles in all, in the first run
-    tiles_out: wp.array[int],  # [M] by slot, in the second run
+    tiles_out: wp.array[int],  # [M] by rank, in the second run
     ranks_out: wp.array[int],  # [M]
 ):
     rank = first + wp.tid()
-    writes = slot_ends.shape[0] > 0
+    writes = place_ends.shape[0] > 0
     begin = int(0)
     if writes:
-        begin = begin_of(slot_ends, rank)
+        begin = begin_of(place_ends, rank)
     found = int(0)
     if radii[order[rank]] > 0:
         splat = splats[rank]
@@ -214,25 +218,27 @@ def scatter(
     first: int,
     bounds: wp.array[int],  # [B + 1] of the bands in `order`
     order: wp.array[int],  # [V] splat, nearest first
-    slots: wp.array[int],  # [V] first one of each, in that order
+    begins: wp.array[int],  # [V] where the places of each begin, in that order
     row_ends: wp.array[wp.int64],  # [V] likewise
     spans: wp.array[wp.vec2i],  # [R]
     # out
     cursor_out: wp.array2d[int],  # [B, T] where a band's next instance of a tile goes
-    instances_out: wp.array[wp.vec2i],  # [M] (splat, slot), by tile, nearest first
+    instances_out: wp.array[int],  # [M] splats, by tile, nearest first
+    places_out: wp.array[int],  # [M] where in those lists, splat by splat
 ):
     band = first + wp.tid()
     row = begin_of(row_ends, bounds[band])
     for rank in range(bounds[band], bounds[band + 1]):
-        slot = slots[rank]
+        number = begins[rank]
         end = int(row_ends[rank])
         while row < end:
             span = spans[row]
             for tile in range(span[0], span[0] + span[1]):
                 place = cursor_out[band, tile]
-                instances_out[place] = wp.vec2i(order[rank], slot)
+                instances_out[place] = order[rank]
+                places_out[number] = place
                 cursor_out[band, tile] = place + 1
-                slot += 1
+                number += 1
             row += 1
 
 
@@ -240,7 +246,8 @@ def scatter(
 def gather(
     first: int,
     gaussians: wp.array[int],  # [V]
-    slot_ends: wp.array[wp.int64],  # [V]
+    place_ends: wp.array[wp.int64],  # [V]
+    places: wp.array[int],  # [M]
     slots: wp.array2d[float],  # [M, 9 or 10]
     # out: gradients, zero where culled; those that nobody asked for have no rows
     means2d_out: wp.array[wp.vec2],  # [N]
@@ -249,7 +256,7 @@ def gather(
     colors_out: wp.array[wp.vec3],  # [N]
     depths_out: wp.array[float],  # [N]
 ):
-    """Sum each Gaussian's slots, in order: no atomics, the same bits for any number of threads."""
+    """Sum each Gaussian's slots, always in the same order: no atomics, the same bits for any number of threads."""
     v = first + wp.tid()
     i = gaussians[v]
     mean = wp.vec2(0.0)
@@ -257,7 +264,8 @@ def gather(
     opacity = float(0.0)
     color = wp.vec3(0.0)
     depth = float(0.0)
-    for slot in range(begin_of(slot_ends, v), int(slot_ends[v])):
+    for number in range(begin_of(place_ends, v), int(place_ends[v])):
+        slot = places[number]
         mean += wp.vec2(slots[slot, 0], slots[slot, 1])
         conic += wp.vec3(slots[slot, 2], slots[slot, 3], slots[slot, 4])
         opacity += slots[slot, 5]
