@@ -1,5 +1,6 @@
 """check_gradients: agrees where the gradients are right, names what is wrong, and its differences are the truth's."""
 
+import numpy as np
 import pytest
 import torch
 from scenes import SCENES
@@ -236,6 +237,10 @@ def test_report_text():
         ({"parameters": "means"}, "parameters: expected a list"),
         ({"adjoint": "automatic"}, "adjoint: expected one of manual, .*plain, got 'automatic'"),
         ({"directions": 0}, "directions: expected a whole number, at least 1, got 0"),
+        ({"adjoint": np.zeros(2)}, "adjoint: expected one of manual"),
+        ({"seed": "a"}, r"seed: expected a whole number from 0 to below 2\^63, got 'a'"),
+        ({"seed": -1}, "seed: expected"),
+        ({"seed": 2**63}, "seed: expected"),
         ({"tolerance": 0.0}, "tolerance: expected a number between 0 and 1, got 0.0"),
         ({"options": RasterOptions(projection="flat")}, "options.projection: expected one of"),
     ],

@@ -11,6 +11,7 @@ import time
 import weakref
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -134,7 +135,16 @@ def test_an_interrupted_launch_waits_for_its_helpers():
     assert len(ended) == 1
 
 
-@pytest.mark.parametrize("count", [0, "a", 1.5])
+@pytest.mark.parametrize("count", [0, "a", 1.5, True, np.ones(2)], ids=repr)
 def test_threads_must_be_a_positive_number(count):
     with pytest.raises(warp_splat.InputError, match="threads"):
         warp_splat.set_threads(count)
+
+
+def test_threads_may_be_a_whole_number_of_any_kind():
+    threads = warp_splat.get_threads()
+    try:
+        warp_splat.set_threads(np.int64(2))
+        assert warp_splat.get_threads() == 2 and type(warp_splat.get_threads()) is int
+    finally:
+        warp_splat.set_threads(threads)

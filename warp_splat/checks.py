@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+from collections.abc import Collection
 from dataclasses import replace
 
 import torch
@@ -23,17 +24,22 @@ def check_camera(camera: Camera) -> None:
         raise InputError(f"camera: expected at most {most} pixels, got {size}; resize it with .resized().")
 
 
+def is_one_of(value: object, choices: Collection) -> bool:
+    """Whether ``choices`` has it; also for what cannot be compared with them, such as an array."""
+    return (value is None or isinstance(value, (str, numbers.Integral))) and value in choices
+
+
 def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     """The options to use, numbers as Python's. Raises InputError for an unknown adjoint or option."""
-    if adjoint not in ADJOINTS:
+    if not is_one_of(adjoint, ADJOINTS):
         raise InputError(f"adjoint: expected one of {', '.join(ADJOINTS)}, got {adjoint!r}.")
     options = options or RasterOptions()
     if not isinstance(options, RasterOptions):
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
-    if options.sh_degree not in (None, 0, 1, 2, 3):
+    if not is_one_of(options.sh_degree, (None, 0, 1, 2, 3)):
         raise InputError(f"options.sh_degree: expected 0, 1, 2, 3 or None, got {options.sh_degree!r}.")
     for name, choices in (("projection", PROJECTIONS), ("extent", EXTENTS), ("exp_degree", EXP_DEGREES)):
-        if getattr(options, name) not in choices:
+        if not is_one_of(getattr(options, name), choices):
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
     for name in ("depth", "antialiasing"):

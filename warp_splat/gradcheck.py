@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
+from warp_splat.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid, is_one_of
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.differences import INPUTS, INTERMEDIATES, RUNGS, MovableScene, Trial, try_direction, try_directions
 from warp_splat.errors import InputError
@@ -127,7 +127,7 @@ def check_gradients(
     Raises:
         InputError: as for :func:`warp_splat.rasterize`; if a parameter has no such name; if a number is out of range.
     """
-    options = _check(adjoint, options, camera, parameters, directions, tolerance)
+    options = _check(adjoint, options, camera, parameters, directions, tolerance, seed)
     names = INPUTS if parameters is None else tuple(parameters)
     *geometry, sh_dc, sh_rest = check_gaussians(means, quats, scales, opacities, sh)
     values = (*geometry, torch.cat([sh_dc, sh_rest], 1), check_background(background, means.device))
@@ -144,9 +144,9 @@ def check_gradients(
     return GradientReport(adjoint, tolerance, rows, worst)
 
 
-def _check(adjoint, options, camera, parameters, directions, tolerance) -> RasterOptions:
+def _check(adjoint, options, camera, parameters, directions, tolerance, seed) -> RasterOptions:
     """The options to use. Raises InputError for what :func:`check_gradients` itself demands of its arguments."""
-    if adjoint not in MODES:
+    if not is_one_of(adjoint, MODES):
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
     known = INPUTS + INTERMEDIATES
     if parameters is not None and (isinstance(parameters, str) or not all(name in known for name in parameters)):
@@ -155,6 +155,8 @@ def _check(adjoint, options, camera, parameters, directions, tolerance) -> Raste
         raise InputError(f"directions: expected a whole number, at least 1, got {directions!r}.")
     if not (isinstance(tolerance, (int, float)) and 0 < tolerance < 1):
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}.")
+    if not (isinstance(seed, int) and 0 <= seed < 2**63):
+        raise InputError(f"seed: expected a whole number from 0 to below 2^63, got {seed!r}.")
     check_camera(camera)
     return check_options(ADJOINTS[0], options)
 

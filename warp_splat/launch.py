@@ -20,6 +20,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 
 import psutil
 import torch
@@ -131,9 +132,9 @@ def set_threads(count: int) -> None:
         InputError: if ``count`` is not a whole number, or out of that range.
     """
     global _threads
-    if not isinstance(count, int) or not 1 <= count <= MOST_THREADS:
+    if isinstance(count, bool) or not isinstance(count, Integral) or not 1 <= count <= MOST_THREADS:
         raise InputError(f"threads: expected a whole number, 1 to {MOST_THREADS}, got {count!r}.")
-    _threads = count
+    _threads = int(count)
 
 
 def prepare(device: str, threads: int) -> torch.device:
