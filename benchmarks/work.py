@@ -131,11 +131,11 @@ def work_of(counts: Counts) -> dict[str, tuple[float, float]]:
         # (splat 4, place 4) out
         "bin": (n * 4 + drawn * (48 + 48 + 12) + counts.instances * 8, 0),
         # instances and Gaussians in; image, alpha, and for the adjoint final T and count out
-        "blend": (counts.instances * 8 + drawn * 48 + pixels * 24, FORWARD * counts.pairs),
+        "blend": (counts.instances * 4 + drawn * 48 + pixels * 24, FORWARD * counts.pairs),
         # image (float32) and photograph (uint8) in; for the adjoint, these and the gradient of the image
         "loss": (pixels * 15, LOSS * 3 * pixels),
         "adjoint of loss": (pixels * 27, ADJOINT_OF_LOSS * 3 * pixels),
-        # as the blend, with the gradient of the image in, and gradients of the projected Gaussians out
+        # as the blend, with places and the gradient of the image in, and gradients of the projected Gaussians out
         "adjoint of blend": (counts.instances * 8 + drawn * (48 + gradient2d) + pixels * 20, ADJOINT * counts.pairs),
         # radii in; of those drawn, shapes, SH and gradients in; gradients of all out
         "adjoint of project": (n * (4 + 44 + sh) + drawn * (44 + sh + gradient2d), 3 * PROJECT * drawn),

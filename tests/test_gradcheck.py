@@ -240,6 +240,7 @@ def test_report_text():
         ({"adjoint": np.zeros(2)}, "adjoint: expected one of manual"),
         ({"seed": "a"}, r"seed: expected a whole number from 0 to below 2\^63, got 'a'"),
         ({"seed": -1}, "seed: expected"),
+        ({"seed": True}, "seed: expected"),
         ({"seed": 2**63}, "seed: expected"),
         ({"tolerance": 0.0}, "tolerance: expected a number between 0 and 1, got 0.0"),
         ({"options": RasterOptions(projection="flat")}, "options.projection: expected one of"),

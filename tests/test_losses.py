@@ -1,9 +1,11 @@
 """The loss against a float64 torch implementation written from the formula."""
 
+import math
+
 import pytest
 import torch
 
-from warp_splat import InputError, set_threads
+from warp_splat import InputError, losses, set_threads
 from warp_splat.launch import get_threads, profile
 from warp_splat.losses import LossByConvolution, image_loss
 
@@ -125,21 +127,68 @@ def test_smooth_images_match_as_well():
     assert (image.grad - exact.grad).norm() < 1e-3 * exact.grad.norm()
 
 
-def test_the_number_of_threads_changes_no_bit():
-    image = torch.rand(50, 70, 3, generator=torch.Generator().manual_seed(2))
-    target = torch.rand(50, 70, 3, generator=torch.Generator().manual_seed(3))
-    threads, results = get_threads(), []
-    try:
-        for count in (1, 2, 3):
-            set_threads(count)
-            leaf = image.clone().requires_grad_()
-            loss = image_loss(leaf, target)
-            loss.backward()
-            results.append((loss.item(), leaf.grad))
-    finally:
-        set_threads(threads)
-    for loss, grad in results[1:]:
-        assert loss == results[0][0] and torch.equal(grad, results[0][1])
+@pytest.fixture
+def threads():
+    """Sets the number of threads; afterwards it is as before."""
+    before = get_threads()
+    yield set_threads
+    set_threads(before)
+
+
+def by_threads(image, target, threads):
+    """Value and gradient on 1, 2, 3 and 7 threads."""
+    results = []
+    for count in (1, 2, 3, 7):
+        threads(count)
+        leaf = image.clone().requires_grad_()
+        loss = image_loss(leaf, target)
+        loss.backward()
+        results.append(torch.cat([loss.detach().reshape(1), leaf.grad.ravel()]))
+    assert len(losses._bands(len(image))[0]) > 2  # or there was nothing to compare
+    return results
+
+
+@pytest.mark.parametrize("size", [(455, 21), (897, 7), (128, 40)])
+@pytest.mark.parametrize("kind", ["floats", "bytes"])
+def test_bands_of_rows_are_right_and_change_no_bit(kind, size, threads):
+    generator = torch.Generator().manual_seed(2)
+    image, target = torch.rand(2, *size, 3, generator=generator)
+    if kind == "bytes":
+        target = (255 * target).to(torch.uint8)
+    first, *others = by_threads(image, target, threads)
+    assert all(torch.equal(other, first) for other in others)
+    exact = image.double().requires_grad_()
+    expected = oracle(exact, target / 255 if kind == "bytes" else target, 0.2)
+    expected.backward()
+    assert abs(first[0] - expected.item()) < 1e-6
+    assert (first[1:] - exact.grad.ravel()).norm() < 1e-5 * exact.grad.norm()
+
+
+@pytest.mark.parametrize("height", [1, 2, 5, 6, 7, 11, 12, 13, 24])
+def test_bands_of_few_rows(height, threads, monkeypatch):
+    monkeypatch.setattr(losses, "SMALLEST_SLICE", 1)
+    threads(5)
+    test_value_and_gradient((height, 19), 0.2)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e25, 1e30])
+def test_what_is_not_finite_spreads_alike_on_any_number_of_threads(value, threads):
+    image, target = torch.rand(2, 455, 21, 3, generator=torch.Generator().manual_seed(2))
+    for picture in (image, target):
+        for row in (64, 227, 300):
+            spoilt = picture.clone()
+            spoilt[row, 5, 1] = value
+            pair = (spoilt, target) if picture is image else (image, spoilt)
+            first, *others = by_threads(*pair, threads)
+            assert all(torch.equal(other.nan_to_num(7.0), first.nan_to_num(7.0)) for other in others)
+
+
+def test_a_target_may_come_from_inference_mode():
+    with torch.inference_mode():
+        target = torch.rand(20, 30, 3)
+    image = torch.rand(20, 30, 3).requires_grad_()
+    image_loss(image, target).backward()
+    assert image.grad.abs().sum() > 0
 
 
 def test_other_types_are_refused():

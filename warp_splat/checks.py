@@ -26,7 +26,7 @@ def check_camera(camera: Camera) -> None:
 
 def is_one_of(value: object, choices: Collection) -> bool:
     """Whether ``choices`` has it; also for what cannot be compared with them, such as an array."""
-    return (value is None or isinstance(value, (str, numbers.Integral))) and value in choices
+    return (value is None or isinstance(value, (str, numbers.Real))) and value in choices
 
 
 def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:

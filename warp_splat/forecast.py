@@ -42,9 +42,9 @@ STATES = TILE * TILE  # floats of a tile instance more, for --adjoint stored
 PER_PIXEL = sum(
     (
         3 + 1 + 1 + 1,  # image, alpha, transmittance and steps in blocks
-        3 + 3,  # the image clamped, the photograph as floats
         9,  # loss: three slopes of SSIM
-        3 + 3,  # gradients of the image, and of it before it was clamped
+        7,  # rows in its rings, at most: in bands of 64 rows, the smallest
+        3,  # gradient of the image
         3 + 1 + 1,  # upstream gradients of image and transmittance in blocks, of alpha
     )
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import torch
 
@@ -119,7 +120,7 @@ def check_gradients(
         directions: random directions per parameter, at least 1; in each, every Gaussian moves by the same share of its
             natural size, in deeply layered scenes some of them.
         tolerance: error, relative to the root mean square of the differences, that is allowed beyond their uncertainty.
-        seed: of weights and directions.
+        seed: of weights and directions, from 0 to below 2^63.
 
     Returns:
         A :class:`GradientReport`: ``ok``, ``rows``, and a table by ``print``.
@@ -131,7 +132,7 @@ def check_gradients(
     names = INPUTS if parameters is None else tuple(parameters)
     *geometry, sh_dc, sh_rest = check_gaussians(means, quats, scales, opacities, sh)
     values = (*geometry, torch.cat([sh_dc, sh_rest], 1), check_background(background, means.device))
-    scene = MovableScene(dict(zip(INPUTS, values, strict=True)), camera, options, adjoint, seed)
+    scene = MovableScene(dict(zip(INPUTS, values, strict=True)), camera, options, adjoint, int(seed))
     if scene.out.invalid:
         explain_invalid(scene.out.invalid, quats)
     trials = {name: try_directions(scene, name, directions, tolerance) for name in names}
@@ -155,7 +156,7 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
         raise InputError(f"directions: expected a whole number, at least 1, got {directions!r}.")
     if not (isinstance(tolerance, (int, float)) and 0 < tolerance < 1):
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}.")
-    if not (isinstance(seed, int) and 0 <= seed < 2**63):
+    if isinstance(seed, bool) or not (isinstance(seed, Integral) and 0 <= int(seed) < 2**63):
         raise InputError(f"seed: expected a whole number from 0 to below 2^63, got {seed!r}.")
     check_camera(camera)
     return check_options(ADJOINTS[0], options)

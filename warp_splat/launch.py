@@ -10,6 +10,7 @@ All memory is torch's, on either device: what a stage frees, its caching allocat
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import functools
 import itertools
@@ -107,6 +108,15 @@ def _help() -> None:
     """What a helper thread does: job after job."""
     while (job := _jobs.get()) is not None:
         job.help()
+
+
+@atexit.register
+def _end_helpers() -> None:
+    """Before the interpreter ends: a thread that wakes in its last moments aborts the process."""
+    for _ in _helpers:
+        _jobs.put(None)
+    for helper in _helpers:
+        helper.join(1.0)
 
 
 def _forget_helpers() -> None:

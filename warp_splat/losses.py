@@ -17,7 +17,7 @@ from warp_splat.kernels import ssim
 from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.launch import even_slices, launch, stage, view
 
-SMALLEST_SLICE = 64  # rows; a slice begins with the ten that its neighbours blur, too
+SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbours'
 FAR_APART = 10.0  # in units of an image's usual range
 
 
@@ -151,6 +151,8 @@ class ImageLoss(torch.autograd.Function):
         with stage("loss"):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
             groups, centers = -(-length // LANES), _centers(image, target)
+            if target.is_inference():  # which autograd does not keep
+                target = target.clone()
             image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
             bounds, bands = _bands(height)
             padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, ssim.RING, groups, ssim.MOMENTS)
@@ -205,8 +207,12 @@ def _lanes(*shape: int) -> torch.Tensor:
 
 
 def _bands(height: int) -> tuple[torch.Tensor, int]:
-    """Bounds of bands of rows, one for each thread [B + 1], and their number."""
+    """Bounds of bands of rows, one for each thread [B + 1], and their number.
+
+    Rows that are blurred together are the same in any number of bands: what is not finite has an influence on both.
+    """
     bounds = even_slices(height, SMALLEST_SLICE)
+    bounds[1:-1] = [bound - bound % ssim.ROWS for bound in bounds[1:-1]]
     return torch.tensor(bounds, dtype=torch.int32), len(bounds) - 1
 
 

@@ -26,7 +26,7 @@ from warp_splat.kernels.build import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
 
 BLOCKS = TILE * TILE // LANES  # per tile
-AHEAD = 32  # instances whose boxes are found together; then, whether the whole tile has stopped
+AHEAD = 32  # instances that are copied, and their boxes found, together; then, whether the whole tile has stopped
 
 ROWS_AHEAD = AHEAD * wp.types.type_size_in_bytes(Splat2D) // (4 * LANES)  # of lanes, in which that many splats fit
 vec4i = wp.types.vector(length=4, dtype=int)
