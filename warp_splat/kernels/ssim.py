@@ -192,6 +192,59 @@ blur_moments_along_columns = make_blur_columns(MOMENTS)
 blur_slopes_along_columns = make_blur_columns(SLOPES)
 
 
+@wp.func
+def compare_row(
+    moments: wp.array2d[vec16],  # [G, MOMENTS]
+    missing: wp.array[vec16],
+    centers: wp.vec2,
+    row: int,
+    height: int,
+    length: int,
+    # out
+    slopes_out: wp.array2d[vec16],  # [SLOPES, G + 2]
+):
+    """The slopes of a row, and the sum of its SSIM."""
+    p = centers[0]
+    q = centers[1]
+    one = vec16(1.0)
+    zero = vec16(0.0)
+    groups = missing.shape[0]
+    above = float(0.0)  # share of the window above or below the image
+    for tap in range(WINDOW):
+        if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
+            above += WEIGHTS[tap]
+    for plane in range(SLOPES):
+        slopes_out[plane, 0] = zero
+        slopes_out[plane, groups + 1] = zero
+    similarity = zero
+    for group in range(groups):
+        mx = moments[group, 0]
+        my = moments[group, 1]
+        squares = moments[group, 2] + moments[group, 3]
+        outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
+        inner = one - outside
+        mu_x = mx + inner * p
+        mu_y = my + inner * q
+        covariance = moments[group, 4] - times(mx, my) + times(outside, my * p + mx * q + inner * (p * q))
+        variances = squares - times(mx, mx) - times(my, my)
+        variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
+        a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
+        b = covariance * 2.0 + fill(C2, mu_x)
+        c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
+        d = over(one, wp.max(variances, zero) + fill(C2, mu_x))  # rounding must not make it negative
+        scale = times(c, d)
+        ssim = times(times(a, b), scale)
+        far_x = mu_x - vec16(p)
+        far_y = mu_y - vec16(q)
+        slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
+        start = LANES * group
+        similarity = similarity + inside(ssim, start, length)
+        slopes_out[0, group + 1] = inside(slope * 2.0, start, length)
+        slopes_out[1, group + 1] = inside(-times(ssim, d), start, length)
+        slopes_out[2, group + 1] = inside(times(a, scale) * 2.0, start, length)
+    return total(similarity)
+
+
 @wp.kernel
 def compare(
     first: int,  # band of this slice
@@ -218,7 +271,6 @@ def compare(
     groups = missing.shape[0]
     p = centers[0]
     q = centers[1]
-    one = vec16(1.0)
     zero = vec16(0.0)
     x = part(padded_out.ptr, groups + 2, 2 * band)
     y = part(padded_out.ptr, groups + 2, 2 * band + 1)
@@ -247,41 +299,7 @@ def compare(
         blur_moments_along_columns(ring, row, ahead, blurred)
         which = int(0)
         while which < ROWS and row < bounds[band + 1]:
-            above = float(0.0)  # share of the window above or below the image
-            for tap in range(WINDOW):
-                if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
-                    above += WEIGHTS[tap]
-            for plane in range(SLOPES):
-                slopes_out[row, plane, 0] = zero
-                slopes_out[row, plane, groups + 1] = zero
-            similarity = zero
-            for group in range(groups):
-                mx = blurred[which, group, 0]
-                my = blurred[which, group, 1]
-                squares = blurred[which, group, 2] + blurred[which, group, 3]
-                outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
-                inner = one - outside
-                mu_x = mx + inner * p
-                mu_y = my + inner * q
-                covariance = blurred[which, group, 4] - times(mx, my)
-                covariance = covariance + times(outside, my * p + mx * q + inner * (p * q))
-                variances = squares - times(mx, mx) - times(my, my)
-                variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
-                a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
-                b = covariance * 2.0 + fill(C2, mu_x)
-                c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
-                d = over(one, wp.max(variances, zero) + fill(C2, mu_x))  # rounding must not make it negative
-                scale = times(c, d)
-                ssim = times(times(a, b), scale)
-                far_x = mu_x - vec16(p)
-                far_y = mu_y - vec16(q)
-                slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
-                start = LANES * group
-                similarity = similarity + inside(ssim, start, length)
-                slopes_out[row, 0, group + 1] = inside(slope * 2.0, start, length)
-                slopes_out[row, 1, group + 1] = inside(-times(ssim, d), start, length)
-                slopes_out[row, 2, group + 1] = inside(times(a, scale) * 2.0, start, length)
-            sums_out[row, 1] = total(similarity)
+            sums_out[row, 1] = compare_row(blurred[which], missing, centers, row, height, length, slopes_out[row])
             which += 1
             row += 1
 
