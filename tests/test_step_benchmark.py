@@ -70,7 +70,7 @@ def test_floor_is_the_larger_of_its_two_parts():
     # 2 Gaussians of degree 0, one of which is drawn, on 10 pixels: by hand
     counts = work.Counts(gaussians=2, coefficients=1, drawn=1, pixels=10, instances=3, pairs=7, looked_at=32)
     found = work.work_of(counts)
-    assert found["project"] == (2 * 48 + 60, 240) and found["blend"] == (24 + 48 + 240, 7 * 31)
+    assert found["project"] == (2 * 48 + 60, 240) and found["blend"] == (12 + 48 + 240, 7 * 31)
     assert found["Adam"][0] == 2 * 14 * 4 * 7 and found["host"] == (0, 0)
 
 
