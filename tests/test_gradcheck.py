@@ -235,6 +235,10 @@ def test_report_text():
     [
         ({"parameters": ["means", "covariances"]}, r"parameters: expected a list of some of means, .*depths, got"),
         ({"parameters": "means"}, "parameters: expected a list"),
+        ({"parameters": iter(["means"])}, "parameters: expected a list"),
+        ({"parameters": []}, "parameters: expected a list"),
+        ({"parameters": [np.zeros(2)]}, "parameters: expected a list"),
+        ({"parameters": 5}, "parameters: expected a list"),
         ({"adjoint": "automatic"}, "adjoint: expected one of manual, .*plain, got 'automatic'"),
         ({"directions": 0}, "directions: expected a whole number, at least 1, got 0"),
         ({"adjoint": np.zeros(2)}, "adjoint: expected one of manual"),
@@ -256,5 +260,8 @@ def test_bad_scene():
     means, *rest = scene.parameters()
     with pytest.raises(InputError, match="means: expected float32"):
         check_gradients(means.double(), *rest, scene.camera)
-    with pytest.raises(InputError, match="background: expected three"):
-        check_gradients(means, *rest, scene.camera, "white")
+    for background in ("white", (10**400, 0, 0)):
+        with pytest.raises(InputError, match="background: expected three"):
+            check_gradients(means, *rest, scene.camera, background)
+    with pytest.raises(InputError, match="background: expected a dense tensor"):
+        check_gradients(means, *rest, scene.camera, torch.zeros(3).to_sparse())

@@ -86,5 +86,5 @@ class Camera:
 def _number(name: str, value) -> float:
     try:
         return float(value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"Camera {name}: expected a number, got {value!r}.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"Camera {name}: expected a number, got {value!r:.80}.") from error

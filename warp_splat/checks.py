@@ -119,8 +119,10 @@ def check_background(background, device: torch.device) -> torch.Tensor:
     if not isinstance(background, torch.Tensor):
         try:
             background = torch.tensor([float(value) for value in background], device=device)
-        except (TypeError, ValueError):
-            raise InputError(f"background: expected three numbers or a tensor [3], got {background!r}.") from None
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"background: expected three numbers or a tensor [3], got {background!r:.80}.") from None
+    if background.layout != torch.strided:
+        raise InputError("background: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
     if background.device != device:
         raise InputError(f"background: expected a tensor on {device}, as the means, got one on {background.device}.")
     if background.shape != (3,) or background.dtype != torch.float32 or not bool(torch.isfinite(background).all()):

@@ -150,7 +150,9 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
     if not is_one_of(adjoint, MODES):
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
     known = INPUTS + INTERMEDIATES
-    if parameters is not None and (isinstance(parameters, str) or not all(name in known for name in parameters)):
+    if parameters is not None and not (
+        isinstance(parameters, (list, tuple)) and parameters and all(is_one_of(name, known) for name in parameters)
+    ):
         raise InputError(f"parameters: expected a list of some of {', '.join(known)}, got {parameters!r}.")
     if not (isinstance(directions, int) and directions >= 1):
         raise InputError(f"directions: expected a whole number, at least 1, got {directions!r}.")
