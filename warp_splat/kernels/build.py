@@ -16,6 +16,9 @@ FORWARD_ONLY = {
 #: Of those whose sums keep their order: (mean - center) - center_low is nothing but that.
 IN_ORDER = {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": _FLAGS}
 
+#: Of those in lanes: the loss, whose bits then do not depend on how a compiler regroups.
+LANES_IN_ORDER = {**IN_ORDER, "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512"}
+
 #: Of the loops over blocks in lanes: they are short, and vectorized across blocks they take three times as long. The
 #: stack is aligned for lanes that do not fit into registers: what crosses two lines holds up its readers (2 to 4 %).
 IN_LANES = {

@@ -28,10 +28,10 @@ import math
 
 import warp as wp
 
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.build import LANES_IN_ORDER
 from warp_splat.kernels.lanes import LANES, fill, over, times, total, vec16, where_less
 
-wp.set_module_options(FORWARD_ONLY)
+wp.set_module_options(LANES_IN_ORDER)
 
 WINDOW = 11
 RADIUS = WINDOW // 2
