@@ -16,7 +16,7 @@ import numpy as np, torch
 import warp_splat
 from warp_splat.kernels import build
 
-for options in (build.FORWARD_ONLY, build.IN_ORDER, build.IN_LANES, build.DIFFERENTIABLE_LANES):  # read later
+for options in [value for name, value in vars(build).items() if name.isupper() and name[0] != "_"]:  # read later
     options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", sys.argv[1])
 from warp_splat.losses import image_loss
 from scenes import SCENES
