@@ -13,7 +13,9 @@ PATIENCE = 300.0  # seconds; a machine may be busy
 @contextmanager
 def served(*arguments, cwd=Path(__file__).parents[1]):
     """A command with a viewer, once that is up: the process, its address, what it printed so far."""
-    command = [sys.executable, "-m", "warp_splat", *map(str, arguments)]
+    # as a shell's "&" starts it: Ctrl-C is ignored before the announcement, and must not be after it
+    ignoring = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]
+    command = [*ignoring, sys.executable, "-m", "warp_splat", *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     process = subprocess.Popen(command, cwd=cwd, **pipes)
     try:

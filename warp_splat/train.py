@@ -139,6 +139,8 @@ def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
     processes, end = trainer.processes, trainer.config.iterations
     with _watched(trainer, run) as viewer:
         with interruptible() as interrupted:
+            if viewer:  # only now: who has read it may press Ctrl-C
+                viewer.announce()
             try:
                 _loop(trainer, run, interrupted, viewer)
             except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet

@@ -39,6 +39,10 @@ class TrainingViewer:
             self._button = viewer.gui.add_button("Pause")
         self._button.on_click(self._toggle)
 
+    def announce(self) -> None:
+        """Say where it is."""
+        print(self.viewer.announcement, flush=True)
+
     def _toggle(self, _=None) -> None:
         self.paused = not self.paused
         self._button.label = "Continue" if self.paused else "Pause"
@@ -125,5 +129,4 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
         return on_screen(trainer.look(camera, depth), trainer.scene.linear)
 
     with Viewer(draw, lambda: trainer.model.parameters["means"], trainer.scene, trainer.config.port) as viewer:
-        print(viewer.announcement, flush=True)
         yield TrainingViewer(trainer, run, viewer)
