@@ -36,12 +36,12 @@ class Lanes:
         self.scene, self.upstream = scene, upstream
         self.order = wp.array(np.arange(len(splats), dtype=np.int32), dtype=int, device="cpu")
         self.splats = wp.array(splats, dtype=Splat2D, device="cpu")
-        instances, places, self.ranges = map(torch.from_numpy, (scene.instances, scene.places, scene.ranges))
-        self.lists = (instances, places, wp.array(scene.place_ends, dtype=wp.int64, device="cpu"))
+        lists = (scene.instances, scene.places, scene.place_begins, scene.ranges)
+        self.lists = tuple(map(torch.from_numpy, lists))
 
     def forward(self) -> None:
         slices = balanced_slices(self.scene.ranges[:, 1])
-        bins = Bins(self.order, self.splats, *self.lists, self.ranges, slices, self.scene.tiles_x, invalid=0)
+        bins = Bins(self.order, self.splats, *self.lists, slices, self.scene.tiles_x, invalid=0)
         black = torch.zeros(3)
         self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), self.mode, Dropped())
 

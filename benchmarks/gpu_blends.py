@@ -1,6 +1,6 @@
 """For ``gpu.py``: the two blends alone, their share of what the card can do, and slots against atomics.
 
-Slots: each tile instance has a row of its own, ``tiles.gather`` sums a Gaussian's rows in order. Atomics: the same
+Slots: each tile instance has a row of its own, ``adjoints.gather`` sums a Gaussian's rows in order. Atomics: the same
 kernel adds into the Gaussian's row at once; no rows per instance, no second kernel, another sum in every run.
 """
 
@@ -8,12 +8,11 @@ import torch
 import warp as wp
 from gpu_scene import cameras, make_gaussians, milliseconds
 
-from warp_splat.adjoints import list_inputs
-from warp_splat.binning import bin_tiles, views2d
+from warp_splat.adjoints import gather, list_inputs
+from warp_splat.binning import bin_tiles
 from warp_splat.blocks import THREADS, blend_blocks, spread_upstream
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels import tiles
 from warp_splat.kernels.adjoint_block import make_reverse_block
 from warp_splat.launch import launch, launch_blocks, view
 from warp_splat.projection import Project, camera_view
@@ -94,16 +93,7 @@ class Blends:
         self.reverse(self.slots)
 
     def gather(self) -> list[torch.Tensor]:
-        grads = [self.slots.new_zeros(self.count, width).squeeze(1) for width in (2, 3, 1, 3, 1)]
-        lists = [self.bins.gaussians, self.bins.place_ends, view(self.bins.places, wp.int32)]
-        launch(
-            tiles.gather,
-            len(self.bins.gaussians),
-            [*lists, view(self.slots, wp.float32)],
-            views2d(grads),
-            device=self.slots.device,
-        )
-        return grads[:4]
+        return gather(self.bins, self.slots, self.count)[:4]
 
     def by_atomics(self) -> torch.Tensor:
         self.rows.zero_()

@@ -20,7 +20,7 @@ class BlendScene(NamedTuple):
     ranges: np.ndarray  # [T, 2] int32, first and last instance
     instances: np.ndarray  # [M] int32, splats
     places: np.ndarray  # [M] int32, where in ``instances``, splat by splat
-    place_ends: np.ndarray  # [V] int64
+    place_begins: np.ndarray  # [V] int32
 
 
 def blend_scene(count: int = 100_000, width: int = 980, height: int = 545, seed: int = 0) -> BlendScene:
@@ -57,5 +57,5 @@ def _bin(splats: np.ndarray, radius: np.ndarray, width: int, height: int) -> Ble
     ends = np.searchsorted(tile[order], np.arange(tiles.prod()), "right")
     ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], 1)
     places = np.argsort(order)
-    lists = (table.astype(np.int32) for table in (ranges, splat[order], places))
-    return BlendScene(width, height, int(tiles[0]), splats, *lists, np.cumsum(counts))
+    lists = (table.astype(np.int32) for table in (ranges, splat[order], places, np.cumsum(counts) - counts))
+    return BlendScene(width, height, int(tiles[0]), splats, *lists)

@@ -127,9 +127,9 @@ def work_of(counts: Counts) -> dict[str, tuple[float, float]]:
     return {
         # shapes in; radii out; of those drawn, SH in and the rest out
         "project": (n * (44 + 4) + drawn * (sh + 48), PROJECT * drawn),
-        # radii and projected Gaussians in; splats, where each came from and where its instances end, and the instances
+        # radii and projected Gaussians in; splats, where each came from and where its places begin, and the instances
         # (splat 4, place 4) out
-        "bin": (n * 4 + drawn * (48 + 48 + 12) + counts.instances * 8, 0),
+        "bin": (n * 4 + drawn * (48 + 48 + 8) + counts.instances * 8, 0),
         # instances and Gaussians in; image, alpha, and for the adjoint final T and count out
         "blend": (counts.instances * 4 + drawn * 48 + pixels * 24, FORWARD * counts.pairs),
         # image (float32) and photograph (uint8) in; for the adjoint, these and the gradient of the image

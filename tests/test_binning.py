@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_splat import Camera, InputError, RasterOptions, binning, renderer, set_threads
+from warp_splat import Camera, InputError, RasterOptions, adjoints, binning, renderer, set_threads
 from warp_splat.launch import get_threads
 from warp_splat.projection import Project, camera_view
 from warp_splat.renderer import Dropped
@@ -54,10 +54,30 @@ def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
 def test_places_are_those_of_each_splat():
     camera, projected = project()
     for bins in counted_and_sorted(camera, projected):
-        ends = bins.place_ends.numpy()
-        splats = np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))
+        begins = bins.place_begins.numpy()
+        splats = np.repeat(np.arange(len(begins)), np.diff(begins, append=len(bins.places)))
         assert (bins.instances.numpy()[bins.places.numpy()] == splats).all() and len(splats) > 300
         assert sorted(bins.places.numpy()) == list(range(len(splats)))
+
+
+@pytest.mark.parametrize("width", [9, 10])
+def test_rows_are_summed_by_gaussian(width):
+    """Whoever shares the work: bit for bit the sums that one gets from first to last."""
+    camera, projected = project(5000)
+    threads = get_threads()
+    try:
+        for bins in counted_and_sorted(camera, projected):
+            slots = torch.randn(len(bins.instances), width, generator=torch.Generator().manual_seed(1))
+            sums = np.zeros((5000, width), np.float32)
+            first_to_last = bins.gaussians.numpy()[bins.instances.numpy()[bins.places.numpy()]]
+            np.add.at(sums, first_to_last, slots.numpy()[bins.places.numpy()])
+            for count in (1, 2, 3):
+                set_threads(count)
+                found = adjoints.gather(bins, slots, 5000)
+                assert [grad.shape[1:].numel() for grad in found] == [2, 3, 1, 3, 1]
+                assert (torch.cat([grad.view(5000, -1) for grad in found], 1)[:, :width].numpy() == sums).all()
+    finally:
+        set_threads(threads)
 
 
 def test_the_number_of_threads_changes_nothing():
@@ -83,8 +103,7 @@ def counted_and_sorted(camera, projected, options=PLAIN):
 def listed(bins):
     """Of each instance the Gaussian, and which of the Gaussian's instances it is."""
     splat, number = bins.instances.numpy(), np.argsort(bins.places.numpy())
-    begins = np.concatenate([[0], bins.place_ends.numpy()])
-    return np.stack([bins.gaussians.numpy()[splat], number - begins[splat]])
+    return np.stack([bins.gaussians.numpy()[splat], number - bins.place_begins.numpy()[splat]])
 
 
 def by_gaussian(bins, drawn):
@@ -103,8 +122,8 @@ def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, optio
     assert (listed(by_sorting) == listed(counted)).all() and torch.equal(by_sorting.ranges, counted.ranges)
     assert by_sorting.instances.dtype == by_sorting.ranges.dtype == torch.int32
     assert by_gaussian(by_sorting, drawn) == by_gaussian(counted, drawn)
-    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.place_ends) == count
-    assert (by_sorting.place_ends.numpy()[drawn:] == len(counted.instances)).all()
+    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.place_begins) == count
+    assert (by_sorting.place_begins.numpy()[drawn:] == len(counted.instances)).all()
     assert int(by_sorting.invalid) == counted.invalid
 
 

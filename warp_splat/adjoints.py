@@ -1,4 +1,4 @@
-"""The adjoint of the pixel loop in one of its modes: from upstream gradients per pixel to a row per tile instance.
+"""The adjoint of the pixel loop in one of its modes: from upstream gradients per pixel to those of the 2D Gaussians.
 
 The modes share the forward kernel, the tile lists, the upstream gradients in blocks, the rows and their summation; they
 differ in the kernel between them alone. Two exceptions: ``stored`` has a forward kernel that writes every T, and
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import torch
 import warp as wp
+from torch.nn.functional import embedding_bag
 
 from warp_splat.binning import MAX_INSTANCES, Bins
 from warp_splat.config import T_LEAST, RasterOptions
@@ -18,9 +19,10 @@ from warp_splat.kernels.blend import Splat2D
 from warp_splat.kernels.blend_lanes import BLOCKS
 from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.kernels.taped_lanes import make_walk, rows_of_copies
-from warp_splat.launch import available_memory, empty, launch, view
+from warp_splat.launch import available_memory, empty, even_slices, in_slices, launch, view
 
 SPLATS = 3  # place of the Gaussians in the list
+WIDTHS = [2, 3, 1, 3, 1]  # of a slot: means2d, conics, opacities, colors, and depths where they are asked for
 
 
 def list_inputs(bins: Bins, options: RasterOptions) -> list:
@@ -73,3 +75,25 @@ def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list
     lists[SPLATS], adjoint["adj_inputs"][SPLATS] = copies, adj_copies
     launch(walk, tile_count, [*lists, *inputs], outputs, bounds=bins.slices, **adjoint)
     launch(rows_of_copies, len(bins.instances), [copies, adj_copies], [rows])
+
+
+def gather(bins: Bins, slots: torch.Tensor, gaussian_count: int) -> list[torch.Tensor]:
+    """Gradients of means2d, conics, opacities, colors and depths: sums of each Gaussian's slots, zero where culled.
+
+    Always in the same order and without atomics: the same bits for any number of threads. (Tried: a kernel with a loop
+    for each Gaussian. It waits for rows that torch has asked for ahead: 11 ms instead of 6 for 540,000 of them.)
+    """
+    gaussians, slot_count = wp.to_torch(bins.gaussians).long(), len(slots)
+    widths = WIDTHS if slots.shape[1] == sum(WIDTHS) else WIDTHS[:-1]
+    grads = [slots.new_zeros(gaussian_count, width) for width in WIDTHS]
+    bounds = [0, len(gaussians)] if slots.is_cuda else even_slices(len(gaussians))
+    begins = dict(zip(bounds, [0, *bins.place_begins[bounds[1:-1]].tolist(), slot_count], strict=True))
+
+    def run(low: int, high: int) -> None:
+        places, begin = bins.places[begins[low] : begins[high]], bins.place_begins[low:high] - begins[low]
+        rows = embedding_bag(places, slots, begin, mode="sum")
+        for grad, columns in zip(grads, rows.split(widths, 1), strict=False):
+            grad.index_copy_(0, gaussians[low:high], columns)
+
+    in_slices(run, bounds)
+    return [grad.squeeze(1) for grad in grads]

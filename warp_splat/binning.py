@@ -30,7 +30,7 @@ class Bins:
     splats: wp.array  # [V] Splat2D
     instances: torch.Tensor  # [M] int32, splats, by tile, nearest first
     places: torch.Tensor  # [M] int32, where in ``instances`` a splat stands, splat by splat
-    place_ends: wp.array  # [V] int64, inclusive scan of how often it does
+    place_begins: torch.Tensor  # [V] int32, where in ``places`` those of each splat begin
     ranges: torch.Tensor  # [T, 2] int32, first and last instance
     slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU
     tiles_x: int
@@ -73,10 +73,11 @@ def bin_by_counting(
     launch(tiles.find_spans, count, inputs, [spans, _array(counts)])
     place_ends = np.cumsum(counts)
     _check_count(_last(place_ends), camera, count, radii.device)
-    begins = (place_ends - counts).astype(np.int32)[order]
-    instances, places, ends = _sort_by_tile(order, begins, row_ends, spans, _last(place_ends), tiles_x * tiles_y)
+    begins = (place_ends - counts).astype(np.int32)
+    lists = _sort_by_tile(order, begins[order], row_ends, spans, _last(place_ends), tiles_x * tiles_y)
+    instances, places, ends = lists
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
-    lists = (instances, places, _array(place_ends), ranges)
+    lists = (instances, places, torch.from_numpy(begins), ranges)
     return Bins(gaussians, splats, *lists, balanced_slices(ends), tiles_x, invalid)
 
 
@@ -119,7 +120,7 @@ def bin_by_sorting(
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
         _check_longest(int(bounds.diff().max()))
     invalid = torch.count_nonzero(radii < 0)
-    return Bins(order, splats, instances, places, wp.from_torch(place_ends), ranges, [], tiles_x, invalid)
+    return Bins(order, splats, instances, places, (place_ends - counts).int(), ranges, [], tiles_x, invalid)
 
 
 def _sort_by_tile(

@@ -228,12 +228,19 @@ def launch(
     if torch.device(device).type == "cuda":
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, stream=_stream(device), **adjoint)
         return
-    bounds = bounds or even_slices(dim)
-    full = [(low, high) for low, high in itertools.pairwise(bounds) if high > low]
 
     def run(low: int, high: int) -> None:
         wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
 
+    bounds = bounds or even_slices(dim)
+    if len(bounds) > 2:
+        wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
+    in_slices(run, bounds)
+
+
+def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
+    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU."""
+    full = [(low, high) for low, high in itertools.pairwise(bounds) if high > low]
     helpers = min(_threads, len(full)) - 1
     if helpers <= 0:
         for low, high in full:
@@ -242,7 +249,6 @@ def launch(
     while len(_helpers) < helpers:
         _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
         _helpers[-1].start()
-    wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
     _Job(run, full).share(helpers)
 
 

@@ -10,18 +10,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warp_splat.binning import bin_tiles, views2d
+from warp_splat.adjoints import gather
+from warp_splat.binning import bin_tiles
 from warp_splat.blocks import adjoint_of_blocks, blend_blocks
 from warp_splat.camera import Camera
 from warp_splat.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.kernels import tiles
 from warp_splat.lanes import adjoint_of_lanes, blend_lanes
-from warp_splat.launch import launch, stage, view
+from warp_splat.launch import stage
 from warp_splat.projection import Project, camera_view
 
 
@@ -217,8 +216,5 @@ class Blend(torch.autograd.Function):
             adjoint = adjoint_of_blocks if adj_image.is_cuda else adjoint_of_lanes
             slots, adj_background, bad = adjoint(ctx.adjoint, bins, ctx.options, background, saved, *adj_pixels)
             ctx.dropped.pixel_count += bad.sum()
-            rows, new = ctx.gaussian_count, slots.new_zeros
-            grads = (new(rows, 2), new(rows, 3), new(rows), new(rows, 3), new(rows))
-            inputs = [bins.gaussians, bins.place_ends, view(bins.places, wp.int32), view(slots, wp.float32)]
-            launch(tiles.gather, len(bins.gaussians), inputs, views2d(grads), device=slots.device)
+            grads = gather(bins, slots, ctx.gaussian_count)
         return *grads, adj_background, None, None, None, None, None
