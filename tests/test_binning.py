@@ -61,8 +61,9 @@ def test_places_are_those_of_each_splat():
 
 
 @pytest.mark.parametrize("width", [9, 10])
-def test_rows_are_summed_by_gaussian(width):
+def test_rows_are_summed_by_gaussian(width, monkeypatch):
     """Whoever shares the work: bit for bit the sums that one gets from first to last."""
+    monkeypatch.setattr(adjoints, "AT_ONCE", 700)
     camera, projected = project(5000)
     threads = get_threads()
     try:

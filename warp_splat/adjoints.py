@@ -19,9 +19,10 @@ from warp_splat.kernels.blend import Splat2D
 from warp_splat.kernels.blend_lanes import BLOCKS
 from warp_splat.kernels.lanes import LANES, vec16
 from warp_splat.kernels.taped_lanes import make_walk, rows_of_copies
-from warp_splat.launch import available_memory, empty, even_slices, in_slices, launch, view
+from warp_splat.launch import available_memory, empty, in_slices, launch, view
 
 SPLATS = 3  # place of the Gaussians in the list
+AT_ONCE = 2**14  # Gaussians whose slots are summed; all at once leave holes in memory, new pages, 15 to 50 ms at 1M
 WIDTHS = [2, 3, 1, 3, 1]  # of a slot: means2d, conics, opacities, colors, and depths where they are asked for
 
 
@@ -86,8 +87,9 @@ def gather(bins: Bins, slots: torch.Tensor, gaussian_count: int) -> list[torch.T
     gaussians, slot_count = wp.to_torch(bins.gaussians).long(), len(slots)
     widths = WIDTHS if slots.shape[1] == sum(WIDTHS) else WIDTHS[:-1]
     grads = [slots.new_zeros(gaussian_count, width) for width in WIDTHS]
-    bounds = [0, len(gaussians)] if slots.is_cuda else even_slices(len(gaussians))
-    begins = dict(zip(bounds, [0, *bins.place_begins[bounds[1:-1]].tolist(), slot_count], strict=True))
+    inner = [] if slots.is_cuda else list(range(AT_ONCE, len(gaussians), AT_ONCE))
+    bounds = [0, *inner, len(gaussians)]
+    begins = dict(zip(bounds, [0, *bins.place_begins[inner].tolist(), slot_count], strict=True))
 
     def run(low: int, high: int) -> None:
         places, begin = bins.places[begins[low] : begins[high]], bins.place_begins[low:high] - begins[low]

@@ -68,7 +68,7 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     Raises:
         InputError: naming the first argument whose type, shape, dtype, device or range is not as it should be.
     """
-    _check_tensor("means", means, (None, 3), None)
+    _check_tensor("means", means, ("N", 3), None)
     count, device = means.shape[0], means.device
     _check_tensor("quats", quats, (count, 4), device)
     _check_tensor("scales", scales, (count, 3), device)
@@ -76,9 +76,9 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     if isinstance(sh, (tuple, list)) and len(sh) == 2:
         sh_dc, sh_rest = sh
         _check_tensor("sh[0]", sh_dc, (count, 1, 3), device)
-        _check_tensor("sh[1]", sh_rest, (count, None, 3), device)
+        _check_tensor("sh[1]", sh_rest, (count, "K - 1", 3), device)
     else:
-        _check_tensor("sh", sh, (count, None, 3), device)
+        _check_tensor("sh", sh, (count, "K", 3), device)
         sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
     if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
         raise InputError(
@@ -93,11 +93,13 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     return tuple(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest))
 
 
-def _check_tensor(name: str, tensor, shape: tuple[int | None, ...], device: torch.device | None) -> None:
-    wanted = "[" + ", ".join("N" if size is None else str(size) for size in shape) + "]"
+def _check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.device | None) -> None:
+    wanted = f"[{', '.join(map(str, shape))}]"
     if not isinstance(tensor, torch.Tensor):
         raise InputError(f"{name}: expected a float32 torch tensor {wanted}, got {type(tensor).__name__}.")
-    fits = tensor.dim() == len(shape) and all(a is None or a == b for a, b in zip(shape, tensor.shape, strict=True))
+    fits = tensor.dim() == len(shape) and all(
+        isinstance(a, str) or a == b for a, b in zip(shape, tensor.shape, strict=True)
+    )
     if not fits:
         raise InputError(f"{name}: expected shape {wanted}, got {list(tensor.shape)}.")
     if tensor.dtype != torch.float32:

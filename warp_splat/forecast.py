@@ -27,7 +27,7 @@ PER_GAUSSIAN = sum(
         3 + 1 + 1,  # gradients of scales and opacities before activation, and whether one is not finite
         2 + 2 + 3,  # depths and indices in the sort, indices of the drawn (32 and 64 bits)
         12 + 2 + 2 + 1,  # Splat2D, where its rows and places end (64 bits), and where these begin
-        9 + 2 + 1,  # sum of its rows of gradients, its index (64 bits), and where its places begin in a slice
+        2,  # its index, where its rows of gradients are summed (64 bits)
         3 + 3,  # densification: its statistics, and what is added to them
     )
 )
