@@ -23,7 +23,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.blend import Splat2D, alpha_of, exponent, make_exp, odds_of
 from warp_splat.kernels.blend_lanes import BLOCKS, reach
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.build import IN_LANES
 from warp_splat.kernels.lanes import LANE_X, LANE_Y, times, total, vec16, where_less
 from warp_splat.kernels.step import conic_from_root, exp2_known, opaque
 
@@ -149,7 +149,7 @@ def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
     def adj_exp2_value(z: vec16, adj_ret: vec16):
         pass
 
-    @wp.kernel(module="unique", module_options={**FORWARD_ONLY, "enable_backward": True})
+    @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
     def walk(
         first: int,
         tiles_x: int,
