@@ -138,7 +138,7 @@ def measure_blends(
     work = {
         "forward": (walked * (SPLAT + INSTANCE) + 24 * pixels, FORWARD * walked * THREADS),
         "adjoint into slots": (walked * (SPLAT + INSTANCE + ROW) + 28 * pixels, ADJOINT * walked * THREADS),
-        "gather": (instances * (INSTANCE + ROW) + blends.count * (ROW + 12), 9 * instances),
+        "gather": (instances * (INSTANCE + ROW) + blends.count * (ROW + 8), 9 * instances),
     }
     shares = [
         [name, f"{times[name]:.3f}", f"{size / 1e9:.3f}", f"{100e3 * size / times[name] / bandwidth:.1f}",

@@ -13,7 +13,7 @@ PATIENCE = 300.0  # seconds; a machine may be busy
 @contextmanager
 def served(*arguments, cwd=Path(__file__).parents[1]):
     """A command with a viewer, once that is up: the process, its address, what it printed so far."""
-    # as a shell's "&" starts it: Ctrl-C is ignored before the announcement, and must not be after it
+    # as a shell's "&" starts it, ignoring SIGINT: Ctrl-C only works once the command has a handler for it
     ignoring = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]
     command = [*ignoring, sys.executable, "-m", "warp_splat", *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}

@@ -76,9 +76,38 @@ def test_rows_are_summed_by_gaussian(width, monkeypatch):
                 set_threads(count)
                 found = adjoints.gather(bins, slots, 5000)
                 assert [grad.shape[1:].numel() for grad in found] == [2, 3, 1, 3, 1]
+                assert width == 10 or not found[4].any()
                 assert (torch.cat([grad.view(5000, -1) for grad in found], 1)[:, :width].numpy() == sums).all()
     finally:
         set_threads(threads)
+
+
+@pytest.fixture
+def torch_threads():
+    threads = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_rows_are_summed_in_any_mode_of_torch(count, torch_threads, monkeypatch):
+    monkeypatch.setattr(adjoints, "AT_ONCE", 100)
+    torch_threads(count)
+    camera, projected = project(2000)
+    bins = binning.bin_tiles(*projected, camera, PLAIN)
+    slots = torch.rand(len(bins.instances), 9)
+    expected = adjoints.gather(bins, slots, 2000)
+    with torch.inference_mode():
+        found = adjoints.gather(bins, slots, 2000)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def test_without_gaussians_or_instances_sums_are_zero():
+    for count in (0, 2000):
+        camera, projected = project(count)
+        projected[-1][:] = 0  # radii
+        bins = binning.bin_tiles(*projected, camera, PLAIN)
+        assert not torch.cat([grad.view(-1) for grad in adjoints.gather(bins, torch.empty(0, 9), count)]).any()
 
 
 def test_the_number_of_threads_changes_nothing():

@@ -1,6 +1,7 @@
 """Launches: one on a GPU, blocks of threads where they are made of fibers, memory that torch owns."""
 
 import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -47,6 +48,22 @@ def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
     assert whole == {"dim": 9000, "inputs": [0, "in"], "outputs": ["out"], "stream": "stream of cuda:1"}
     assert adjoint["adjoint"] and adjoint["adj_inputs"] == [None, "grad"] and adjoint["adj_outputs"] == ["up"]
     assert blocks == {"dim": [12], "inputs": ["in"], "outputs": ["out"], "block_dim": 256, "stream": "stream of cuda:1"}
+
+
+def test_helpers_keep_nothing_alive():
+    """What they worked on last goes when the caller lets it go, though they know of the next job only when it comes."""
+    threads = launch.get_threads()
+    launch.set_threads(4)
+    try:
+        for _ in range(20):
+            tensor = torch.zeros(64)
+            launch.in_slices(lambda low, high, tensor=tensor: tensor[low:high].add_(1.0), list(range(65)))
+            assert (tensor == 1.0).all()
+            alive = weakref.ref(tensor)
+            del tensor
+            assert alive() is None
+    finally:
+        launch.set_threads(threads)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -1,5 +1,8 @@
 """A training that is watched, by browsers whose place is taken by a fake."""
 
+import io
+import os
+import signal
 import sys
 import time
 
@@ -149,9 +152,9 @@ class Visited(FakeServer):
             self.leave(self.client)
 
 
-def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, capsys):
-    """From the command line: frames while it trains, the end before it is evaluated, and then it lingers."""
-    root = write_colmap(tmp_path / "scene")
+def visited(monkeypatch, folder):
+    """The command that trains a small scene while somebody looks, who leaves at the second wait."""
+    root = write_colmap(folder / "scene")
     (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
     monkeypatch.setattr(sys.modules["viser"], "ViserServer", Visited)
     monkeypatch.setattr(server, "DESERTED", 0.0)
@@ -159,6 +162,12 @@ def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, cap
     monkeypatch.setattr("warp_splat.viewer.training.SHARE", 1e9)
     monkeypatch.setattr(server.Viewer, "wait", lambda viewer, seconds: viewer.server.wait())
     at_rest(monkeypatch)
+    return ["train", "-s", str(root), "-m", str(folder / "model"), "--viewer", "--iterations", "3"]
+
+
+def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, capsys):
+    """From the command line: frames while it trains, the end before it is evaluated, and then it lingers."""
+    command = visited(monkeypatch, tmp_path)
 
     def evaluated(*_):
         seen = Visited.last
@@ -166,8 +175,29 @@ def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, cap
         return finish(*_)
 
     monkeypatch.setattr("warp_splat.train.finish", evaluated)
-    assert main(["train", "-s", str(root), "-m", str(tmp_path / "model"), "--viewer", "--iterations", "3"]) == 0
+    assert main(command) == 0
     seen, said = Visited.last, capsys.readouterr()
     assert seen.seen == [3, True] and seen.waits == 2 and seen.stopped  # after two steps and at the end
     assert "Viewer at http" in said.out and "The viewer stays at" in said.out
     assert "no points to start from" in said.out and "Done after 3 iterations" in said.out
+
+
+@pytest.mark.parametrize(("line", "code"), [("Viewer at", 130), ("The viewer stays at", 0)])
+def test_who_reads_the_line_may_press_ctrl_c(line, code, fake_viser, monkeypatch, tmp_path, capsys):
+    """While it is printed, Ctrl-C is heeded already, even if the shell has the process ignore it."""
+    heeded = []
+
+    class Output(io.StringIO):
+        def write(self, text):
+            if text.startswith(line):
+                heeded.append(signal.getsignal(signal.SIGINT) is not signal.SIG_IGN)
+                os.kill(os.getpid(), signal.SIGINT)
+            return super().write(text)
+
+    monkeypatch.setattr(sys, "stdout", Output())
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert main(visited(monkeypatch, tmp_path)) == code
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert heeded == [True] and Visited.last.waits < 2

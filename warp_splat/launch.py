@@ -21,6 +21,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from numbers import Integral
 
 import psutil
@@ -42,7 +43,7 @@ _seconds: dict[str, float] | None = None
 
 
 class _Job:
-    """Slices of one launch, shared by the threads: whoever is free takes the next one.
+    """Slices of one launch, or of other work, shared by the threads: whoever is free takes the next one.
 
     A launch takes tenths of a millisecond, so what a thread costs counts: the caller waits for helpers that are at
     work, but not for those that have not woken yet (Tried: an executor's futures, 0.1 ms per launch, 2 ms a step;
@@ -50,7 +51,8 @@ class _Job:
     """
 
     def __init__(self, run: Callable[[int, int], None], slices: list[tuple[int, int]]):
-        self.run, self.slices = run, slices[::-1]
+        # each with its function: a helper that sleeps or comes late knows this job, which must not keep tensors alive
+        self.slices = [partial(run, low, high) for low, high in reversed(slices)]
         self.lock, self.idle = threading.Lock(), threading.Event()
         self.idle.set()
         self.helping = 0
@@ -81,10 +83,10 @@ class _Job:
     def _run_slices(self) -> None:
         while True:
             try:
-                low, high = self.slices.pop()  # one step, hence safe without the lock
+                run = self.slices.pop()  # one step, hence safe without the lock
             except IndexError:
                 return
-            self.run(low, high)
+            run()
 
     def help(self) -> None:
         """A helper's part."""
@@ -131,12 +133,12 @@ if hasattr(os, "register_at_fork"):
 
 
 def get_threads() -> int:
-    """Number of threads that a CPU launch may use."""
+    """Number of threads that work on the CPU may use."""
     return _threads
 
 
 def set_threads(count: int) -> None:
-    """Use ``count`` threads (1 to 1024) for CPU launches. Results do not depend on it.
+    """Use ``count`` threads (1 to 1024) on the CPU. Results do not depend on it.
 
     Raises:
         InputError: if ``count`` is not a whole number, or out of that range.
@@ -163,7 +165,8 @@ def prepare(device: str, threads: int) -> torch.device:
     wp.config.log_level = wp.LOG_ERROR  # no list of devices and modules
     chosen = choose_device(device)
     # torch: one thread. Its elementwise work here is bound by memory (Adam on 200k Gaussians: 6.7 ms against 5.7 ms
-    # with two), its sums would depend on the number of threads, and its idle threads would spin beside ours
+    # with two), its sums would depend on the number of threads, and its idle threads would spin beside ours, which call
+    # torch as well
     torch.set_num_threads(1)
     if threads:
         set_threads(threads)
@@ -239,7 +242,10 @@ def launch(
 
 
 def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
-    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU."""
+    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU.
+
+    Slices must write different elements; what torch keeps for each thread, such as inference mode, is not passed on.
+    """
     full = [(low, high) for low, high in itertools.pairwise(bounds) if high > low]
     helpers = min(_threads, len(full)) - 1
     if helpers <= 0:

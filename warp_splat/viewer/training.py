@@ -84,8 +84,8 @@ class TrainingViewer:
         """After the training, stay until the last browser has left, or Ctrl-C."""
         if self.viewer.deserted:
             return
-        print(f"The viewer stays at {self.viewer.address} until its page is closed, or Ctrl-C.", flush=True)
         with interruptible() as interrupted:
+            print(f"The viewer stays at {self.viewer.address} until its page is closed, or Ctrl-C.", flush=True)
             while not interrupted and not self.viewer.deserted:
                 if not self._draw():
                     self.viewer.wait(IDLE)
