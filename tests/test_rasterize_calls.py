@@ -10,6 +10,8 @@ from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, r
 
 import warp_splat
 from warp_splat import RasterOptions
+from warp_splat.config import ADJOINTS
+from warp_splat.losses import image_loss
 
 
 def equal(first, second):
@@ -33,6 +35,29 @@ def test_bit_identical_between_thread_counts(name, device):
     finally:
         warp_splat.set_threads(threads)
     assert equal(*results)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_defaults_of_torch_change_nothing(adjoint):
+    """The inputs say of what type the numbers are, and where they lie."""
+    scene = truth("degree3", PLAIN).scene.to("cpu")
+    leaves = [leaves_of(scene) for _ in range(3)]
+    photograph = torch.full((scene.camera.height, scene.camera.width, 3), 90, dtype=torch.uint8)
+
+    def everything(leaves):
+        gaussians = [leaves[name] for name in PARAMETERS]
+        out = warp_splat.rasterize(*gaussians, scene.camera, adjoint=adjoint, options=RasterOptions(depth=True))
+        image_loss(out.image, photograph).backward()
+        return out, {name: leaves[name].grad for name in PARAMETERS}
+
+    expected, dtype = everything(leaves[0]), torch.get_default_dtype()
+    try:
+        torch.set_default_dtype(torch.float64)
+        assert equal(everything(leaves[1]), expected)
+    finally:
+        torch.set_default_dtype(dtype)
+    with torch.device("meta"):
+        assert equal(everything(leaves[2]), expected)
 
 
 def test_several_views_equal_separate_calls(device):

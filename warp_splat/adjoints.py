@@ -53,7 +53,7 @@ def memory_for_states(bins: Bins) -> torch.Tensor:
             f"adjoint 'stored': the transmittances of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
             f"{available / 2**30:.1f} GiB are free; use 'reversible', which needs none, or a smaller image."
         )
-    return torch.empty(count, BLOCKS, LANES, device=bins.instances.device)
+    return torch.empty(count, BLOCKS, LANES, dtype=torch.float32, device=bins.instances.device)
 
 
 def adjoint_of_blend(mode: str, bins: Bins, options: RasterOptions, states: list[torch.Tensor], steps, slots) -> None:

@@ -74,8 +74,7 @@ def bin_by_counting(
     place_ends = np.cumsum(counts)
     _check_count(_last(place_ends), camera, count, radii.device)
     begins = (place_ends - counts).astype(np.int32)
-    lists = _sort_by_tile(order, begins[order], row_ends, spans, _last(place_ends), tiles_x * tiles_y)
-    instances, places, ends = lists
+    instances, places, ends = _sort_by_tile(order, begins[order], row_ends, spans, _last(place_ends), tiles_x * tiles_y)
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     lists = (instances, places, torch.from_numpy(begins), ranges)
     return Bins(gaussians, splats, *lists, balanced_slices(ends), tiles_x, invalid)
@@ -140,7 +139,7 @@ def _sort_by_tile(
     ends = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
     _check_longest(int(counts.sum(0).max(initial=0)))
     cursor = np.ascontiguousarray((ends - counts.T).T, dtype=np.int32)
-    instances, places = (torch.empty(count, dtype=torch.int32) for _ in range(2))
+    instances, places = (torch.empty(count, dtype=torch.int32, device="cpu") for _ in range(2))
     inputs = [_array(bounds), _array(order), _array(begins), _array(row_ends), spans]
     outputs = [_array(cursor), view(instances, wp.int32), view(places, wp.int32)]
     launch(tiles.scatter, bands, inputs, outputs, bounds=one_each)

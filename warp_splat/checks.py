@@ -33,7 +33,7 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     """The options to use, numbers as Python's. Raises InputError for an unknown adjoint or option."""
     if not is_one_of(adjoint, ADJOINTS):
         raise InputError(f"adjoint: expected one of {', '.join(ADJOINTS)}, got {adjoint!r}.")
-    options = options or RasterOptions()
+    options = RasterOptions() if options is None else options
     if not isinstance(options, RasterOptions):
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
     if not is_one_of(options.sh_degree, (None, 0, 1, 2, 3)):
@@ -120,7 +120,7 @@ def check_background(background, device: torch.device) -> torch.Tensor:
     """The background as a tensor [3] on ``device``. Raises InputError if it is not three finite numbers there."""
     if not isinstance(background, torch.Tensor):
         try:
-            background = torch.tensor([float(value) for value in background], device=device)
+            background = torch.tensor([float(value) for value in background], dtype=torch.float32, device=device)
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"background: expected three numbers or a tensor [3], got {background!r:.80}.") from None
     if background.layout != torch.strided:

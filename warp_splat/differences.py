@@ -91,7 +91,8 @@ class MovableScene:
         with torch.no_grad():
             self.extents, self.radii = Project.apply(*_gaussians(self.inputs), view, Dropped())[5:]
         self.generator = torch.Generator().manual_seed(seed)
-        self.weights = torch.randn(self.picture.shape, generator=self.generator).to(self.picture.device)
+        random = torch.randn(self.picture.shape, generator=self.generator, dtype=torch.float32, device="cpu")
+        self.weights = random.to(self.picture.device)
 
     def tensor(self, name: str) -> torch.Tensor:
         """The parameter in the graph of ``picture``."""
@@ -199,7 +200,7 @@ def _random_step(scene: MovableScene, name: str, share: float) -> torch.Tensor:
     step = wanted.sign() * torch.maximum(LEAST * wanted.abs(), 4 * place)
     step = torch.nan_to_num((value + step.float()) - value)
     if share < 1:
-        step[(torch.rand(len(step), generator=scene.generator) >= share).to(step.device)] = 0
+        step[(torch.rand(len(step), generator=scene.generator, device="cpu") >= share).to(step.device)] = 0
     return step
 
 

@@ -1,6 +1,6 @@
 """How much memory training will take, told before it does: the tensors of a step on the CPU, counted.
 
-They are counted as if none took the place of one that was freed, since the pieces of a heap seldom fit what comes next:
+They are counted as if few took the place of one that was freed, since the pieces of a heap seldom fit what comes next:
 ``benchmarks/scaling.py`` compares with measured peaks.
 """
 
@@ -45,8 +45,7 @@ PER_PIXEL = sum(
         3 + 1 + 1 + 1,  # image, alpha, transmittance and steps in blocks
         9,  # loss: three slopes of SSIM
         7,  # rows in its rings, at most: in bands of 64 rows, the smallest
-        3,  # gradient of the image
-        3 + 1 + 1,  # upstream gradients of image and transmittance in blocks, of alpha
+        3,  # gradient of the image; those upstream of the blend, in blocks, go where the slopes were
     )
 )
 MASKED = 3 + 3 + 3  # floats of a pixel more, where masks are: both images in black, and a gradient

@@ -29,12 +29,12 @@ def blend_lanes(
         options: what to compute.
         keep: store every transmittance, for the adjoint "stored".
     """
-    height, width = camera.height, camera.width
-    image, alpha = torch.empty(height, width, 3), torch.empty(height, width)
-    depth = torch.empty(height, width) if options.depth else torch.empty(0, 0)
+    height, width, new = camera.height, camera.width, background.new_empty
+    image, alpha = new(height, width, 3), new(height, width)
+    depth = new(height, width) if options.depth else new(0, 0)
     tile_count = len(bins.ranges)
-    final, count = torch.empty(tile_count, BLOCKS, LANES), torch.empty(tile_count, BLOCKS, LANES)
-    kept = memory_for_states(bins) if keep else torch.empty(0, 0, LANES)
+    final, count = new(tile_count, BLOCKS, LANES), new(tile_count, BLOCKS, LANES)
+    kept = memory_for_states(bins) if keep else new(0, 0, LANES)
     launch(
         make_blend(options.depth, options.exp_degree, keep),
         tile_count,
@@ -61,7 +61,7 @@ def adjoint_of_lanes(
         adj_depth: [H, W], or nothing.
     """
     final, count, kept = saved
-    slots = torch.empty(len(bins.instances), 10 if options.depth else 9)
+    slots = background.new_empty(len(bins.instances), 10 if options.depth else 9)
     adj_pixels = (adj_image, adj_alpha, adj_depth)
     up, adj_final, adj_background, bad, steps = _spread_upstream(
         bins, options, background, final, count, adj_pixels, slots
@@ -77,10 +77,10 @@ def _pixel_views(image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) 
 def _spread_upstream(
     bins: Bins, options: RasterOptions, background, final, count, adj_pixels, slots
 ) -> tuple[torch.Tensor, ...]:
-    tile_count = len(bins.ranges)
-    up = torch.empty(tile_count, BLOCKS * (4 if options.depth else 3), LANES)
-    adj_final, adj_background = torch.empty_like(final), torch.empty(tile_count, 3)
-    bad, steps = torch.empty(tile_count, dtype=torch.int32), torch.empty(tile_count, dtype=torch.int32)
+    tile_count, new = len(bins.ranges), background.new_empty
+    up = new(tile_count, BLOCKS * (4 if options.depth else 3), LANES)
+    adj_final, adj_background = torch.empty_like(final), new(tile_count, 3)
+    bad, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
     lists, row = [bins.tiles_x, view(bins.ranges, wp.vec2i)], wp.types.vector(length=slots.shape[1], dtype=float)
     launch(
         make_upstream(options.depth),

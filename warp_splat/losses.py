@@ -117,13 +117,13 @@ def _blur(planes: torch.Tensor) -> torch.Tensor:
 @functools.cache  # copied once: a copy from the host would wait for the GPU in every step
 def _window(device: torch.device) -> torch.Tensor:
     """The window's weights for each channel, [3, 1, 1, 11]."""
-    return torch.tensor(list(ssim.WEIGHTS), device=device).repeat(ssim.CHANNELS, 1, 1, 1)
+    return torch.tensor(list(ssim.WEIGHTS), dtype=torch.float32, device=device).repeat(ssim.CHANNELS, 1, 1, 1)
 
 
 @functools.lru_cache(16)
 def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
     """The share of the window inside the image around each pixel, [1, H, W]."""
-    return _blur(torch.ones(1, ssim.CHANNELS, height, width, device=device))[0, :1]
+    return _blur(torch.ones(1, ssim.CHANNELS, height, width, dtype=torch.float32, device=device))[0, :1]
 
 
 class LossByConvolution(torch.autograd.Function):
@@ -157,7 +157,7 @@ class ImageLoss(torch.autograd.Function):
             bounds, bands = _bands(height)
             padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, ssim.RING, groups, ssim.MOMENTS)
             blurred, slopes = _lanes(bands, ssim.ROWS, groups, ssim.MOMENTS), _lanes(height, ssim.SLOPES, groups + 2)
-            sums = torch.empty(height, 2)
+            sums = image.new_empty(height, 2)
             launch(
                 ssim.compare,
                 bands,
@@ -177,7 +177,7 @@ class ImageLoss(torch.autograd.Function):
             l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
             ctx.save_for_backward(image, target, slopes)
             ctx.lambda_dssim, ctx.limits, ctx.centers = lambda_dssim, limits, centers
-            return torch.tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity), dtype=torch.float32)
+            return image.new_tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity))
 
     @staticmethod
     @once_differentiable
@@ -203,7 +203,7 @@ class ImageLoss(torch.autograd.Function):
 
 
 def _lanes(*shape: int) -> torch.Tensor:
-    return torch.empty(*shape, LANES)
+    return torch.empty(*shape, LANES, dtype=torch.float32, device="cpu")
 
 
 def _bands(height: int) -> tuple[torch.Tensor, int]:
@@ -213,13 +213,14 @@ def _bands(height: int) -> tuple[torch.Tensor, int]:
     """
     bounds = even_slices(height, SMALLEST_SLICE)
     bounds[1:-1] = [bound - bound % ssim.ROWS for bound in bounds[1:-1]]
-    return torch.tensor(bounds, dtype=torch.int32), len(bounds) - 1
+    return torch.tensor(bounds, dtype=torch.int32, device="cpu"), len(bounds) - 1
 
 
 def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor) -> list:
     """What both kernels read of [H, L]: the image and its limits; the target as floats, and as bytes: one of them."""
     floats, levels = (
-        target if target.dtype == dtype else torch.empty(0, 0, dtype=dtype) for dtype in (torch.float32, torch.uint8)
+        target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype)
+        for dtype in (torch.float32, torch.uint8)
     )
     return [
         *(view(image, wp.float32), _taps(image), wp.vec2(*limits)),
@@ -251,7 +252,7 @@ def _missing(groups: int, length: int) -> torch.Tensor:
     columns = length // ssim.CHANNELS
     tap = np.arange(columns)[:, None] + np.arange(ssim.WINDOW) - ssim.RADIUS
     share = ((tap < 0) | (tap >= columns)) @ np.array(list(ssim.WEIGHTS))
-    missing = torch.zeros(groups * LANES)
+    missing = torch.zeros(groups * LANES, dtype=torch.float32, device="cpu")
     missing[:length] = torch.from_numpy(np.repeat(share, ssim.CHANNELS))
     return missing.view(groups, LANES)
 
