@@ -218,10 +218,8 @@ def _bands(height: int) -> tuple[torch.Tensor, int]:
 
 def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor) -> list:
     """What both kernels read of [H, L]: the image and its limits; the target as floats, and as bytes: one of them."""
-    floats, levels = (
-        target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype)
-        for dtype in (torch.float32, torch.uint8)
-    )
+    types = (torch.float32, torch.uint8)
+    floats, levels = (target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype) for dtype in types)
     return [
         *(view(image, wp.float32), _taps(image), wp.vec2(*limits)),
         *(view(floats, wp.float32), _taps(floats), view(levels, wp.uint8), _taps(levels, ssim.vec16b)),
