@@ -44,7 +44,9 @@ KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 
 
 def train(config: TrainConfig) -> int:
-    """Train as ``config`` says; returns the process's exit code (130 if interrupted, with the model saved).
+    """Train as ``config`` says; returns the process's exit code.
+
+    130: interrupted, with the model saved. 1: the model had no room in its folder and was saved elsewhere.
 
     Raises:
         InputError: if an option, the scene or the output folder is not usable.
@@ -137,6 +139,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
 def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
     """Train, save, and tell; returns the process's exit code."""
     processes, end = trainer.processes, trainer.config.iterations
+    saved = None
     with _watched(trainer, run) as viewer:
         with interruptible() as interrupted:
             if viewer:  # only now: who has read it may press Ctrl-C
@@ -148,7 +151,8 @@ def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
                 return 1
             finally:  # whatever happened, the model comes first
                 if processes.rank == 0 or processes.lost:
-                    print(f"Model after {run.iteration} iterations: {save_model(trainer, run)}")
+                    saved = save_model(trainer, run)
+                    print(f"Model after {run.iteration} iterations: {saved}")
                 if run.kept is not None and run.iteration < end:
                     print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
         if viewer:
@@ -157,6 +161,9 @@ def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
             finish(trainer, run, say)
         if viewer and run.iteration == end:
             viewer.linger()
+    if saved and saved != model_folder.ply_path(run.folder, run.iteration):
+        tqdm.write(f"The model is not in {run.folder}, but in {saved}; make room and move it.", file=sys.stderr)
+        return 1
     return 130 if run.iteration < end else 0
 
 
