@@ -67,6 +67,7 @@ def test_self_test(adjoint, device):
 def test_kernels_that_do_nothing_are_found(monkeypatch):
     monkeypatch.setattr(lanes, "launch", lambda *arguments, **options: None)
     monkeypatch.setattr(torch, "empty", torch.zeros)
+    monkeypatch.setattr(torch.Tensor, "new_empty", torch.Tensor.new_zeros)
     with pytest.raises(InputError, match=r"--device cpu: the self-test expected 0\.\d+ as a pixel and found 0: "):
         selftest.check_device(CPU)
 
