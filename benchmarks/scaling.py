@@ -250,8 +250,7 @@ def report(out: Path | None, found: dict[str, list[dict]]) -> None:
             "Exponents of time and of memory beyond the loaded process: against what the sweep varies, over all of it "
             "and between its last two points, and against tile instances. These fall behind the Gaussians, because "
             "those shrink, and behind the pixels; in the sweep of the depth, where Gaussians grow, they change, and so "
-            "does how much of its tile each covers (in one view 140, then 180 of 256 pixels at the last two points), "
-            "hence more than 1 in the blends:",
+            "does how much of its tile each covers:",
             format_table(("sweep", *over), exponents(found)),
             "Exponents of the stages, each over the sweep in which only that varies which the stage follows:",
             format_table(("stage", "follows", "ms at its end", "exponent", "its end"), stage_exponents(found)),
