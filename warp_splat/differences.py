@@ -144,7 +144,7 @@ def _growth(scene: MovableScene, name: str, step: torch.Tensor) -> torch.Tensor:
     determinant's growth comes from det(I + covariance step): the entries of a needle's conic cancel in the determinant.
     """
     if name not in ("conics", "opacities2d"):
-        return torch.ones(1, device=step.device)
+        return step.new_ones(1)
     least = max(scene.options.alpha_min, 1e-37)
     opacities = scene.out.opacities2d.double()
     reach = (2 * (opacities / least).log()).clamp_min(1e-6)
@@ -186,7 +186,7 @@ def _random_step(scene: MovableScene, name: str, share: float) -> torch.Tensor:
     Only a ``share`` of the rows moves.
     """
     value = scene.tensor(name)
-    signs = 2.0 * torch.randint(0, 2, value.shape, generator=scene.generator).to(value.device) - 1
+    signs = 2.0 * torch.randint(0, 2, value.shape, generator=scene.generator, device="cpu").to(value) - 1
     if name == "conics":  # root' signs root: the ellipse changes by the same share along either axis
         xx, xy, yy = value.double().unbind(1)
         a = xx.sqrt()
@@ -200,7 +200,8 @@ def _random_step(scene: MovableScene, name: str, share: float) -> torch.Tensor:
     step = wanted.sign() * torch.maximum(LEAST * wanted.abs(), 4 * place)
     step = torch.nan_to_num((value + step.float()) - value)
     if share < 1:
-        step[(torch.rand(len(step), generator=scene.generator, device="cpu") >= share).to(step.device)] = 0
+        drawn = torch.rand(len(step), generator=scene.generator, dtype=torch.float32, device="cpu")
+        step[(drawn >= share).to(step.device)] = 0
     return step
 
 
@@ -221,7 +222,7 @@ def _extrapolate(scene: MovableScene, rung: int, far: tuple, near: tuple) -> Quo
     even = (plus + minus) - 4 * (near_plus + near_minus) + 6 * base
     kept = _is_smooth(odd, largest) & _is_smooth(even, largest)
     moved = ((plus != base) | (minus != base)).any(2)
-    pixels = float((kept & moved).sum() / moved.sum()) if moved.any() else 1.0
+    pixels = int((kept & moved).sum()) / int(moved.sum()) if moved.any() else 1.0
     spread, quotient = odd[kept] / (2 * h), (near_plus - near_minus)[kept] / h
     value = float(((quotient - spread / 3) * scene.weights[kept]).sum())
     rounded = max(int((kept & moved).sum()), 1)

@@ -201,7 +201,7 @@ def _find_worst(scene: MovableScene, name: str, trials: list[Trial]) -> WorstGau
     trial = max(trials, key=lambda trial: trial.gap)
     sizes = (trial.gradient * trial.step).abs().reshape(len(trial.step), -1).sum(1)
     peaks = sizes.topk(min(PEAKS, len(sizes))).indices
-    rows = torch.arange(len(sizes))
+    rows = torch.arange(len(sizes), device="cpu")
     while len(rows) > 1:
         halves = {half: _try_rows(scene, name, trial.step, half, (trial.quotient.rung,)) for half in rows.chunk(2)}
         rows = max(halves, key=lambda half: halves[half].gap)

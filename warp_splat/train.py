@@ -46,7 +46,7 @@ KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 def train(config: TrainConfig) -> int:
     """Train as ``config`` says; returns the process's exit code.
 
-    130: interrupted, with the model saved. 1: the model had no room in its folder and was saved elsewhere.
+    1: the model could not be written into its folder and was saved elsewhere. 130: interrupted, the model saved.
 
     Raises:
         InputError: if an option, the scene or the output folder is not usable.
@@ -162,7 +162,7 @@ def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
         if viewer and run.iteration == end:
             viewer.linger()
     if saved and saved != model_folder.ply_path(run.folder, run.iteration):
-        tqdm.write(f"The model is not in {run.folder}, but in {saved}; make room and move it.", file=sys.stderr)
+        tqdm.write(f"The model is not in {run.folder}, but in {saved}; see the warning, and move it.", file=sys.stderr)
         return 1
     return 130 if run.iteration < end else 0
 
