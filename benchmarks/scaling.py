@@ -53,8 +53,8 @@ FOLLOWS = {
     "Adam": "gaussians",
 }
 VARIES = {"gaussians": "gaussians", "pixels": "pixels", "instances": "depth"}  # in which sweep that alone varies
-SECONDS = 5.0  # of the steps at one point, after three to warm up
-REPEATS = (3, 15)  # at least, at most
+SECONDS = 5.0  # of the steps at one point, after three to warm up, but
+REPEATS = (3, 15)  # so many at least, at most
 HEADERS = (
     *("sweep", "Gaussians", "width", "height", "tile instances", "listed per px", "ms per step", "ns per instance"),
     *("peak MiB", "forecast MiB", "forecast / peak"),
@@ -68,7 +68,7 @@ GROWTH = (
 
 
 def measure(
-    count: int, width: int, height: int, size: float, faint: bool, seconds: float = SECONDS, kinds: tuple = ()
+    count: int, width: int, height: int, size: float, faint: bool, repeats: tuple = REPEATS, kinds: tuple = ()
 ) -> dict:
     """One point, in this process: milliseconds of a step and of its stages, peak and forecast in MiB.
 
@@ -89,7 +89,7 @@ def measure(
     for iteration in range(10, 13):
         take_step(trainer, iteration)
     change_set(trainer)
-    while len(steps) < REPEATS[0] or (len(steps) < REPEATS[1] and sum(steps) < seconds):
+    while len(steps) < repeats[0] or (len(steps) < repeats[1] and sum(steps) < SECONDS):
         with launch.profile() as profile:
             start = time.perf_counter()
             take_step(trainer, 13 + len(steps))

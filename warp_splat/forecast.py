@@ -46,6 +46,7 @@ PER_PIXEL = sum(
         9,  # loss: three slopes of SSIM
         7,  # rows in its rings, at most: in bands of 64 rows, the smallest
         3,  # gradient of the image; those upstream of the blend, in blocks, go where the slopes were
+        3,  # an image, for which the heap has no piece that fits
     )
 )
 MASKED = 3 + 3 + 3  # floats of a pixel more, where masks are: both images in black, and a gradient
