@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import weakref
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +129,7 @@ def test_an_interrupted_launch_waits_for_its_helpers():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background, shells have it ignored
     try:
         with pytest.raises(KeyboardInterrupt):
-            launch._Job(run, [(0, 1), (1, 2)]).share(helpers=1)
+            launch._Job([partial(run, 0, 1), partial(run, 1, 2)]).share(helpers=1)
     finally:
         signal.signal(signal.SIGINT, before)
         warp_splat.set_threads(threads)

@@ -25,9 +25,9 @@ PER_GAUSSIAN = sum(
         2 + 3 + 1 + 3 + 1 + 2 + 1 + 1,  # means2d, conics, opacities2d, colors, depths, extents, radii (twice)
         2 + 3 + 1 + 3 + 1,  # their gradients, without those of the last three
         3 + 1 + 1,  # gradients of scales and opacities before activation, and whether one is not finite
-        2 + 2 + 3,  # depths and indices in the sort, indices of the drawn (32 and 64 bits)
+        1 + 2 + 2 + 1 + 3,  # depths and indices, in the sort as well, indices of the drawn (32 and 64 bits)
         12 + 2 + 2 + 1,  # Splat2D, where its rows and places end (64 bits), and where these begin
-        2,  # its index, where its rows of gradients are summed (64 bits)
+        1,  # where its rows of gradients begin, once more
         3 + 3,  # densification: its statistics, and what is added to them
     )
 )

@@ -50,9 +50,8 @@ class _Job:
     arguments packed once for all slices, no difference).
     """
 
-    def __init__(self, run: Callable[[int, int], None], slices: list[tuple[int, int]]):
-        # each with its function: a helper that sleeps or comes late knows this job, which must not keep tensors alive
-        self.slices = [partial(run, low, high) for low, high in reversed(slices)]
+    def __init__(self, slices: list[Callable[[], None]]):
+        self.slices = slices[::-1]
         self.lock, self.idle = threading.Lock(), threading.Event()
         self.idle.set()
         self.helping = 0
@@ -203,6 +202,11 @@ def even_slices(dim: int, smallest: int = SMALLEST_SLICE) -> list[int]:
     return [dim * part // parts for part in range(parts + 1)]
 
 
+def torch_slices(dim: int) -> list[int]:
+    """:func:`even_slices` of work that torch does; a single one where torch has threads of its own, which share it."""
+    return even_slices(dim) if torch.get_num_threads() == 1 else [0, dim]
+
+
 def launch(
     kernel: wp.Kernel,
     dim: int,
@@ -210,6 +214,7 @@ def launch(
     outputs: Sequence = (),
     *,
     bounds: list[int] | None = None,
+    beside: Callable[[], None] | None = None,
     device: torch.device | str = "cpu",
     **adjoint,
 ) -> None:
@@ -221,6 +226,7 @@ def launch(
         inputs: Warp arrays, :func:`view` results, structs or scalars.
         outputs: likewise.
         bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
+        beside: other work for one of the threads of the CPU, at the same time.
         device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
@@ -238,24 +244,27 @@ def launch(
     bounds = bounds or even_slices(dim)
     if len(bounds) > 2:
         wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
-    in_slices(run, bounds)
+    in_slices(run, bounds, beside)
 
 
-def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
-    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU.
+def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callable[[], None] | None = None) -> None:
+    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU, and ``beside`` first.
 
     Slices must write different elements; what torch keeps for each thread, such as inference mode, is not passed on.
     """
-    full = [(low, high) for low, high in itertools.pairwise(bounds) if high > low]
-    helpers = min(_threads, len(full)) - 1
+    # each with its function: a helper that sleeps or comes late knows its job, which must not keep tensors alive
+    slices = [partial(run, low, high) for low, high in itertools.pairwise(bounds) if high > low]
+    if beside:
+        slices.insert(0, beside)
+    helpers = min(_threads, len(slices)) - 1
     if helpers <= 0:
-        for low, high in full:
-            run(low, high)
+        for call in slices:
+            call()
         return
     while len(_helpers) < helpers:
         _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
         _helpers[-1].start()
-    _Job(run, full).share(helpers)
+    _Job(slices).share(helpers)
 
 
 def launch_blocks(

@@ -7,17 +7,19 @@ import math
 import numpy as np
 import torch
 import warp as wp
+from torch.optim.adam import adam
 
 from warp_splat.config import TrainConfig
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.lanes import LANES
-from warp_splat.launch import launch, view
+from warp_splat.launch import in_slices, launch, torch_slices, view
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
 MOMENTS = ("exp_avg", "exp_avg_sq")
+SETTINGS = {"fused": True, "amsgrad": False, "weight_decay": 0.0, "maximize": False}
 
 
 class Optimizer:
@@ -70,11 +72,28 @@ class Optimizer:
             for group in self.adam.param_groups:
                 self._sparse_step(group, radii)
         else:
-            rest = self.model.parameters["sh_rest"]
-            if rest.grad is None:  # degree 0: gradients of zero would change nothing but the count of the steps
-                self._state(rest)["step"] += 1
-            self.adam.step()
+            self._dense_step()
         self.adam.zero_grad(set_to_none=True)
+
+    def _dense_step(self) -> None:
+        """The fused Adam of torch, the rows shared among the threads of the CPU."""
+        count, jobs = len(self.model), []
+        for group in self.adam.param_groups:
+            parameter, (beta1, beta2) = group["params"][0], group["betas"]
+            state = self._state(parameter)
+            if parameter.grad is not None:  # degree 0: zeros would change nothing but the count of the steps
+                tables = [parameter.detach(), parameter.grad, *(state[name] for name in MOMENTS)]
+                rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
+                jobs.append((tables, state["step"].clone(), rates))
+            state["step"] += 1
+
+        def run(low: int, high: int) -> None:
+            for tables, step, rates in jobs:
+                adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
+
+        # whole vectors, or the last numbers of a slice, left over, would round in another way
+        groups = [0, count] if self.model.device.type == "cuda" else torch_slices(-(-count // LANES))
+        in_slices(run, [min(LANES * bound, count) for bound in groups])
 
     def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
         """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
