@@ -11,6 +11,7 @@ from warp_splat.config import TrainConfig
 from warp_splat.distributed import ALONE, Processes
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel, along_curve
+from warp_splat.launch import in_slices, torch_slices
 from warp_splat.optimizer import Optimizer
 from warp_splat.renderer import RenderOutput
 
@@ -54,11 +55,17 @@ class Densifier:
 
     def observe(self, out: RenderOutput, width: int, height: int) -> None:
         """Take in the gradient of one view's 2D means."""
-        if out.means2d.grad is None:
+        grad = out.means2d.grad
+        if grad is None:
             return
-        x, y = (0.5 * size * out.means2d.grad[:, axis] for axis, size in enumerate((width, height)))
-        self.gradient += torch.nan_to_num(torch.hypot(x, y), 0.0, 0.0, 0.0)
-        self.views += out.radii > 0
+
+        def run(low: int, high: int) -> None:
+            rows = slice(low, high)
+            x, y = (0.5 * size * grad[rows, axis] for axis, size in enumerate((width, height)))
+            self.gradient[rows] += torch.nan_to_num(torch.hypot(x, y), 0.0, 0.0, 0.0)
+            self.views[rows] += out.radii[rows] > 0
+
+        in_slices(run, torch_slices(len(grad), grad.device))
         if self.config.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
 

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.spatial import KDTree
+from torch.autograd.function import once_differentiable
 
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.harmonics import C0
+from warp_splat.launch import in_slices, torch_slices
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
+LARGEST = 88.0  # logarithm of a scale, after which float32 ends
 CELLS = 2**20  # of the Morton curve, along an axis
 #: Shifts and masks that put two zeros between the bits of a number below 2^21.
 MORTON = (
@@ -23,6 +26,37 @@ MORTON = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
+
+
+class Activate(torch.autograd.Function):
+    """Scales from their logarithms, opacities from logits; the rows shared among the threads of the CPU."""
+
+    @staticmethod
+    def forward(ctx, logarithms, logits):
+        scales, opacities = torch.empty_like(logarithms), torch.empty_like(logits)
+
+        def run(low: int, high: int) -> None:
+            # finite; the renderer leaves out what is too large
+            torch.exp(logarithms[low:high].clamp_max(LARGEST), out=scales[low:high])
+            torch.sigmoid(logits[low:high], out=opacities[low:high])
+
+        in_slices(run, torch_slices(len(logits), logits.device))
+        ctx.save_for_backward(scales, opacities)
+        return scales, opacities
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_scales, adj_opacities):
+        scales, opacities = ctx.saved_tensors
+        adj_logarithms, adj_logits = torch.empty_like(scales), torch.empty_like(opacities)
+
+        def run(low: int, high: int) -> None:
+            torch.mul(adj_scales[low:high], scales[low:high], out=adj_logarithms[low:high])
+            torch.mul(adj_opacities[low:high], 1.0 - opacities[low:high], out=adj_logits[low:high])
+            adj_logits[low:high].mul_(opacities[low:high])
+
+        in_slices(run, torch_slices(len(opacities), opacities.device))
+        return adj_logarithms, adj_logits
 
 
 class GaussianModel:
@@ -98,8 +132,7 @@ class GaussianModel:
         return (
             raw["means"],
             raw["quats"],
-            torch.exp(raw["scales"].clamp_max(88.0)),  # finite; the renderer leaves out what is too large
-            torch.sigmoid(raw["opacities"]),
+            *Activate.apply(raw["scales"], raw["opacities"]),
             raw["sh_dc"],
             raw["sh_rest"].detach()[:, :0] if degree == 0 else raw["sh_rest"],
         )

@@ -34,6 +34,7 @@ from warp_splat.errors import InputError
 
 BLOCK = 256  # threads of a block: one per pixel of a tile
 MOST_THREADS = 1024
+WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
 SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
 
 _threads = CORES
@@ -105,6 +106,7 @@ class _Job:
                     self.idle.set()
 
 
+@torch.no_grad()
 def _help() -> None:
     """What a helper thread does: job after job."""
     while (job := _jobs.get()) is not None:
@@ -202,9 +204,14 @@ def even_slices(dim: int, smallest: int = SMALLEST_SLICE) -> list[int]:
     return [dim * part // parts for part in range(parts + 1)]
 
 
-def torch_slices(dim: int) -> list[int]:
-    """:func:`even_slices` of work that torch does; a single one where torch has threads of its own, which share it."""
-    return even_slices(dim) if torch.get_num_threads() == 1 else [0, dim]
+def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
+    """:func:`even_slices` of work that torch does; a single one where it has threads of its own, or works on a GPU.
+
+    In multiples of WIDTH: what is left over at the end of a slice, torch may round in another way.
+    """
+    if torch.get_num_threads() > 1 or torch.device(device).type == "cuda":
+        return [0, dim]
+    return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_SLICE // WIDTH)]
 
 
 def launch(
@@ -250,8 +257,10 @@ def launch(
 def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callable[[], None] | None = None) -> None:
     """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU, and ``beside`` first.
 
-    Slices must write different elements; what torch keeps for each thread, such as inference mode, is not passed on.
+    Slices must write different elements. Helpers record no gradients.
     """
+    if torch.is_inference_mode_enabled():  # which is each thread's own
+        run = torch.inference_mode()(run)
     # each with its function: a helper that sleeps or comes late knows its job, which must not keep tensors alive
     slices = [partial(run, low, high) for low, high in itertools.pairwise(bounds) if high > low]
     if beside:

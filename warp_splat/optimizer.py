@@ -77,7 +77,7 @@ class Optimizer:
 
     def _dense_step(self) -> None:
         """The fused Adam of torch, the rows shared among the threads of the CPU."""
-        count, jobs = len(self.model), []
+        jobs = []
         for group in self.adam.param_groups:
             parameter, (beta1, beta2) = group["params"][0], group["betas"]
             state = self._state(parameter)
@@ -91,9 +91,7 @@ class Optimizer:
             for tables, step, rates in jobs:
                 adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
 
-        # whole vectors, or the last numbers of a slice, left over, would round in another way
-        groups = [0, count] if self.model.device.type == "cuda" else torch_slices(-(-count // LANES))
-        in_slices(run, [min(LANES * bound, count) for bound in groups])
+        in_slices(run, torch_slices(len(self.model), self.model.device))
 
     def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
         """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
