@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,7 +17,7 @@ from warp_splat.kernels.lanes import LANES
 from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
 from warp_splat.kernels.shade import adj_shade, shade
-from warp_splat.launch import SMALLEST_SLICE, even_slices, launch, stage, view
+from warp_splat.launch import SMALLEST_SLICE, even_slices, in_slices, launch, stage, torch_slices, view
 
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView:
@@ -131,13 +132,28 @@ class Project(torch.autograd.Function):
             placed = [colored[0], *(torch.zeros_like(tensor) for tensor in (quats, scales, opacities))]
             geometry = [*outputs[:3], *outputs[4:], radii]
             project(ctx.cam, (means, quats, scales, opacities), geometry, placed, adj_outputs)
-            bad, adj_inputs = torch.zeros_like(radii), [*placed, *colored[1:]]
-            types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
-            found = [view(tensor, dtype) for tensor, dtype in zip((*adj_inputs, bad), types, strict=True)]
-            launch(quarantine, len(radii), [view(radii, wp.int32)], found, device=radii.device)
-            ctx.dropped.gaussian_count += torch.count_nonzero(bad)
+            adj_inputs = [*placed, *colored[1:]]
+            if not _all_finite(adj_inputs[:5]):  # sh_rest's are multiples of those of sh_dc
+                bad = torch.zeros_like(radii)
+                types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
+                found = [view(tensor, dtype) for tensor, dtype in zip((*adj_inputs, bad), types, strict=True)]
+                launch(quarantine, len(radii), [view(radii, wp.int32)], found, device=radii.device)
+                ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj_inputs, ctx.needs_input_grad[:6], strict=True)
         return *(adj if wants else None for adj, wants in wanted), None, None
+
+
+def _all_finite(tensors: Sequence[torch.Tensor]) -> bool:
+    """Whether ``tensors``, N rows each, are finite because their sums are. On a GPU, which one would wait for: False."""
+    if tensors[0].is_cuda:
+        return False
+    sums: list[float] = []
+
+    def run(low: int, high: int) -> None:
+        sums.extend(float(tensor[low:high].sum()) for tensor in tensors)
+
+    in_slices(run, torch_slices(len(tensors[0])))
+    return math.isfinite(sum(sums))
 
 
 def _views3d(tensors: Sequence[torch.Tensor]) -> list:
