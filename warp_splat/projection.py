@@ -144,7 +144,7 @@ class Project(torch.autograd.Function):
 
 
 def _all_finite(tensors: Sequence[torch.Tensor]) -> bool:
-    """Whether ``tensors``, N rows each, are finite because their sums are. On a GPU, which one would wait for: False."""
+    """Whether ``tensors``, N rows each, are finite because their sums are; on a GPU, one would wait for them: False."""
     if tensors[0].is_cuda:
         return False
     sums: list[float] = []
