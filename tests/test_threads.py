@@ -1,0 +1,122 @@
+"""What the threads of the CPU share of torch's work is what one of them computes alone, bit for bit."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from warp_splat import binning, launch
+from warp_splat.config import TrainConfig
+from warp_splat.densify import Densifier
+from warp_splat.gaussians import GaussianModel
+from warp_splat.optimizer import EPS, Optimizer
+
+COUNT = 5003  # no multiple of what any processor computes at once
+
+
+@pytest.fixture(params=[1, 2, 3])
+def threads(request):
+    """So many of ours, and one of torch's: with more it shares its work by itself."""
+    before, of_torch = launch.get_threads(), torch.get_num_threads()
+    launch.set_threads(request.param)
+    torch.set_num_threads(1)
+    yield request.param
+    launch.set_threads(before)
+    torch.set_num_threads(of_torch)
+
+
+@pytest.fixture
+def model():
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (15, 3), "opacities": (), "scales": (3,), "quats": (4,)}
+    return GaussianModel({name: torch.randn(COUNT, *shape, generator=generator) for name, shape in shapes.items()})
+
+
+def test_slices_cover_everything_in_whole_widths(threads):
+    for count in (0, 1, 63, 64, 65, 2047, 2048, 2049, COUNT, 10**6):
+        bounds = launch.torch_slices(count)
+        assert bounds[0] == 0 and bounds[-1] == count and bounds == sorted(bounds) and len(bounds) <= threads + 1
+        assert all(bound % launch.WIDTH == 0 for bound in bounds[:-1])
+    assert len(launch.torch_slices(10**6)) == threads + 1
+    assert launch.torch_slices(10**6, "cuda") == [0, 10**6]
+    torch.set_num_threads(2)
+    assert launch.torch_slices(10**6) == [0, 10**6]
+
+
+def test_steps_are_those_of_adam_in_torch(threads, model):
+    """The coefficients of higher degrees get no gradients at first: zeros to torch."""
+    optimizer = Optimizer(model, TrainConfig(), extent=2.0)
+    copies = {name: tensor.detach().clone().requires_grad_() for name, tensor in model.parameters.items()}
+    groups = [{"params": [copies[group["name"]]], "lr": group["lr"]} for group in optimizer.adam.param_groups]
+    expected = torch.optim.Adam(groups, eps=EPS, fused=True)
+    generator = torch.Generator().manual_seed(1)
+    for iteration in range(4):
+        for name, tensor in model.parameters.items():
+            grad = torch.randn(tensor.shape, generator=generator)
+            with_rest = name != "sh_rest" or iteration > 1
+            tensor.grad = grad if with_rest else None
+            copies[name].grad = grad.clone() if with_rest else torch.zeros_like(grad)
+        optimizer.step(torch.ones(COUNT, dtype=torch.int32))
+        expected.step()
+    for name, tensor in model.parameters.items():
+        assert torch.equal(tensor, copies[name]) and tensor.grad is None
+        state, known = optimizer.adam.state[tensor], expected.state[copies[name]]
+        assert all(torch.equal(state[key], known[key]) for key in ("step", "exp_avg", "exp_avg_sq"))
+
+
+def test_activations_are_those_of_torch(threads, model):
+    with torch.no_grad():
+        model.parameters["scales"][:2] = torch.tensor([[90.0], [-200.0]])
+    raw = {name: model.parameters[name].detach().clone().requires_grad_() for name in ("scales", "opacities")}
+    expected = torch.exp(raw["scales"].clamp_max(88.0)), torch.sigmoid(raw["opacities"])
+    found = model.activated()[2:4]
+    upstream = [torch.randn(tensor.shape, generator=torch.Generator().manual_seed(2)) for tensor in expected]
+    upstream[0][0] = 0.0  # as of any Gaussian that is too large to be drawn
+    torch.autograd.backward(found, upstream)
+    torch.autograd.backward(expected, upstream)
+    for name, one, other in zip(raw, found, expected, strict=True):
+        assert torch.equal(one, other) and torch.equal(model.parameters[name].grad, raw[name].grad)
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad, torch.enable_grad])
+def test_activations_in_any_mode_of_torch(threads, model, mode):
+    expected = [tensor.detach() for tensor in model.activated()]
+    with mode():
+        found = model.activated()
+    assert all(torch.equal(one, other) for one, other in zip(found, expected, strict=True))
+
+
+def test_statistics_are_those_of_all_rows(threads, model):
+    config = TrainConfig()
+    densifier = Densifier(model, Optimizer(model, config, 1.0), config, 1.0)
+    grad = torch.randn(COUNT, 2, generator=torch.Generator().manual_seed(3))
+    grad[7] = torch.inf
+    radii = (grad[:, 0] > 0).int()
+    densifier.observe(SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=radii), 100, 50)
+    norms = torch.hypot(50.0 * grad[:, 0], 25.0 * grad[:, 1])
+    norms[7] = 0.0
+    assert torch.equal(densifier.gradient, norms) and torch.equal(densifier.views, radii.float())
+
+
+def test_rows_are_taken_and_put(threads):
+    rng = np.random.default_rng(0)
+    order, values = rng.permutation(COUNT).astype(np.int32), rng.integers(0, 10**9, COUNT).astype(np.int32)
+    assert (binning._taken(values, order) == values[order]).all()
+    assert (binning._put(values.astype(np.int64), order)[order] == values).all()
+    assert len(binning._taken(values, order[:0])) == len(binning._put(values[:0], order[:0])) == 0
+
+
+def test_what_runs_beside_runs_once(threads):
+    done = []
+    for bounds in ([0, 0], [0, 5], [0, 1, 2, 3, 4, 5]):
+        launch.in_slices(lambda low, high: done.extend(range(low, high)), bounds, lambda: done.append("beside"))
+    assert done.count("beside") == 3 and all(done.count(number) == 2 for number in range(5))
+
+
+def test_an_error_beside_reaches_the_caller(threads):
+    def fail() -> None:
+        raise ValueError("beside")
+
+    with pytest.raises(ValueError, match="beside"):
+        launch.in_slices(lambda low, high: None, [0, 1, 2, 3], fail)
