@@ -1,24 +1,40 @@
 """What the threads of the CPU share of torch's work is what one of them computes alone, bit for bit."""
 
+import hashlib
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
-from warp_splat import binning, launch
+from warp_splat import Camera, binning, launch, projection, rasterize
 from warp_splat.config import TrainConfig
 from warp_splat.densify import Densifier
 from warp_splat.gaussians import GaussianModel
+from warp_splat.kernels.project import quarantine
 from warp_splat.optimizer import EPS, Optimizer
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from gpu_scene import make_trainer
 
 COUNT = 5003  # no multiple of what any processor computes at once
 
 
+@wp.kernel
+def double(first: int, values: wp.array[float], doubles_out: wp.array[float]):
+    i = first + wp.tid()
+    doubles_out[i] = 2.0 * values[i]
+
+
 @pytest.fixture(params=[1, 2, 3])
-def threads(request):
+def threads(request, monkeypatch):
     """So many of ours, and one of torch's: with more it shares its work by itself."""
     before, of_torch = launch.get_threads(), torch.get_num_threads()
+    monkeypatch.setattr(launch, "SMALLEST_OF_TORCH", 1024)
     launch.set_threads(request.param)
     torch.set_num_threads(1)
     yield request.param
@@ -67,16 +83,16 @@ def test_steps_are_those_of_adam_in_torch(threads, model):
 
 def test_activations_are_those_of_torch(threads, model):
     with torch.no_grad():
-        model.parameters["scales"][:2] = torch.tensor([[90.0], [-200.0]])
+        model.parameters["scales"][:3] = torch.tensor([[90.0], [-200.0], [float("nan")]])
     raw = {name: model.parameters[name].detach().clone().requires_grad_() for name in ("scales", "opacities")}
     expected = torch.exp(raw["scales"].clamp_max(88.0)), torch.sigmoid(raw["opacities"])
     found = model.activated()[2:4]
     upstream = [torch.randn(tensor.shape, generator=torch.Generator().manual_seed(2)) for tensor in expected]
-    upstream[0][0] = 0.0  # as of any Gaussian that is too large to be drawn
     torch.autograd.backward(found, upstream)
     torch.autograd.backward(expected, upstream)
     for name, one, other in zip(raw, found, expected, strict=True):
-        assert torch.equal(one, other) and torch.equal(model.parameters[name].grad, raw[name].grad)
+        assert torch.equal(one.nan_to_num(), other.nan_to_num()) and torch.equal(one.isnan(), other.isnan())
+        assert torch.equal(model.parameters[name].grad, raw[name].grad)
 
 
 @pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad, torch.enable_grad])
@@ -112,6 +128,63 @@ def test_what_runs_beside_runs_once(threads):
     for bounds in ([0, 0], [0, 5], [0, 1, 2, 3, 4, 5]):
         launch.in_slices(lambda low, high: done.extend(range(low, high)), bounds, lambda: done.append("beside"))
     assert done.count("beside") == 3 and all(done.count(number) == 2 for number in range(5))
+
+
+@pytest.mark.parametrize("dim", [0, 5, 5000])
+def test_what_runs_beside_a_launch_runs_once(threads, dim):
+    done, values, found = [], torch.rand(dim), torch.zeros(dim)
+    arrays = [[launch.view(tensor, wp.float32)] for tensor in (values, found)]
+    launch.launch(double, dim, *arrays, beside=lambda: done.append("beside"))
+    assert done == ["beside"] and torch.equal(found, 2.0 * values)
+
+
+@pytest.mark.parametrize(
+    ("rows", "value", "finite"), [([], 0.0, True), ([COUNT - 1], torch.nan, False), ([0, -1], torch.inf, False)]
+)
+def test_sums_find_what_is_not_finite(threads, rows, value, finite):
+    tensors = [torch.ones(COUNT, 3), torch.ones(COUNT)]
+    for row, sign in zip(rows, (1.0, -1.0), strict=False):
+        tensors[0][row] = sign * value
+    assert projection._all_finite(tensors) == finite
+
+
+def test_a_sum_that_overflows_drops_nothing():
+    """All is finite, though no sum says so."""
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(3), np.zeros(3))
+    grid = torch.cartesian_prod(torch.linspace(-0.8, 0.8, 20), torch.linspace(-0.6, 0.6, 20))
+    means = torch.cat([grid, torch.full((400, 1), 2.0)], 1).requires_grad_()
+    quats, scales = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(400, 1), torch.full((400, 3), 0.03)
+    sh = torch.zeros(400, 1, 3).requires_grad_()
+    out = rasterize(means, quats, scales, torch.full((400,), 0.9), sh, camera)
+    out.image.backward(torch.full_like(out.image, 1e36))
+    assert torch.isinf(sh.grad.sum()) and torch.isfinite(sh.grad).all() and (sh.grad > 1e35).all()
+    assert torch.isfinite(means.grad).all() and means.grad.any() and out.dropped.gaussians == 0
+
+
+def test_warming_up_loads_what_only_a_bad_gradient_needs():
+    trainer = make_trainer(100, 64, 48, "cpu")
+    quarantine.module.unload()
+    trainer.warm_up()
+    assert quarantine.module.execs
+
+
+def state_after_steps() -> str:
+    """All that four steps leave, from degree 0 to degree 3."""
+    trainer = make_trainer(COUNT, 64, 48, "cpu")
+    trainer.degree = 0
+    digest = hashlib.sha256()
+    for iteration in range(4):
+        trainer.differentiate(iteration)
+        trainer.update(iteration)
+    for name, tensor in trainer.state()[0].items():
+        digest.update(name.encode() + tensor.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def test_a_training_is_the_same_on_any_number_of_threads(threads):
+    found = state_after_steps()
+    launch.set_threads(1)
+    assert found == state_after_steps()
 
 
 def test_an_error_beside_reaches_the_caller(threads):

@@ -111,6 +111,10 @@ def _gather_in_pieces(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor]
 
     def run(low: int, high: int) -> None:
         first, last = np.searchsorted(gaussians, np.array([low, high], dtype=np.int32))
+        if first == last:
+            for column in columns:
+                column[low:high] = 0.0
+            return
         # those that are not drawn have no slots: theirs begin where the next one's do
         repeats = np.diff(gaussians[first:last], prepend=low - 1, append=high - 1)
         places = bins.places[begins[first] : begins[last]]

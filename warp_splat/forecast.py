@@ -1,7 +1,7 @@
 """How much memory training will take, told before it does: the tensors of a step on the CPU, counted.
 
-They are counted as if few took the place of one that was freed, since the pieces of a heap seldom fit what comes next:
-``benchmarks/scaling.py`` compares with measured peaks.
+They are counted as if few took the place of one that was freed, since the pieces of a heap seldom fit what comes next,
+and one image is added for what such pieces still leave unused: ``benchmarks/scaling.py`` compares with measured peaks.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ COPIES = 4  # of a parameter: itself, its gradient, and the two moments of Adam
 #: Floats of a Gaussian besides its parameters.
 PER_GAUSSIAN = sum(
     (
-        3 + 3 + 1,  # clamped scales, scales, opacities
+        3 + 1,  # scales, opacities
         2 + 3 + 1 + 3 + 1 + 2 + 1 + 1,  # means2d, conics, opacities2d, colors, depths, extents, radii (twice)
         2 + 3 + 1 + 3 + 1,  # their gradients, without those of the last three
-        3 + 1 + 1,  # gradients of scales and opacities before activation, and whether one is not finite
+        3 + 1,  # gradients of scales and opacities before activation
         1 + 2 + 2 + 1 + 3,  # depths and indices, in the sort as well, indices of the drawn (32 and 64 bits)
         12 + 2 + 2 + 1,  # Splat2D, where its rows and places end (64 bits), and where these begin
         1,  # where its rows of gradients begin, once more

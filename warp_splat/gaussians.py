@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from warp_splat.launch import in_slices, torch_slices
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
-LARGEST = 88.0  # logarithm of a scale, after which float32 ends
+LARGEST = 88.0  # logarithm of a scale; float32 ends soon after
 CELLS = 2**20  # of the Morton curve, along an axis
 #: Shifts and masks that put two zeros between the bits of a number below 2^21.
 MORTON = (
@@ -36,7 +37,7 @@ class Activate(torch.autograd.Function):
         scales, opacities = torch.empty_like(logarithms), torch.empty_like(logits)
 
         def run(low: int, high: int) -> None:
-            # finite; the renderer leaves out what is too large
+            # finite: the renderer leaves out what is too large
             torch.exp(logarithms[low:high].clamp_max(LARGEST), out=scales[low:high])
             torch.sigmoid(logits[low:high], out=opacities[low:high])
 
@@ -49,9 +50,13 @@ class Activate(torch.autograd.Function):
     def backward(ctx, adj_scales, adj_opacities):
         scales, opacities = ctx.saved_tensors
         adj_logarithms, adj_logits = torch.empty_like(scales), torch.empty_like(opacities)
+        end = math.exp(LARGEST)
 
         def run(low: int, high: int) -> None:
-            torch.mul(adj_scales[low:high], scales[low:high], out=adj_logarithms[low:high])
+            part = scales[low:high]
+            torch.mul(adj_scales[low:high], part, out=adj_logarithms[low:high])
+            if scales.is_cuda or not part.max() < end:  # the clamp's share, rarely: zero beyond it, and of no number
+                adj_logarithms[low:high].masked_fill_(~(part < end), 0.0)
             torch.mul(adj_opacities[low:high], 1.0 - opacities[low:high], out=adj_logits[low:high])
             adj_logits[low:high].mul_(opacities[low:high])
 

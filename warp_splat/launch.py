@@ -34,8 +34,9 @@ from warp_splat.errors import InputError
 
 BLOCK = 256  # threads of a block: one per pixel of a tile
 MOST_THREADS = 1024
-WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
 SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
+SMALLEST_OF_TORCH = 2**16  # likewise, of rows for torch, which takes less time and more of the interpreter's lock
+WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
 
 _threads = CORES
 _helpers: list[threading.Thread] = []
@@ -165,9 +166,8 @@ def prepare(device: str, threads: int) -> torch.device:
     """
     wp.config.log_level = wp.LOG_ERROR  # no list of devices and modules
     chosen = choose_device(device)
-    # torch: one thread. Its elementwise work here is bound by memory (Adam on 200k Gaussians: 6.7 ms against 5.7 ms
-    # with two), its sums would depend on the number of threads, and its idle threads would spin beside ours, which call
-    # torch as well
+    # torch: one thread. Its sums would depend on the number of threads, and its idle threads would spin beside ours,
+    # which call torch as well and share its work on many rows (torch_slices)
     torch.set_num_threads(1)
     if threads:
         set_threads(threads)
@@ -211,7 +211,7 @@ def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
     """
     if torch.get_num_threads() > 1 or torch.device(device).type == "cuda":
         return [0, dim]
-    return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_SLICE // WIDTH)]
+    return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_OF_TORCH // WIDTH)]
 
 
 def launch(
@@ -233,22 +233,25 @@ def launch(
         inputs: Warp arrays, :func:`view` results, structs or scalars.
         outputs: likewise.
         bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
-        beside: other work for one of the threads of the CPU, at the same time.
+        beside: other work, done at the same time where threads share the launch, else before it.
         device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
+    on_gpu, bounds = torch.device(device).type == "cuda", bounds or even_slices(dim)
+    if beside and (on_gpu or len(bounds) <= 2):  # nothing to share
+        beside()
+        beside = None
     if dim == 0:
         return
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
-    if torch.device(device).type == "cuda":
+    if on_gpu:
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, stream=_stream(device), **adjoint)
         return
 
     def run(low: int, high: int) -> None:
         wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
 
-    bounds = bounds or even_slices(dim)
     if len(bounds) > 2:
         wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
     in_slices(run, bounds, beside)
@@ -274,6 +277,11 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callab
         _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
         _helpers[-1].start()
     _Job(slices).share(helpers)
+
+
+def load(kernel: wp.Kernel, device: torch.device) -> None:
+    """Compile and load ``kernel``, and what else is in its module."""
+    wp.load_module(kernel.module, device=wp.device_from_torch(device))
 
 
 def launch_blocks(

@@ -23,7 +23,7 @@ SETTINGS = {"fused": True, "amsgrad": False, "weight_decay": 0.0, "maximize": Fa
 
 
 class Optimizer:
-    """torch's Adam with one group per parameter, or its sparse variant.
+    """Adam with one group per parameter, or its sparse variant, whose moments torch's optimizer keeps.
 
     Args:
         model: whose parameters are updated in place.
@@ -41,7 +41,7 @@ class Optimizer:
         names = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
         groups = [{"name": name, "params": [model.parameters[name]]} for name in names]
         betas = (BETAS[0] ** batch, BETAS[1] ** batch)
-        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale, fused=True)
+        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale)
         self._groups = {group["name"]: group for group in self.adam.param_groups}
         self.set_iteration(0)
 
@@ -77,21 +77,23 @@ class Optimizer:
 
     def _dense_step(self) -> None:
         """The fused Adam of torch, the rows shared among the threads of the CPU."""
-        jobs = []
+        jobs, steps = [], []
         for group in self.adam.param_groups:
             parameter, (beta1, beta2) = group["params"][0], group["betas"]
             state = self._state(parameter)
+            steps.append(state["step"])
             if parameter.grad is not None:  # degree 0: zeros would change nothing but the count of the steps
                 tables = [parameter.detach(), parameter.grad, *(state[name] for name in MOMENTS)]
                 rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
-                jobs.append((tables, state["step"].clone(), rates))
-            state["step"] += 1
+                jobs.append((tables, state["step"], rates))
 
         def run(low: int, high: int) -> None:
             for tables, step, rates in jobs:
                 adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
 
         in_slices(run, torch_slices(len(self.model), self.model.device))
+        for count in steps:
+            count.add_(1)
 
     def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
         """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
@@ -116,7 +118,7 @@ class Optimizer:
         """Moments and number of steps, as torch's Adam keeps them."""
         state = self.adam.state[parameter]
         if not state:
-            step = torch.zeros((), device=parameter.device)
+            step = torch.zeros((), dtype=torch.float32, device=parameter.device)
             state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=step)
         return state
 
@@ -181,7 +183,7 @@ class Optimizer:
             leaf.grad = tables.get("gradients")
             if moments:
                 images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
-                step = torch.tensor(float(images / self.batch), device=leaf.device)
+                step = torch.tensor(float(images / self.batch), dtype=torch.float32, device=leaf.device)
                 self.adam.state[leaf] = {"step": step, **{moment: tables[moment] for moment in MOMENTS}}
 
     def _swap(self, name: str, values: torch.Tensor) -> None:

@@ -144,7 +144,7 @@ class Project(torch.autograd.Function):
 
 
 def _all_finite(tensors: Sequence[torch.Tensor]) -> bool:
-    """Whether ``tensors``, N rows each, are finite because their sums are; on a GPU, one would wait for them: False."""
+    """Whether the sums of ``tensors``, N rows each, are finite: then all is. Not asked on a GPU, which would stop."""
     if tensors[0].is_cuda:
         return False
     sums: list[float] = []

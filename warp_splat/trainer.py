@@ -20,7 +20,8 @@ from warp_splat.distributed import ALONE, Processes
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
-from warp_splat.launch import stage
+from warp_splat.kernels.project import quarantine
+from warp_splat.launch import load, stage
 from warp_splat.losses import image_loss
 from warp_splat.metrics import psnr
 from warp_splat.optimizer import Optimizer
@@ -156,6 +157,7 @@ class Trainer:
         out = self._render(camera, self.background)
         image_loss(out.image, torch.zeros_like(out.image), self.config.lambda_dssim).backward()
         self.optimizer.adam.zero_grad(set_to_none=True)
+        load(quarantine, self.device)  # launched only where a gradient is not finite
 
     def check_identical(self, iteration: int) -> None:
         """Raise GroupError if the model is not the same, byte for byte, in all processes."""
