@@ -171,7 +171,6 @@ def test_warming_up_loads_what_only_a_bad_gradient_needs():
 def state_after_steps() -> str:
     """All that four steps leave, from degree 0 to degree 3."""
     trainer = make_trainer(COUNT, 64, 48, "cpu")
-    trainer.degree = 0
     digest = hashlib.sha256()
     for iteration in range(4):
         trainer.differentiate(iteration)

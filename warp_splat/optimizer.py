@@ -92,8 +92,8 @@ class Optimizer:
                 adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
 
         in_slices(run, torch_slices(len(self.model), self.model.device))
-        for count in steps:
-            count.add_(1)
+        for step in steps:
+            step.add_(1)
 
     def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
         """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
