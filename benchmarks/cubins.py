@@ -37,7 +37,8 @@ def modules() -> dict[str, wp.Module]:
     """What runs on CUDA, by the name under which it is listed."""
     found = {
         "project": project.make_project(1).module,
-        "shade": shade.shade.module,
+        "shade": shade.make_shade(1).module,
+        "adjoint of shade": shade.make_adj_shade(1).module,
         "quarantine": project.quarantine.module,
         "adam": make_adam(15, 3).module,
         "tiles": tiles.pack.module,

@@ -87,6 +87,23 @@ def test_exp(degree, allowed):
     assert np.abs(lanes.numpy() - scalar.numpy()[:, None]).max() < 1e-7
 
 
+def test_log():
+    log_of = blend.log_of
+
+    @wp.kernel(module="unique")
+    def evaluate(x: wp.array[float], out: wp.array[float]):
+        i = wp.tid()
+        out[i] = log_of(x[i])
+
+    near = 1.0 + np.linspace(-1e-3, 1e-3, 1001)
+    x = np.concatenate([np.exp(np.linspace(-87, 88.7, 100001)), near, [1.0, 0.0, -1.0, np.inf]]).astype(np.float32)
+    out = wp.empty(len(x), dtype=float, device="cpu")
+    wp.launch(evaluate, len(x), [wp.array(x, dtype=float, device="cpu")], [out], device="cpu")
+    found, truth = out.numpy(), np.log(x[:-3].astype(np.float64))
+    assert (np.abs(found[:-3] - truth) <= 3e-7 * np.abs(truth)).all()
+    assert found[-3:] == pytest.approx([-88.03, -88.03, 88.72], abs=0.01)
+
+
 def test_adjoint_stands_behind_its_forward():
     source = Path(inspect.getfile(blend)).read_text()
     for name in PAIRS:

@@ -21,7 +21,7 @@ OPTIONS = {
 
 
 def gaussians(count):
-    """Of degree 2, some behind the camera, beside the image, too faint, or not finite."""
+    """Of degree 3, some behind the camera, beside the image, too faint, or not finite."""
     generator = torch.Generator().manual_seed(count)
 
     def normal(*shape):
@@ -30,7 +30,7 @@ def gaussians(count):
     means = 1.5 * normal(count, 3) + torch.tensor([0.0, 0.0, 2.5])
     quats, scales = normal(count, 4), torch.exp(normal(count, 3) - 3.0)
     opacities = torch.rand(count, generator=generator) ** 3
-    sh_dc, sh_rest = normal(count, 1, 3), 0.3 * normal(count, 8, 3)
+    sh_dc, sh_rest = normal(count, 1, 3), 0.3 * normal(count, 15, 3)
     if count > 16:
         means[:7] = torch.tensor([0.0, 0.0, 3.0])
         opacities[:7] = 1.0
@@ -50,7 +50,7 @@ def project(count, options, sets=1, left_out=None, spread=False):
     """
     inputs = [tensor.requires_grad_() for tensor in gaussians(count)]
     given = [torch.stack([tensor, tensor], -1)[..., 0] for tensor in inputs] if spread else inputs
-    outputs = Project.apply(*given, camera_view(CAMERA, 8, options), Dropped())
+    outputs = Project.apply(*given, camera_view(CAMERA, 15, options), Dropped())
     generator = torch.Generator().manual_seed(1)
     upstream = [torch.randn(output.shape, generator=generator) for output in outputs[:5]]
     if left_out is not None:
@@ -98,9 +98,27 @@ def test_a_color_is_finite_even_if_the_sum_of_its_channels_is_not():
     torch.testing.assert_close(outputs[3], torch.full((1, 3), 3.4e38 * C0 + 2.0e38 * C1))
 
 
+@pytest.mark.parametrize("exponent", [-100, -60, -31, -30, -29, 29, 30, 31, 60, 100])
+def test_quaternions_of_any_norm(exponent):
+    """A power of two: the same Gaussian, bit for bit, and the gradient of its inverse."""
+    means, quats, *others = gaussians(16)
+
+    def derived(factor):
+        inputs = [means, (factor * quats).requires_grad_(), *others]
+        outputs = Project.apply(*inputs, camera_view(CAMERA, 15, OPTIONS["plain"]), Dropped())
+        return outputs, torch.autograd.grad(outputs[1].sum(), inputs[1])[0]
+
+    outputs, grad = derived(1.0)
+    scaled, scaled_grad = derived(2.0**exponent)
+    assert (outputs[6] > 0).sum() > 3
+    for found, wanted in zip(scaled, outputs, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close(scaled_grad * 2.0**exponent, grad, rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("degree", [0, 1])
 def test_inactive_degrees_have_no_gradient(degree):
-    torch.full((100, 8, 3), torch.nan)  # what the next tensor of that size may find in memory
+    torch.full((100, 15, 3), torch.nan)  # what the next tensor of that size may find in memory
     _, (grads,) = project(100, RasterOptions(sh_degree=degree))
     assert grads[5][:, :3].any() == (degree > 0) and not grads[5][:, (degree + 1) ** 2 - 1 :].any()
 

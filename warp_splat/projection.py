@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.kernels.lanes import LANES
 from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
-from warp_splat.kernels.shade import adj_shade, shade
+from warp_splat.kernels.shade import make_adj_shade, make_shade, mat53, mat73
 from warp_splat.launch import SMALLEST_SLICE, even_slices, in_slices, launch, stage, torch_slices, view
 
 
@@ -102,6 +103,24 @@ def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> Non
     )
 
 
+def _by_degree(sh_rest: torch.Tensor) -> list:
+    """The coefficients of degree 1, 2 and 3; an array of none for each degree that there is not."""
+    types, bounds = (wp.mat33, mat53, mat73), (0, 3, 8, 15)
+    parts = (sh_rest[:, low:high] for low, high in itertools.pairwise(bounds))
+    return [
+        view(part if part.shape[1] == high - low else sh_rest.new_empty(0, high - low, 3), dtype)
+        for part, dtype, (low, high) in zip(parts, types, itertools.pairwise(bounds), strict=True)
+    ]
+
+
+def _launch_groups(make_kernel: Callable[[int], wp.Kernel], count: int, inputs, outputs, device: torch.device) -> None:
+    """Launch a kernel of :mod:`warp_splat.kernels.shade` on ``count`` Gaussians."""
+    lanes = 1 if device.type == "cuda" else LANES
+    groups = -(-count // lanes)
+    bounds = even_slices(groups, SMALLEST_SLICE // lanes)
+    launch(make_kernel(lanes), groups, inputs, outputs, bounds=bounds, device=device)
+
+
 class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
@@ -112,8 +131,8 @@ class Project(torch.autograd.Function):
         outputs = (new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2))
         radii = torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device)
         project(cam, inputs[:4], [*outputs[:3], *outputs[4:], radii])
-        results = [*views2d(outputs), view(radii, wp.int32)]
-        launch(shade, count, [cam, *_views3d([inputs[0], *inputs[4:]])], results, device=radii.device)
+        given = [cam, *_views3d([inputs[0], inputs[4][:, 0]]), *_by_degree(inputs[5])]
+        _launch_groups(make_shade, count, given, [*views2d(outputs), view(radii, wp.int32)], radii.device)
         ctx.save_for_backward(*inputs, *outputs, radii)
         ctx.cam, ctx.dropped = cam, dropped
         ctx.mark_non_differentiable(outputs[5], radii)
@@ -127,8 +146,10 @@ class Project(torch.autograd.Function):
             adj_outputs = [adj.contiguous() for adj in adj_outputs[:5]]
             adj_colors = adj_outputs.pop(3)
             colored = [torch.empty_like(tensor) for tensor in (means, sh_dc, sh_rest)]
-            given = [*_views3d((means, sh_rest, outputs[3])), view(radii, wp.int32), *_views3d([adj_colors])]
-            launch(adj_shade, len(radii), [ctx.cam, *given], _views3d(colored), device=radii.device)
+            drawn, (means3d, colors, adj_colors) = view(radii, wp.int32), _views3d([means, outputs[3], adj_colors])
+            given = [ctx.cam, means3d, *_by_degree(sh_rest), colors, drawn, adj_colors]
+            found = [*_views3d([colored[0], colored[1][:, 0]]), *_by_degree(colored[2])]
+            _launch_groups(make_adj_shade, len(radii), given, found, radii.device)
             placed = [colored[0], *(torch.zeros_like(tensor) for tensor in (quats, scales, opacities))]
             geometry = [*outputs[:3], *outputs[4:], radii]
             project(ctx.cam, (means, quats, scales, opacities), geometry, placed, adj_outputs)
@@ -137,7 +158,7 @@ class Project(torch.autograd.Function):
                 bad = torch.zeros_like(radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 found = [view(tensor, dtype) for tensor, dtype in zip((*adj_inputs, bad), types, strict=True)]
-                launch(quarantine, len(radii), [view(radii, wp.int32)], found, device=radii.device)
+                launch(quarantine, len(radii), [drawn], found, device=radii.device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj_inputs, ctx.needs_input_grad[:6], strict=True)
         return *(adj if wants else None for adj, wants in wanted), None, None

@@ -1,12 +1,14 @@
 """Real spherical harmonics up to degree 3, with the signs of the reference implementation."""
 
+import functools
+from typing import NamedTuple
+
 import warp as wp
 
 from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.numbers import make_numbers
 
 wp.set_module_options(FORWARD_ONLY)
-
-vec15 = wp.types.vector(length=15, dtype=float)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -20,39 +22,72 @@ C3A, C3B, C3C, C3D, C3E = (
 )
 
 
-@wp.func
-def basis(degree: int, d: wp.vec3):
-    """Values of the functions of degree 1 to ``degree`` in unit direction ``d``; 0 beyond."""
-    b = vec15()
-    if degree > 0:
-        x = d[0]
-        y = d[1]
-        z = d[2]
-        b[0] = -C1 * y
-        b[1] = C1 * z
-        b[2] = -C1 * x
-        if degree > 1:
-            xx = x * x
-            yy = y * y
-            zz = z * z
-            b[3] = C2A * x * y
-            b[4] = -C2A * y * z
-            b[5] = C2B * (2.0 * zz - xx - yy)
-            b[6] = -C2A * x * z
-            b[7] = C2C * (xx - yy)
-            if degree > 2:
-                shared = -C3C * (4.0 * zz - xx - yy)
-                b[8] = -C3A * y * (3.0 * xx - yy)
-                b[9] = C3B * x * y * z
-                b[10] = shared * y
-                b[11] = C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)
-                b[12] = shared * x
-                b[13] = C3E * z * (xx - yy)
-                b[14] = -C3A * x * (xx - 3.0 * yy)
-    return b
+class Harmonics(NamedTuple):
+    """The functions of degree 1 to 3 for a number of lanes."""
+
+    table: type  # 15 rows of lanes, one for each function
+    evaluate: wp.Function  # their values in the direction of an offset
+    weigh: wp.Function  # these, weighted, summed over all lanes: what one differentiates
 
 
-@wp.func
-def weighted_basis(degree: int, offset: wp.vec3, weights: vec15):
-    """Sum of the functions in the direction of ``offset``, weighted."""
-    return wp.dot(basis(degree, wp.normalize(offset)), weights)
+@functools.cache
+def make_harmonics(lanes: int) -> Harmonics:
+    """The functions in ``lanes`` directions at once."""
+    number, _, fill, _, _, _, _, root, inverse, *_ = make_numbers(lanes)
+    table = wp.types.matrix(shape=(15, lanes), dtype=float)
+    mul = wp.cw_mul
+
+    @wp.func
+    def basis(x: number, y: number, z: number):
+        shorten = inverse(root(mul(x, x) + mul(y, y) + mul(z, z)))
+        x = mul(x, shorten)
+        y = mul(y, shorten)
+        z = mul(z, shorten)
+        xx = mul(x, x)
+        yy = mul(y, y)
+        zz = mul(z, z)
+        two = fill(2.0)
+        three = fill(3.0)
+        shared = mul(fill(-C3C), mul(fill(4.0), zz) - xx - yy)
+        return (
+            mul(fill(-C1), y),
+            mul(fill(C1), z),
+            mul(fill(-C1), x),
+            mul(fill(C2A), mul(x, y)),
+            mul(fill(-C2A), mul(y, z)),
+            mul(fill(C2B), mul(two, zz) - xx - yy),
+            mul(fill(-C2A), mul(x, z)),
+            mul(fill(C2C), xx - yy),
+            mul(mul(fill(-C3A), y), mul(three, xx) - yy),
+            mul(mul(fill(C3B), x), mul(y, z)),
+            mul(shared, y),
+            mul(mul(fill(C3D), z), mul(two, zz) - mul(three, xx + yy)),
+            mul(shared, x),
+            mul(mul(fill(C3E), z), xx - yy),
+            mul(mul(fill(-C3A), x), xx - mul(three, yy)),
+        )
+
+    @wp.func
+    def evaluate(x: number, y: number, z: number):
+        b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14 = basis(x, y, z)
+        return wp.matrix_from_rows(b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14)
+
+    @wp.func
+    def weight_of(weights: table, k: int):
+        return weights[k]
+
+    @wp.func_grad(weight_of)
+    def adj_weight_of(weights: table, k: int, adj_ret: number):  # nobody asks, and it would take a fifth of the adjoint
+        pass
+
+    @wp.func
+    def weigh(x: number, y: number, z: number, weights: table):
+        b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14 = basis(x, y, z)
+        s = mul(b0, weight_of(weights, 0)) + mul(b1, weight_of(weights, 1)) + mul(b2, weight_of(weights, 2))
+        s = s + mul(b3, weight_of(weights, 3)) + mul(b4, weight_of(weights, 4)) + mul(b5, weight_of(weights, 5))
+        s = s + mul(b6, weight_of(weights, 6)) + mul(b7, weight_of(weights, 7)) + mul(b8, weight_of(weights, 8))
+        s = s + mul(b9, weight_of(weights, 9)) + mul(b10, weight_of(weights, 10)) + mul(b11, weight_of(weights, 11))
+        s = s + mul(b12, weight_of(weights, 12)) + mul(b13, weight_of(weights, 13)) + mul(b14, weight_of(weights, 14))
+        return wp.dot(s, fill(1.0))
+
+    return Harmonics(table, evaluate, weigh)

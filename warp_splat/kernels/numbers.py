@@ -27,6 +27,7 @@ class Numbers(NamedTuple):
     some: wp.Function  # whether a mask is set anywhere
     pick: wp.Function  # a where a mask is set, else b
     root: wp.Function  # square root
+    inverse: wp.Function  # 1 / x
     up: wp.Function  # rounded up; no gradient, as all below
     down: wp.Function
     real: wp.Function  # of integers
@@ -71,10 +72,10 @@ def make_numbers(lanes: int) -> Numbers:
 
     @wp.func
     def some(mask: number):
-        s = float(0.0)
+        s = int(0)  # a sum of floats would be taken in order
         for lane in range(lanes):
-            s += mask[lane]
-        return s > 0.0
+            s += int(mask[lane])
+        return s > 0
 
     @wp.func
     def pick(mask: number, a: number, b: number):
@@ -99,6 +100,15 @@ def make_numbers(lanes: int) -> Numbers:
     @wp.func_grad(root)
     def adj_root(x: number, adj_ret: number):
         wp.adjoint[x] += wp.cw_div(adj_ret, root(x) * 2.0)
+
+    @wp.func
+    def inverse(x: number):
+        return wp.cw_div(number(1.0), x)
+
+    @wp.func_grad(inverse)
+    def adj_inverse(x: number, adj_ret: number):
+        r = inverse(x)
+        wp.adjoint[x] -= wp.cw_mul(wp.cw_mul(adj_ret, r), r)
 
     @wp.func
     def up(x: number):
@@ -128,7 +138,7 @@ def make_numbers(lanes: int) -> Numbers:
             r[lane] = int(x[lane])
         return r
 
-    return Numbers(number, integer, fill, less, equal, some, pick, root, up, down, real, whole)
+    return Numbers(number, integer, fill, less, equal, some, pick, root, inverse, up, down, real, whole)
 
 
 class Rows(NamedTuple):

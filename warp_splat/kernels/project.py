@@ -8,9 +8,11 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLU
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
 
 Written out in numbers, because a number may be sixteen (:mod:`warp_splat.kernels.numbers`): against vectors and
-matrices of one Gaussian, 12.0 -> 3.5 ms and, the adjoint, 25.3 -> 8.2 (194,000 Gaussians, one thread). Tried: columns
-instead of rows in memory, which no processor reads ahead in sixty places at once; a function for the products of three
-(an adjoint of 12.9 ms); names of vectors of their own, which LLVM leaves as calls.
+matrices of one Gaussian, 12.0 -> 3.5 ms and, the adjoint, 25.3 -> 8.2 (194,000 Gaussians, one thread); since then 2.2
+and 4.2, with fewer divisions and without gradients that nobody asks for. Tried: columns instead of rows in memory,
+which no processor reads ahead in sixty places at once; a function for the products of three (an adjoint of 12.9 ms);
+names of vectors of their own, which LLVM leaves as calls; 32 Gaussians, which do not become vectors; zeros written here
+instead of by the caller (the adjoint reads them, and gains nothing).
 
 The exact outline of the ellipsoid x' Sigma^-1 x = k^2 instead (Qi, Cai and Han 2024, with k = 3) follows from its
 dual conic, K (k^2 Sigma - p p') K' for a centre p. With a3 = k / z (third row of W R S) and r = 1 - |a3|^2 that is,
@@ -31,6 +33,9 @@ from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, mak
 
 wp.set_module_options(IN_ORDER)
 
+# quaternions beyond these norms, and by what they are multiplied first: squares are then numbers, too
+SMALL, ENLARGED = wp.constant(2.0**-30), wp.constant(2.0**90)
+LARGE, REDUCED = wp.constant(2.0**30), wp.constant(2.0**-70)
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
 LEAST_REST = wp.constant(1.0 - (OUTLINE / OUTLINE_REACH) ** 2)
@@ -58,15 +63,24 @@ class CameraView:
 @functools.cache
 def make_project(lanes: int) -> wp.Kernel:
     """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU. Its adjoint is Warp's."""
-    number, integer, fill, less, equal, some, pick, root, up, down, real, whole = make_numbers(lanes)
+    number, integer, fill, less, equal, some, pick, root, inverse, up, down, real, whole = make_numbers(lanes)
     pair, _, join2 = make_rows2(lanes)
     triple, split3, join3 = make_rows3(lanes)
     quadruple, split4, _ = make_rows4(lanes)
     mul, div = wp.cw_mul, wp.cw_div
 
     @wp.func
+    def turn(camera: CameraView, row: int, column: int):
+        """An entry of the camera's rotation, without a gradient, which would take a quarter of the adjoint."""
+        return number(camera.rotation[row, column])
+
+    @wp.func_grad(turn)
+    def adj_turn(camera: CameraView, row: int, column: int, adj_ret: number):
+        pass
+
+    @wp.func
     def largest(a: number, b: number, c: number, d: number):
-        """The largest magnitude, without a gradient: what is divided by it is normalized afterwards."""
+        """The largest magnitude, without a gradient."""
         return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
 
     @wp.func_grad(largest)
@@ -75,12 +89,12 @@ def make_project(lanes: int) -> wp.Kernel:
 
     @wp.func
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
-        """Half sides of the box where alpha >= alpha_min, and the distance of its farthest point [px]; no gradient."""
+        """Half sides of the box where alpha >= alpha_min, and its farthest point in whole pixels [px]; no gradient."""
         reach = number()
         for lane in range(lanes):
             reach[lane] = reach_of(opacity[lane], alpha_min)
         widest = (xx + yy + root(mul(xx - yy, xx - yy) + mul(xy, xy) * 4.0)) * 0.5  # variance of the long axis
-        return root(mul(reach, xx)), root(mul(reach, yy)), root(mul(reach, widest))
+        return root(mul(reach, xx)), root(mul(reach, yy)), wp.min(up(root(mul(reach, widest))), fill(1.0e9))
 
     @wp.func_grad(support)
     def adj_support(
@@ -134,25 +148,26 @@ def make_project(lanes: int) -> wp.Kernel:
         ox = (pick(here, mx, zero) - fill(camera.center[0])) - fill(camera.center_low[0])
         oy = (pick(here, my, zero) - fill(camera.center[1])) - fill(camera.center_low[1])
         oz = (pick(here, mz, zero) - fill(camera.center[2])) - fill(camera.center_low[2])
-        r20 = fill(camera.rotation[2, 0])
-        r21 = fill(camera.rotation[2, 1])
-        r22 = fill(camera.rotation[2, 2])
+        r20 = turn(camera, 2, 0)
+        r21 = turn(camera, 2, 1)
+        r22 = turn(camera, 2, 2)
         depth = mul(r20, ox) + mul(r21, oy) + mul(r22, oz)
         here = mul(here, less(fill(NEAR), depth))
         if not some(here):
             return
         # harmless numbers take the place of those that are left out
         z = pick(here, depth, one)
-        size = pick(here, size, one)  # divided by first, so that denormals keep their direction
-        w = div(pick(here, qw, one), size)
-        x = div(pick(here, qx, zero), size)
-        y = div(pick(here, qy, zero), size)
-        q = div(pick(here, qz, zero), size)
-        norm = root(mul(w, w) + mul(x, x) + mul(y, y) + mul(q, q))
-        w = div(w, norm)
-        x = div(x, norm)
-        y = div(y, norm)
-        q = div(q, norm)
+        size = pick(here, size, one)
+        scale = pick(less(size, fill(SMALL)), fill(ENLARGED), pick(less(fill(LARGE), size), fill(REDUCED), one))
+        w = mul(pick(here, qw, one), scale)
+        x = mul(pick(here, qx, zero), scale)
+        y = mul(pick(here, qy, zero), scale)
+        q = mul(pick(here, qz, zero), scale)
+        shorten = inverse(root(mul(w, w) + mul(x, x) + mul(y, y) + mul(q, q)))
+        w = mul(w, shorten)
+        x = mul(x, shorten)
+        y = mul(y, shorten)
+        q = mul(q, shorten)
         # R
         two = fill(2.0)
         m00 = one - mul(two, mul(y, y) + mul(q, q))
@@ -168,12 +183,12 @@ def make_project(lanes: int) -> wp.Kernel:
         sy = pick(here, sy, one)
         sz = pick(here, sz, one)
         # the mean in the image
-        r00 = fill(camera.rotation[0, 0])
-        r01 = fill(camera.rotation[0, 1])
-        r02 = fill(camera.rotation[0, 2])
-        r10 = fill(camera.rotation[1, 0])
-        r11 = fill(camera.rotation[1, 1])
-        r12 = fill(camera.rotation[1, 2])
+        r00 = turn(camera, 0, 0)
+        r01 = turn(camera, 0, 1)
+        r02 = turn(camera, 0, 2)
+        r10 = turn(camera, 1, 0)
+        r11 = turn(camera, 1, 1)
+        r12 = turn(camera, 1, 2)
         fx = fill(camera.focal[0])
         fy = fill(camera.focal[1])
         u = div(mul(r00, ox) + mul(r01, oy) + mul(r02, oz), z)
@@ -188,8 +203,9 @@ def make_project(lanes: int) -> wp.Kernel:
             u = pick(less(u, u_min), u_min, pick(less(u_max, u), u_max, u))
             v = pick(less(v, v_min), v_min, pick(less(v_max, v), v_max, v))
         # J W
-        kx = div(fx, z)
-        ky = div(fy, z)
+        shorten = inverse(z)
+        kx = mul(fx, shorten)
+        ky = mul(fy, shorten)
         j00 = mul(kx, r00 - mul(u, r20))
         j01 = mul(kx, r01 - mul(u, r21))
         j02 = mul(kx, r02 - mul(u, r22))
@@ -250,13 +266,14 @@ def make_project(lanes: int) -> wp.Kernel:
         if not some(here):
             return
         means2d_out[g] = join2(pick(here, px, zero), pick(here, py, zero))
+        shorten = inverse(det)
         conics_out[g] = join3(
-            pick(here, div(yy, det), zero), pick(here, div(-xy, det), zero), pick(here, div(xx, det), zero)
+            pick(here, mul(yy, shorten), zero), pick(here, mul(-xy, shorten), zero), pick(here, mul(xx, shorten), zero)
         )
         opacities_out[g] = pick(here, opacity, zero)
         depths_out[g] = pick(here, depth, zero)
         extents_out[g] = join2(pick(here, extent_x, zero), pick(here, extent_y, zero))
-        radii_out[g] = whole(pick(here, wp.min(up(farthest), fill(1.0e9)), code))
+        radii_out[g] = whole(pick(here, farthest, code))
 
     return project
 
