@@ -20,8 +20,8 @@ OPTIONS = {
 }
 
 
-def gaussians(count):
-    """Of degree 3, some behind the camera, beside the image, too faint, or not finite."""
+def gaussians(count, coefficients=15):
+    """Of degree 3 or less, some behind the camera, beside the image, too faint, or not finite."""
     generator = torch.Generator().manual_seed(count)
 
     def normal(*shape):
@@ -30,27 +30,27 @@ def gaussians(count):
     means = 1.5 * normal(count, 3) + torch.tensor([0.0, 0.0, 2.5])
     quats, scales = normal(count, 4), torch.exp(normal(count, 3) - 3.0)
     opacities = torch.rand(count, generator=generator) ** 3
-    sh_dc, sh_rest = normal(count, 1, 3), 0.3 * normal(count, 15, 3)
+    sh_dc, sh_rest = normal(count, 1, 3), 0.3 * normal(count, coefficients, 3)
     if count > 16:
         means[:7] = torch.tensor([0.0, 0.0, 3.0])
         opacities[:7] = 1.0
         quats[1] = 0.0
         scales[2] = 1.0e30  # too large on the image
         means[3, 1] = torch.nan
-        sh_rest[4, 0, 0] = torch.inf
+        sh_rest[4, :1, 0] = torch.inf
         quats[5] = torch.tensor([3.0e38, 3.0e38, 0.0, 0.0])  # of any norm
         means[6] = torch.tensor([-2.0e38, -2.0e38, -1.0e38])  # behind the camera
     return means, quats, scales, opacities, sh_dc, sh_rest
 
 
-def project(count, options, sets=1, left_out=None, spread=False):
+def project(count, options, sets=1, left_out=None, spread=False, coefficients=15):
     """Outputs, and gradients of their random weighting, which is ``left_out`` for those not drawn.
 
     Gradients are asked for ``sets`` times; ``spread``: no tensor is contiguous.
     """
-    inputs = [tensor.requires_grad_() for tensor in gaussians(count)]
+    inputs = [tensor.requires_grad_() for tensor in gaussians(count, coefficients)]
     given = [torch.stack([tensor, tensor], -1)[..., 0] for tensor in inputs] if spread else inputs
-    outputs = Project.apply(*given, camera_view(CAMERA, 15, options), Dropped())
+    outputs = Project.apply(*given, camera_view(CAMERA, coefficients, options), Dropped())
     generator = torch.Generator().manual_seed(1)
     upstream = [torch.randn(output.shape, generator=generator) for output in outputs[:5]]
     if left_out is not None:
@@ -61,18 +61,21 @@ def project(count, options, sets=1, left_out=None, spread=False):
 
 
 @pytest.mark.parametrize("name", OPTIONS)
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 100])
-def test_sixteen_and_one_agree(count, name, monkeypatch):
-    outputs, (grads,) = project(count, OPTIONS[name])
+@pytest.mark.parametrize(
+    ("count", "coefficients"), [(0, 15), (1, 15), (15, 15), (16, 15), (17, 15), (100, 15), (99, 0), (99, 3), (99, 8)]
+)
+def test_sixteen_and_one_agree(count, coefficients, name, monkeypatch):
+    outputs, (grads,) = project(count, OPTIONS[name], coefficients=coefficients)
     monkeypatch.setattr(projection, "LANES", 1)
-    single, (single_grads,) = project(count, OPTIONS[name])
+    single, (single_grads,) = project(count, OPTIONS[name], coefficients=coefficients)
     torch.testing.assert_close(outputs[6], single[6], rtol=0, atol=0)
     if count == 100:
         assert (outputs[6] > 0).sum() > 20 and (outputs[6] == 0).sum() > 20
         # what reaches the camera's plane is left out as an ellipsoid before it is too large
         assert outputs[6][:7].sign().tolist() == [1, -1, 0 if name == "ellipsoid" else -1, -1, -1, 1, 0]
     for found, wanted in zip((*outputs[:6], *grads), (*single[:6], *single_grads), strict=True):
-        torch.testing.assert_close(found, wanted, rtol=2e-5, atol=1e-6 * float(wanted.abs().max() if count else 0))
+        largest = float(wanted.abs().max()) if wanted.numel() else 0.0
+        torch.testing.assert_close(found, wanted, rtol=2e-5, atol=1e-6 * largest)
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -100,7 +103,7 @@ def test_a_color_is_finite_even_if_the_sum_of_its_channels_is_not():
 
 @pytest.mark.parametrize("exponent", [-100, -60, -31, -30, -29, 29, 30, 31, 60, 100])
 def test_quaternions_of_any_norm(exponent):
-    """A power of two: the same Gaussian, bit for bit, and the gradient of its inverse."""
+    """A power of two: the same Gaussian, bit for bit, and the gradient times its inverse."""
     means, quats, *others = gaussians(16)
 
     def derived(factor):

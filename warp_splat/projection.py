@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -60,7 +59,7 @@ def project(
         adj_outputs: of the first four outputs.
     """
     count = len(outputs[-1])
-    lanes = 1 if outputs[-1].is_cuda else LANES
+    lanes = _lanes(outputs[-1].device)
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
     _project_groups(cam, lanes, *([tensor[:whole] for tensor in table] for table in tables))
@@ -91,34 +90,29 @@ def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> Non
     if adj_inputs:
         adj_in, adj_out = in_groups(adj_inputs, types_in), in_groups(adj_outputs, types_out)
         adjoint = {"adj_inputs": [cam, *adj_in], "adj_outputs": [*adj_out, None, None]}
-    groups = len(outputs[-1]) // lanes
-    launch(
-        make_project(lanes),
-        groups,
-        [cam, *in_groups(inputs, types_in)],
-        in_groups(outputs, types_out),
-        bounds=even_slices(groups, SMALLEST_SLICE // lanes),
-        device=outputs[-1].device,
-        **adjoint,
-    )
+    given, found = [cam, *in_groups(inputs, types_in)], in_groups(outputs, types_out)
+    _launch_groups(make_project, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
 
 
 def _by_degree(sh_rest: torch.Tensor) -> list:
-    """The coefficients of degree 1, 2 and 3; an array of none for each degree that there is not."""
-    types, bounds = (wp.mat33, mat53, mat73), (0, 3, 8, 15)
-    parts = (sh_rest[:, low:high] for low, high in itertools.pairwise(bounds))
+    """The coefficients of degree 1, 2 and 3; an empty array for each degree that there is not."""
     return [
-        view(part if part.shape[1] == high - low else sh_rest.new_empty(0, high - low, 3), dtype)
-        for part, dtype, (low, high) in zip(parts, types, itertools.pairwise(bounds), strict=True)
+        view(sh_rest[:, low:high] if sh_rest.shape[1] >= high else sh_rest.new_empty(0, high - low, 3), dtype)
+        for dtype, low, high in ((wp.mat33, 0, 3), (mat53, 3, 8), (mat73, 8, 15))
     ]
 
 
-def _launch_groups(make_kernel: Callable[[int], wp.Kernel], count: int, inputs, outputs, device: torch.device) -> None:
-    """Launch a kernel of :mod:`warp_splat.kernels.shade` on ``count`` Gaussians."""
-    lanes = 1 if device.type == "cuda" else LANES
+def _lanes(device: torch.device) -> int:
+    """How many Gaussians a kernel takes at once."""
+    return 1 if device.type == "cuda" else LANES
+
+
+def _launch_groups(make_kernel: Callable[[int], wp.Kernel], count: int, inputs, outputs, device, **adjoint) -> None:
+    """Launch a kernel for groups of lanes on ``count`` Gaussians."""
+    lanes = _lanes(device)
     groups = -(-count // lanes)
     bounds = even_slices(groups, SMALLEST_SLICE // lanes)
-    launch(make_kernel(lanes), groups, inputs, outputs, bounds=bounds, device=device)
+    launch(make_kernel(lanes), groups, inputs, outputs, bounds=bounds, device=device, **adjoint)
 
 
 class Project(torch.autograd.Function):
@@ -146,10 +140,10 @@ class Project(torch.autograd.Function):
             adj_outputs = [adj.contiguous() for adj in adj_outputs[:5]]
             adj_colors = adj_outputs.pop(3)
             colored = [torch.empty_like(tensor) for tensor in (means, sh_dc, sh_rest)]
-            drawn, (means3d, colors, adj_colors) = view(radii, wp.int32), _views3d([means, outputs[3], adj_colors])
-            given = [ctx.cam, means3d, *_by_degree(sh_rest), colors, drawn, adj_colors]
-            found = [*_views3d([colored[0], colored[1][:, 0]]), *_by_degree(colored[2])]
-            _launch_groups(make_adj_shade, len(radii), given, found, radii.device)
+            seen, (centers, *colors) = view(radii, wp.int32), _views3d([means, outputs[3], adj_colors])
+            given = [ctx.cam, centers, *_by_degree(sh_rest), seen, *colors]
+            stored = [*_views3d([colored[0], colored[1][:, 0]]), *_by_degree(colored[2])]
+            _launch_groups(make_adj_shade, len(radii), given, stored, radii.device)
             placed = [colored[0], *(torch.zeros_like(tensor) for tensor in (quats, scales, opacities))]
             geometry = [*outputs[:3], *outputs[4:], radii]
             project(ctx.cam, (means, quats, scales, opacities), geometry, placed, adj_outputs)
@@ -158,7 +152,7 @@ class Project(torch.autograd.Function):
                 bad = torch.zeros_like(radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 found = [view(tensor, dtype) for tensor, dtype in zip((*adj_inputs, bad), types, strict=True)]
-                launch(quarantine, len(radii), [drawn], found, device=radii.device)
+                launch(quarantine, len(radii), [seen], found, device=radii.device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj_inputs, ctx.needs_input_grad[:6], strict=True)
         return *(adj if wants else None for adj, wants in wanted), None, None

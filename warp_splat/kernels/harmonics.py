@@ -5,10 +5,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.build import FORWARD_ONLY
 from warp_splat.kernels.numbers import make_numbers
-
-wp.set_module_options(FORWARD_ONLY)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -33,16 +30,17 @@ class Harmonics(NamedTuple):
 @functools.cache
 def make_harmonics(lanes: int) -> Harmonics:
     """The functions in ``lanes`` directions at once."""
-    number, _, fill, _, _, _, _, root, inverse, *_ = make_numbers(lanes)
+    numbers = make_numbers(lanes)
+    number, fill, root, inverse = numbers.number, numbers.fill, numbers.root, numbers.inverse
     table = wp.types.matrix(shape=(15, lanes), dtype=float)
     mul = wp.cw_mul
 
     @wp.func
     def basis(x: number, y: number, z: number):
-        shorten = inverse(root(mul(x, x) + mul(y, y) + mul(z, z)))
-        x = mul(x, shorten)
-        y = mul(y, shorten)
-        z = mul(z, shorten)
+        per_norm = inverse(root(mul(x, x) + mul(y, y) + mul(z, z)))
+        x = mul(x, per_norm)
+        y = mul(y, per_norm)
+        z = mul(z, per_norm)
         xx = mul(x, x)
         yy = mul(y, y)
         zz = mul(z, z)

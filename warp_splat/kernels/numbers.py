@@ -2,18 +2,14 @@
 
 A kernel made for 16 lanes fills the CPU's registers; made for 1, it is what a thread of a GPU runs. Operations here
 know their derivative, because the generated one is slow in lanes: that of a choice has a branch per lane, and that of a
-constant is a sum over the lanes, one after the other (Tried: an adjoint twice as slow). What else there is, `+`, `-`,
-wp.cw_mul and wp.cw_div, Warp differentiates well. Masks are 1 or 0 and have no derivative.
+constant is a sum over the lanes, one after the other (Tried: an adjoint twice as slow), that of a division two more.
+What else there is, `+`, `-` and wp.cw_mul, Warp differentiates well. Masks are 1 or 0 and have no derivative.
 """
 
 import functools
 from typing import NamedTuple
 
 import warp as wp
-
-from warp_splat.kernels.build import FORWARD_ONLY
-
-wp.set_module_options(FORWARD_ONLY)
 
 
 class Numbers(NamedTuple):

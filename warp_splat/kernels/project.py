@@ -33,7 +33,7 @@ from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, mak
 
 wp.set_module_options(IN_ORDER)
 
-# quaternions beyond these norms, and by what they are multiplied first: squares are then numbers, too
+# of a quaternion's largest entry; beyond, a power of two comes first, so that squares neither vanish nor overflow
 SMALL, ENLARGED = wp.constant(2.0**-30), wp.constant(2.0**90)
 LARGE, REDUCED = wp.constant(2.0**30), wp.constant(2.0**-70)
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
@@ -80,7 +80,7 @@ def make_project(lanes: int) -> wp.Kernel:
 
     @wp.func
     def largest(a: number, b: number, c: number, d: number):
-        """The largest magnitude, without a gradient."""
+        """The largest magnitude, without a gradient: it chooses a factor that normalization takes out again."""
         return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
 
     @wp.func_grad(largest)
@@ -89,7 +89,7 @@ def make_project(lanes: int) -> wp.Kernel:
 
     @wp.func
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
-        """Half sides of the box where alpha >= alpha_min, and its farthest point in whole pixels [px]; no gradient."""
+        """Half sides of the box where alpha >= alpha_min, its farthest point's distance, rounded up [px]."""
         reach = number()
         for lane in range(lanes):
             reach[lane] = reach_of(opacity[lane], alpha_min)
@@ -163,11 +163,11 @@ def make_project(lanes: int) -> wp.Kernel:
         x = mul(pick(here, qx, zero), scale)
         y = mul(pick(here, qy, zero), scale)
         q = mul(pick(here, qz, zero), scale)
-        shorten = inverse(root(mul(w, w) + mul(x, x) + mul(y, y) + mul(q, q)))
-        w = mul(w, shorten)
-        x = mul(x, shorten)
-        y = mul(y, shorten)
-        q = mul(q, shorten)
+        per_norm = inverse(root(mul(w, w) + mul(x, x) + mul(y, y) + mul(q, q)))
+        w = mul(w, per_norm)
+        x = mul(x, per_norm)
+        y = mul(y, per_norm)
+        q = mul(q, per_norm)
         # R
         two = fill(2.0)
         m00 = one - mul(two, mul(y, y) + mul(q, q))
@@ -203,9 +203,9 @@ def make_project(lanes: int) -> wp.Kernel:
             u = pick(less(u, u_min), u_min, pick(less(u_max, u), u_max, u))
             v = pick(less(v, v_min), v_min, pick(less(v_max, v), v_max, v))
         # J W
-        shorten = inverse(z)
-        kx = mul(fx, shorten)
-        ky = mul(fy, shorten)
+        per_z = inverse(z)
+        kx = mul(fx, per_z)
+        ky = mul(fy, per_z)
         j00 = mul(kx, r00 - mul(u, r20))
         j01 = mul(kx, r01 - mul(u, r21))
         j02 = mul(kx, r02 - mul(u, r22))
@@ -266,9 +266,9 @@ def make_project(lanes: int) -> wp.Kernel:
         if not some(here):
             return
         means2d_out[g] = join2(pick(here, px, zero), pick(here, py, zero))
-        shorten = inverse(det)
+        per_det = inverse(det)
         conics_out[g] = join3(
-            pick(here, mul(yy, shorten), zero), pick(here, mul(-xy, shorten), zero), pick(here, mul(xx, shorten), zero)
+            pick(here, mul(yy, per_det), zero), pick(here, mul(-xy, per_det), zero), pick(here, mul(xx, per_det), zero)
         )
         opacities_out[g] = pick(here, opacity, zero)
         depths_out[g] = pick(here, depth, zero)

@@ -2,7 +2,7 @@
 
 The color is linear in the coefficients: their gradient, a product of two vectors, is written down, and stored instead
 of added. How the functions depend on the direction Warp differentiates. (All of it by Warp: the adjoint takes 2.3 times
-as long, 16.5 ms instead of 7.0 for 137,000 Gaussians of degree 3, with the same gradients to 1e-7.)
+as long, 16.5 ms instead of 7.0 for 137,000 Gaussians of degree 3, one at a time, with the same gradients to 1e-7.)
 
 On a CPU, a kernel evaluates the functions for sixteen Gaussians at once, then goes through their coefficients in turn:
 3.7 -> 2.8 ms and, the adjoint, 7.4 -> 5.6 (193,000 Gaussians, degree 3, one thread). Tried: groups of which none is
@@ -114,8 +114,8 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         sh1: wp.array[wp.mat33],  # [N]
         sh2: wp.array[mat53],
         sh3: wp.array[mat73],
-        colors: wp.array[wp.vec3],  # [N]
         radii: wp.array[int],  # [N]
+        colors: wp.array[wp.vec3],  # [N]
         adj_colors: wp.array[wp.vec3],  # [N]
         # out: gradients, zero where culled and of inactive degrees
         means_out: wp.array[wp.vec3],  # [N]
@@ -133,16 +133,14 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
             i = group + lane
             if i < radii.shape[0]:
                 adj = wp.vec3(0.0)
-                if radii[i] > 0:
-                    for channel in range(3):
-                        if colors[i][channel] > 0.0:  # not cut to 0
-                            adj[channel] = adj_colors[i][channel]
-                sh_dc_out[i] = C0 * adj
                 adj1 = wp.mat33()
                 adj2 = mat53()
                 adj3 = mat73()
                 if radii[i] > 0:
                     drawn[lane] = 1.0
+                    for channel in range(3):
+                        if colors[i][channel] > 0.0:  # not cut to 0
+                            adj[channel] = adj_colors[i][channel]
                     if camera.sh_degree > 0:
                         for k in range(3):
                             weights[k, lane] = wp.dot(sh1[i][k], adj)
@@ -155,6 +153,7 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
                         for k in range(7):
                             weights[8 + k, lane] = wp.dot(sh3[i][k], adj)
                             adj3[k] = functions[8 + k, lane] * adj
+                sh_dc_out[i] = C0 * adj
                 if sh1_out.shape[0] > 0:
                     sh1_out[i] = adj1
                 if sh2_out.shape[0] > 0:
