@@ -21,7 +21,7 @@ from warp_splat.kernels.project import INVALID, CameraView
 mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
 mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
 
-OPTIONS = {**LANES_IN_ORDER, "max_unroll": 15}  # all but the loops over lanes
+OPTIONS = {**LANES_IN_ORDER, "max_unroll": 15}  # unrolls all loops but those over lanes
 
 
 @functools.cache
@@ -56,7 +56,7 @@ def make_shade(lanes: int) -> wp.Kernel:
         camera: CameraView,
         means: wp.array[wp.vec3],  # [N] world
         sh_dc: wp.array[wp.vec3],  # [N] coefficients
-        sh1: wp.array[wp.mat33],  # [N] of degree 1, like the next two; none, if there are none
+        sh1: wp.array[wp.mat33],  # [N] of degree 1; like the next two, empty if there are none
         sh2: wp.array[mat53],
         sh3: wp.array[mat73],
         # out
