@@ -188,10 +188,10 @@ def _decide(alpha, error, alpha_min, t_min):
     return blended, ((at_threshold | at_stop) & reached & seen).any(1)
 
 
-def _swappable(alpha, blended, key):
-    """Pixels that blend two neighbors whose float32 depths differ by rounding only: a renderer may swap them, [P]."""
-    gap = key[1:] - key[:-1]
-    close = (gap > 0) & (gap < 8 * ROUNDING * key[1:].abs())  # equal ones are ordered by index, everywhere
+def _swappable(alpha, blended, depth):
+    """Pixels that blend two neighbors whose depths differ by less than float32 knows: a renderer may swap them, [P]."""
+    gap = (depth[1:] - depth[:-1]).abs()
+    close = (gap > 0) & (gap < 8 * ROUNDING * depth[1:].abs())  # equal ones are ordered by index, everywhere
     both = blended[:, 1:] & blended[:, :-1] & close
     before = torch.cumprod(1 - torch.where(blended, alpha.clamp_max(ALPHA_MAX), 0), 1)[:, 1:]
     return (both & (before * alpha[:, :-1] * alpha[:, 1:] > UNSEEN)).any(1)
@@ -242,7 +242,7 @@ def render(
     with torch.no_grad():
         raw, error = _alphas(splats, order, camera, pixels)
         blended, fragile = _decide(raw, error, alpha_min, t_min)
-        fragile |= _swappable(raw, blended, key[order])
+        fragile |= _swappable(raw, blended, splats.z.detach()[order])
         touches, near_image, reach = _culling(splats, raw, order, camera, alpha_min)
         seen = blended.any(0)  # the others have no gradient, and need no memory for it
     order, blended = order[seen], blended[:, seen]
