@@ -143,6 +143,18 @@ def test_gradient_of_one_input_only(name, device):
     assert all(getattr(scene, other).grad is None for other in PARAMETERS)
 
 
+def test_no_gaussians_of_any_strides(device):
+    """Torch calls a tensor of nothing contiguous, whatever its strides."""
+    scene = SCENES["empty"]().to(device)
+    leaves = leaves_of(scene)
+    strided = leaves | {
+        "means": torch.zeros(0, 6, device=device)[:, ::2],
+        "quats": torch.zeros(0, 4, 2, device=device)[..., 0],
+        "sh": torch.zeros(0, 16, 6, device=device)[..., :3],
+    }
+    assert torch.equal(rasterize(scene, strided).image, rasterize(scene, leaves).image)
+
+
 def test_non_contiguous_inputs(device):
     scene = SCENES["degree1"]().to(device)
     leaves, strided = leaves_of(scene), {}

@@ -47,13 +47,17 @@ def model_bytes(scene):
 
 
 def start(photos, scene):
-    return subprocess.Popen(
-        [sys.executable, "-m", "warp_splat", "sfm", str(photos), str(scene)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it for what they background
-    )
+    """What shells start in the background ignores SIGINT, and passes that on; a handler is not passed on."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-m", "warp_splat", "sfm", str(photos), str(scene)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_the_cameras_are_found(photos, scene):
