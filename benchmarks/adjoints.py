@@ -14,9 +14,9 @@ from blend import Lanes
 from common import interleaved_medians, machine, write_table
 from scenes import blend_scene
 
-from warp_splat import launch
 from warp_splat.compare.adjoints import peak_memory
 from warp_splat.config import ADJOINTS
+from warp_splat.runtime import launch
 
 MODES = (*ADJOINTS, "generated")
 

@@ -15,12 +15,12 @@ from common import interleaved_medians, machine, write_table
 from scalar_blend import adj_blend, blend, vec9
 from scenes import BlendScene, blend_scene
 
-from warp_splat import launch
-from warp_splat.binning import Bins, balanced_slices
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels.blend import Splat2D
-from warp_splat.renderer import Blend, Dropped
+from warp_splat.kernels.splat import Splat2D
+from warp_splat.raster.api import Blend, Dropped
+from warp_splat.raster.bin import Bins, balanced_slices
+from warp_splat.runtime import launch
 
 
 class Lanes:

@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from warp_splat.report import format_table, machine
+from warp_splat.evaluation.report import machine
+from warp_splat.text import format_table
 
 
 def interleaved_medians(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:

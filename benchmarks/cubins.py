@@ -18,11 +18,11 @@ import warp as wp
 from common import write_table
 
 from warp_splat.config import ADJOINTS
-from warp_splat.kernels import project, shade, tiles
+from warp_splat.kernels import project, sh_colors, tiles
 from warp_splat.kernels.adam import make_adam
-from warp_splat.kernels.adjoint_block import make_reverse_block, make_upstream_block
-from warp_splat.kernels.blend_block import make_blend_block
-from warp_splat.kernels.taped_block import make_walk_block
+from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
+from warp_splat.kernels.cuda.blend import make_blend_block
+from warp_splat.kernels.cuda.taped import make_walk_block
 
 BLOCK = 256
 REGISTERS = 65536  # of a multiprocessor, all architectures below
@@ -37,8 +37,8 @@ def modules() -> dict[str, wp.Module]:
     """What runs on CUDA, by the name under which it is listed."""
     found = {
         "project": project.make_project(1).module,
-        "shade": shade.make_shade(1).module,
-        "adjoint of shade": shade.make_adj_shade(1).module,
+        "shade": sh_colors.make_shade(1).module,
+        "adjoint of shade": sh_colors.make_adj_shade(1).module,
         "quarantine": project.quarantine.module,
         "adam": make_adam(15, 3).module,
         "tiles": tiles.pack.module,

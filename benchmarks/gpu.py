@@ -29,14 +29,16 @@ from gpu_blends import ATOMIC_HEADERS, SHARE_HEADERS, measure_blends
 from gpu_scene import cameras, make_gaussians
 from gpu_steps import STEP_HEADERS, measure_errors, measure_modes, measure_orbit, measure_step
 
-from warp_splat import rasterize, renderer
-from warp_splat.blocks import adjoint_of_blocks, blend_blocks
+from warp_splat import rasterize
 from warp_splat.config import ADJOINTS
-from warp_splat.devices import is_out_of_memory
 from warp_splat.errors import InputError
+from warp_splat.evaluation.report import machine
 from warp_splat.formats.atomic import atomic_write, write_json
-from warp_splat.launch import prepare
-from warp_splat.report import format_table, machine
+from warp_splat.raster import api
+from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
+from warp_splat.runtime.devices import is_out_of_memory
+from warp_splat.runtime.launch import prepare
+from warp_splat.text import format_table
 
 SMALL, LARGE = (980, 545), (1920, 1080)
 COUNT, CHECKED = 1_000_000, 20_000
@@ -225,7 +227,7 @@ def main() -> None:
         wp.config.enable_cpu_blocks = True
         case, driver = (
             (500, 64, 40),
-            patch.multiple(renderer, blend_lanes=blend_blocks, adjoint_of_lanes=adjoint_of_blocks),
+            patch.multiple(api, blend_lanes=blend_blocks, adjoint_of_lanes=adjoint_of_blocks),
         )
     expected = expectation(arguments.expected, case)
     with driver:

@@ -8,15 +8,15 @@ import torch
 import warp as wp
 from gpu_scene import cameras, make_gaussians, milliseconds
 
-from warp_splat.adjoints import gather, list_inputs
-from warp_splat.binning import bin_tiles
-from warp_splat.blocks import THREADS, blend_blocks, spread_upstream
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels.adjoint_block import make_reverse_block
-from warp_splat.launch import launch, launch_blocks, view
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped
+from warp_splat.kernels.cuda.adjoint import make_reverse_block
+from warp_splat.raster.adjoints import gather, list_inputs
+from warp_splat.raster.api import Dropped
+from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.cuda import THREADS, blend_blocks, spread_upstream
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime.launch import launch, launch_blocks, view
 
 #: Floating-point operations for one Gaussian at one pixel (operators of kernels/blend.py and kernels/step.py).
 #: Forward: offset 2, exponent 7, exponential 14, alpha 3, transmittance and weight 6, color 6, stop 1.

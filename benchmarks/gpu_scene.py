@@ -10,11 +10,11 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.config import TrainConfig
-from warp_splat.densify import Densifier
 from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.camera_paths import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
 from warp_splat.scene.types import Scene, View
-from warp_splat.trainer import Trainer
-from warp_splat.ways import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
+from warp_splat.training.densify import Densifier
+from warp_splat.training.trainer import Trainer
 
 RADIUS = 4.0  # world units, of the ball that the Gaussians fill; the orbit lies outside
 VIEWS = 8

@@ -6,14 +6,14 @@ import time
 import torch
 from gpu_scene import cameras, make_gaussians, make_trainer, milliseconds, steps_of, synchronize
 
-from warp_splat import launch
 from warp_splat.compare import adjoints
 from warp_splat.compare.workloads import layered
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.render import make_picture
-from warp_splat.renderer import render
-from warp_splat.ways import ORBIT_SIZE
+from warp_splat.raster.api import render
+from warp_splat.rendering.camera_paths import ORBIT_SIZE
+from warp_splat.rendering.command import make_picture
+from warp_splat.runtime import launch
 
 STAGES = (
     *("project", "bin", "blend", "loss", "adjoint of loss", "adjoint of blend", "adjoint of project"),

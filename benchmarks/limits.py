@@ -22,10 +22,10 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from warp_splat import launch
-from warp_splat.kernels.build import IN_LANES
+from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.lanes import LANES, vec16
-from warp_splat.launch import view
+from warp_splat.runtime import launch
+from warp_splat.runtime.launch import view
 
 SCALED = 2**28  # bytes, many times any cache
 CHAINS, UNROLLED, ROUNDS = 12, 16, 2**14  # 7 ms: less, and a helper that wakes late counts

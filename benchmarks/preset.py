@@ -14,7 +14,7 @@ from pathlib import Path
 
 from common import machine, write_table
 
-from warp_splat.report import BLUE, ORANGE, new_figure, plain_axes, save_figure
+from warp_splat.evaluation.report import BLUE, ORANGE, new_figure, plain_axes, save_figure
 
 ROOT = Path(__file__).parents[1]
 EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}

@@ -12,14 +12,15 @@ import numpy as np
 import torch
 from common import interleaved_medians, machine, write_table
 
-from warp_splat import launch, rasterize, rasterize_views
+from warp_splat import rasterize, rasterize_views
 from warp_splat.config import RasterOptions
+from warp_splat.evaluation.metrics import psnr
 from warp_splat.gaussians import GaussianModel
-from warp_splat.metrics import psnr
-from warp_splat.render import make_picture
-from warp_splat.report import format_table
+from warp_splat.rendering.camera_paths import focus_orbit
+from warp_splat.rendering.command import make_picture
+from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
-from warp_splat.ways import focus_orbit
+from warp_splat.text import format_table
 
 FRAMES = 12  # of the orbit, in each round
 ROUNDS = 5

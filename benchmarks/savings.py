@@ -24,12 +24,13 @@ from common import machine, write_table
 from gpu_scene import NEVER, steps_of
 from step import add_arguments, synthetic, trained
 
-from warp_splat import lanes, launch, renderer
-from warp_splat.binning import Bins
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped, render
+from warp_splat.raster import api, cpu
+from warp_splat.raster.api import Dropped, render
+from warp_splat.raster.bin import Bins
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime import launch
 from warp_splat.scene.images import read_rgb
-from warp_splat.trainer import Trainer
+from warp_splat.training.trainer import Trainer
 
 SYNTHETIC = (200_000, 980, 545)
 ROUNDS, STEPS = 15, 2
@@ -92,8 +93,8 @@ def every_block(_: Trainer) -> AbstractContextManager:
         bins.splats.numpy()["extent"] = 1e9
         return bins
 
-    original = renderer.bin_tiles
-    return patch.object(renderer, "bin_tiles", bin_tiles)
+    original = api.bin_tiles
+    return patch.object(api, "bin_tiles", bin_tiles)
 
 
 def whole_lists(_: Trainer) -> AbstractContextManager:
@@ -103,8 +104,8 @@ def whole_lists(_: Trainer) -> AbstractContextManager:
         steps.copy_(bins.ranges[:, 1] - bins.ranges[:, 0])
         original(mode, bins, chosen, states, steps, slots)
 
-    original = lanes.adjoint_of_blend
-    return patch.object(lanes, "adjoint_of_blend", adjoint_of_blend)
+    original = cpu.adjoint_of_blend
+    return patch.object(cpu, "adjoint_of_blend", adjoint_of_blend)
 
 
 CASES = (

@@ -1,14 +1,14 @@
 """The baseline of benchmarks/blend.py: one scalar thread per pixel, as a CUDA programmer would first write it.
 
-The same image and the same gradients as the package's driver, by the same formulas (warp_splat.kernels.blend), with
+The same image and the same gradients as the package's driver, by the same formulas (warp_splat.kernels.splat), with
 wp.exp and a sum into each Gaussian's gradient. On the CPU a launch is one thread, so that plain sums are no race.
 """
 
 import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE
-from warp_splat.kernels.blend import LN_2, Splat2D
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.splat import LN_2, Splat2D
 
 wp.set_module_options(FORWARD_ONLY)
 vec9 = wp.types.vector(length=9, dtype=float)

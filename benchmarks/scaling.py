@@ -21,15 +21,16 @@ import torch
 from common import machine, write_table
 from gpu_scene import make_trainer
 
-from warp_splat import launch
-from warp_splat.binning import bin_tiles
 from warp_splat.config import TILE, RasterOptions
-from warp_splat.devices import peak_memory
-from warp_splat.forecast import pixel_floats, step_memory
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped
-from warp_splat.report import BLUE, INK, ORANGE, format_table, new_figure, plain_axes, save_figure
-from warp_splat.trainer import Trainer
+from warp_splat.evaluation.report import BLUE, INK, ORANGE, new_figure, plain_axes, save_figure
+from warp_splat.raster.api import Dropped
+from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime import launch
+from warp_splat.runtime.devices import peak_memory
+from warp_splat.text import format_table
+from warp_splat.training.memory import pixel_floats, step_memory
+from warp_splat.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
 MIB = 2**20

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warp_splat.config import ALPHA_MIN, TILE
-from warp_splat.kernels.blend import Splat2D
+from warp_splat.kernels.splat import Splat2D
 
 LN_2 = np.log(2.0)
 

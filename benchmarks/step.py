@@ -25,12 +25,12 @@ from gpu_steps import STAGES
 from limits import Limits, measure_limits
 from work import Counts, count, mean, work_of
 
-from warp_splat import launch
 from warp_splat.config import RasterOptions
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.gaussians import GaussianModel
+from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
-from warp_splat.trainer import Trainer
+from warp_splat.training.trainer import Trainer
 
 THREADS = (1, 2)
 TRAINED = {"half": (2, 1000), "full": (1, 3000)}  # name of the model: -r, iteration

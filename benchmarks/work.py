@@ -20,18 +20,18 @@ from dataclasses import astuple, dataclass
 import torch
 import warp as wp
 
-from warp_splat.adjoints import list_inputs
-from warp_splat.binning import bin_tiles
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels.blend import Splat2D, alpha_of, exponent, make_exp
-from warp_splat.kernels.blend_lanes import BLOCKS, offset_x, offset_y, reach
-from warp_splat.kernels.build import IN_LANES
+from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.cpu.blend import BLOCKS, offset_x, offset_y, reach
 from warp_splat.kernels.lanes import LANES, total, vec16, where_less
-from warp_splat.lanes import blend_lanes
-from warp_splat.launch import launch, view
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped
+from warp_splat.kernels.splat import Splat2D, alpha_of, exponent, make_exp
+from warp_splat.raster.adjoints import list_inputs
+from warp_splat.raster.api import Dropped
+from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.cpu import blend_lanes
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime.launch import launch, view
 
 FORWARD, ADJOINT = 31, 49  # operations per pair
 PROJECT = 240  # per Gaussian drawn, two thirds of them for its shape; its adjoint: again, and twice that, at most
@@ -97,7 +97,7 @@ class Counts:
 
 
 def count(gaussians: tuple[torch.Tensor, ...], camera: Camera, options: RasterOptions) -> Counts:
-    """Of one view on the CPU; ``gaussians`` as :func:`warp_splat.renderer.render` takes them."""
+    """Of one view on the CPU; ``gaussians`` as :func:`warp_splat.raster.api.render` takes them."""
     with torch.no_grad():
         cam = camera_view(camera, gaussians[5].shape[1], options)
         bins = bin_tiles(*Project.apply(*gaussians, cam, Dropped()), camera, options)

@@ -22,9 +22,9 @@ sys.path.insert(0, str(DOCS.parent / "tests"))
 from browser import browser_page  # noqa: E402
 
 from warp_splat.cli import main  # noqa: E402
+from warp_splat.evaluation.report import new_figure, save_figure  # noqa: E402
 from warp_splat.formats.model_folder import find_iteration  # noqa: E402
 from warp_splat.formats.png import load_png  # noqa: E402
-from warp_splat.report import new_figure, save_figure  # noqa: E402
 
 PATIENCE = 180_000  # ms, on a machine without a GPU that is busy
 SHOWN = 6  # frames of each video

@@ -6,15 +6,15 @@ import numpy as np
 import torch
 from matplotlib.collections import EllipseCollection
 
-from warp_splat.binning import bin_tiles
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE, RasterOptions
+from warp_splat.evaluation.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
-from warp_splat.losses import image_loss
-from warp_splat.projection import Project, camera_view
-from warp_splat.render import load_trained_scene
-from warp_splat.renderer import Dropped, rasterize
-from warp_splat.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
+from warp_splat.raster.api import Dropped, rasterize
+from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.rendering.command import load_trained_scene
+from warp_splat.training.loss import image_loss
 
 OUTLINES = 1500  # ellipses that are drawn
 FEW = 60  # entries of a list

@@ -8,7 +8,7 @@ import torch
 from fake_viser import FakeServer
 
 from warp_splat.scene import load_scene
-from warp_splat.train import embedded_scene
+from warp_splat.scene.embedded import embedded_scene
 
 torch.set_num_threads(1)  # idle threads of torch would spin beside the kernels'
 

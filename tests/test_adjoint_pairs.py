@@ -11,11 +11,11 @@ import pytest
 import warp as wp
 
 from warp_splat.config import ALPHA_MIN, T_MIN
-from warp_splat.kernels import blend
+from warp_splat.kernels import splat
 from warp_splat.kernels.lanes import vec16
 
 PAIRS = {
-    name: (getattr(blend, name), getattr(blend, f"adj_{name}")) for name in dir(blend) if hasattr(blend, f"adj_{name}")
+    name: (getattr(splat, name), getattr(splat, f"adj_{name}")) for name in dir(splat) if hasattr(splat, f"adj_{name}")
 }
 
 
@@ -44,16 +44,16 @@ def test_a_blended_pixel_against_float64():
     t = 1.0
     total = 0.0
     for alpha, color in zip(alphas, colors, strict=True):
-        after = blend.advance(t, float(alpha), T_MIN)
-        total += blend.weight(t, float(alpha), after) * color
+        after = splat.advance(t, float(alpha), T_MIN)
+        total += splat.weight(t, float(alpha), after) * color
         t = after
     assert (total, t) == pytest.approx(pixel(alphas), rel=1e-5)
     behind = 0.0
     for k in reversed(range(12)):
-        odds = blend.odds_of(float(alphas[k]))
+        odds = splat.odds_of(float(alphas[k]))
         t = t + t * odds
         lit = float(colors[k] * up)
-        found = blend.adj_alpha_blend(t, odds, behind, lit)
+        found = splat.adj_alpha_blend(t, odds, behind, lit)
         behind += float(alphas[k]) * t * lit
         nudge = np.where(np.arange(12) == k, 1e-6, 0.0)
         expected = up * (pixel(alphas + nudge)[0] - pixel(alphas - nudge)[0]) / 2e-6
@@ -61,14 +61,14 @@ def test_a_blended_pixel_against_float64():
 
 
 def test_a_pixel_stops_before_the_gaussian_that_would_darken_it():
-    t = blend.advance(2e-4, 0.6, T_MIN)
-    assert t == pytest.approx(-2e-4) and blend.weight(2e-4, 0.6, t) == 0.0
-    assert blend.advance(t, 0.5, T_MIN) == pytest.approx(-2e-4) and blend.weight(t, 0.5, t) == 0.0
+    t = splat.advance(2e-4, 0.6, T_MIN)
+    assert t == pytest.approx(-2e-4) and splat.weight(2e-4, 0.6, t) == 0.0
+    assert splat.advance(t, 0.5, T_MIN) == pytest.approx(-2e-4) and splat.weight(t, 0.5, t) == 0.0
 
 
 @pytest.mark.parametrize(("degree", "allowed"), [(3, 8e-5), (4, 4e-6), (5, 1e-6), (6, 1e-6), (None, 1e-6)])
 def test_exp(degree, allowed):
-    exp2_minus = blend.make_exp(degree)
+    exp2_minus = splat.make_exp(degree)
 
     @wp.kernel(module="unique")
     def evaluate(z: wp.array[float], scalar_out: wp.array[float], lanes_out: wp.array[vec16]):
@@ -88,7 +88,7 @@ def test_exp(degree, allowed):
 
 
 def test_log():
-    log_of = blend.log_of
+    log_of = splat.log_of
 
     @wp.kernel(module="unique")
     def evaluate(x: wp.array[float], out: wp.array[float]):
@@ -105,7 +105,7 @@ def test_log():
 
 
 def test_adjoint_stands_behind_its_forward():
-    source = Path(inspect.getfile(blend)).read_text()
+    source = Path(inspect.getfile(splat)).read_text()
     for name in PAIRS:
         after = source[source.index(f"def {name}(") :].split("\ndef ")[1]
         assert after.startswith(f"adj_{name}(")

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from warp_splat import Camera, InputError, RasterOptions, adjoints, binning, renderer, set_threads
-from warp_splat.launch import get_threads
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped
+from warp_splat import Camera, InputError, RasterOptions, set_threads
+from warp_splat.raster import adjoints, api, bin
+from warp_splat.raster.api import Dropped
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime.launch import get_threads
 
 SIZE = (70, 53)
 PLAIN = RasterOptions()
@@ -35,7 +36,7 @@ def lists(bins):
 def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
     camera, projected = project(seed=seed)
     means2d, conics, opacities, _, depths, _, radii = (tensor.double().numpy() for tensor in projected)
-    found = lists(binning.bin_tiles(*projected, camera, RasterOptions()))
+    found = lists(bin.bin_tiles(*projected, camera, RasterOptions()))
     spare = 0
     for tile, listed in enumerate(found):
         left, top = tile % 5 * 16, tile // 5 * 16
@@ -94,7 +95,7 @@ def test_rows_are_summed_in_any_mode_of_torch(count, torch_threads, monkeypatch)
     monkeypatch.setattr(adjoints, "AT_ONCE", 100)
     torch_threads(count)
     camera, projected = project(2000)
-    bins = binning.bin_tiles(*projected, camera, PLAIN)
+    bins = bin.bin_tiles(*projected, camera, PLAIN)
     slots = torch.rand(len(bins.instances), 9)
     expected = adjoints.gather(bins, slots, 2000)
     with torch.inference_mode():
@@ -106,7 +107,7 @@ def test_without_gaussians_or_instances_sums_are_zero():
     for count in (0, 2000):
         camera, projected = project(count)
         projected[-1][:] = 0  # radii
-        bins = binning.bin_tiles(*projected, camera, PLAIN)
+        bins = bin.bin_tiles(*projected, camera, PLAIN)
         assert not torch.cat([grad.view(-1) for grad in adjoints.gather(bins, torch.empty(0, 9), count)]).any()
 
 
@@ -117,7 +118,7 @@ def test_the_number_of_threads_changes_nothing():
         results = []
         for count in (1, 2, 3):
             set_threads(count)
-            results.append(binning.bin_tiles(*projected, camera, RasterOptions()))
+            results.append(bin.bin_tiles(*projected, camera, RasterOptions()))
     finally:
         set_threads(threads)
     for other in results[1:]:
@@ -127,7 +128,7 @@ def test_the_number_of_threads_changes_nothing():
 
 
 def counted_and_sorted(camera, projected, options=PLAIN):
-    return [bin_on(*projected, camera, options) for bin_on in (binning.bin_by_counting, binning.bin_by_sorting)]
+    return [bin_on(*projected, camera, options) for bin_on in (bin.bin_by_counting, bin.bin_by_sorting)]
 
 
 def listed(bins):
@@ -176,10 +177,10 @@ def test_images_and_gradients_are_the_same_from_sorted_lists(monkeypatch):
     tensors = (means, torch.randn(400, 4, generator=generator), scales, torch.rand(400, generator=generator))
     sh = torch.randn(400, 4, 3, generator=generator)
     camera = Camera(*SIZE, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
-    for bin_on in (binning.bin_by_counting, binning.bin_by_sorting):
-        monkeypatch.setattr(renderer, "bin_tiles", bin_on)
+    for bin_on in (bin.bin_by_counting, bin.bin_by_sorting):
+        monkeypatch.setattr(api, "bin_tiles", bin_on)
         leaves = [tensor.clone().requires_grad_() for tensor in (*tensors, sh)]
-        out = renderer.rasterize(*leaves, camera)
+        out = api.rasterize(*leaves, camera)
         assert 0 < (out.radii > 0).sum() < 400
         results.append([out.image, *torch.autograd.grad(out.image.square().sum(), leaves)])
     assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
@@ -187,14 +188,14 @@ def test_images_and_gradients_are_the_same_from_sorted_lists(monkeypatch):
 
 def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
     camera, projected = project()
-    monkeypatch.setattr(binning, "MAX_INSTANCES", 100)
+    monkeypatch.setattr(bin, "MAX_INSTANCES", 100)
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        binning.bin_tiles(*projected, camera, RasterOptions())
+        bin.bin_tiles(*projected, camera, RasterOptions())
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        binning.bin_by_sorting(*projected, camera, RasterOptions())
+        bin.bin_by_sorting(*projected, camera, RasterOptions())
 
 
-@pytest.mark.parametrize("bin_on", [binning.bin_by_counting, binning.bin_by_sorting])
+@pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
 def test_the_count_does_not_wrap(bin_on):
     """70,000 Gaussians that cover 188 x 182 tiles each: 32 bits would see a negative number of instances."""
     camera, projected = project(70_000, size=(3000, 2900), stretch=0.0)
@@ -207,13 +208,13 @@ def test_the_count_does_not_wrap(bin_on):
         bin_on(*projected, camera, RasterOptions(extent="ellipse"))
 
 
-@pytest.mark.parametrize("bin_on", [binning.bin_by_counting, binning.bin_by_sorting])
+@pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
 def test_one_tile_with_too_many_is_refused(bin_on, monkeypatch):
     camera, projected = project()
-    longest = max(map(len, lists(binning.bin_tiles(*projected, camera, PLAIN))))
-    monkeypatch.setattr(binning, "MAX_TILE", longest)
+    longest = max(map(len, lists(bin.bin_tiles(*projected, camera, PLAIN))))
+    monkeypatch.setattr(bin, "MAX_TILE", longest)
     bin_on(*projected, camera, PLAIN)
-    monkeypatch.setattr(binning, "MAX_TILE", longest - 1)
+    monkeypatch.setattr(bin, "MAX_TILE", longest - 1)
     message = f"one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {longest - 1} that fit"
     with pytest.raises(InputError, match=message):
         bin_on(*projected, camera, PLAIN)

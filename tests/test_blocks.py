@@ -8,9 +8,10 @@ import torch
 import warp as wp
 from test_rasterize import check_gradients, check_image, relative_error, run, truth
 
-from warp_splat import RasterOptions, renderer
-from warp_splat.blocks import adjoint_of_blocks, blend_blocks
+from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
+from warp_splat.raster import api
+from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
 
 SCENES = ("degree1", "dense_tile", "saturated", "needles", "ties", "size_1x1", "size_17x33", "single", "empty")
 PLAIN = RasterOptions()
@@ -21,8 +22,8 @@ def blocks(monkeypatch):
     """The renderer with the driver of a GPU, in fibers."""
     before = wp.config.enable_cpu_blocks
     wp.config.enable_cpu_blocks = True
-    monkeypatch.setattr(renderer, "blend_lanes", blend_blocks)
-    monkeypatch.setattr(renderer, "adjoint_of_lanes", adjoint_of_blocks)
+    monkeypatch.setattr(api, "blend_lanes", blend_blocks)
+    monkeypatch.setattr(api, "adjoint_of_lanes", adjoint_of_blocks)
     yield
     wp.config.enable_cpu_blocks = before
 
@@ -63,7 +64,7 @@ def test_pixels_that_are_not_finite_are_dropped(blocks):
     for value in (0.0, float("nan")):
         upstream["image"][5, 7], upstream["alpha"][5, 7] = value, 0.0
         leaves = [tensor.clone().requires_grad_() for tensor in expected.scene.parameters()]
-        out = renderer.rasterize(*leaves, expected.scene.camera, expected.scene.background)
+        out = api.rasterize(*leaves, expected.scene.camera, expected.scene.background)
         torch.autograd.backward([out.image, out.alpha], [upstream["image"], upstream["alpha"]])
         results.append([leaf.grad for leaf in leaves])
         assert out.dropped.pixels == (value != 0.0)

@@ -28,8 +28,8 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.splats import SplatFile
-from warp_splat.run import Run, keep, restore
-from warp_splat.trainer import Trainer
+from warp_splat.training.record import Run, keep, restore
+from warp_splat.training.trainer import Trainer
 
 STOP = 33  # of 60; densification has added Gaussians and the opacities were reset
 #: Densifies, prunes, resets opacities and raises the SH degree within 50 steps.
@@ -46,7 +46,7 @@ SCHEDULE = {
 
 
 def begin(scene, folder, **options):
-    """A trainer and its run, as :func:`warp_splat.train.train` starts them."""
+    """A trainer and its run, as :func:`warp_splat.training.command.train` starts them."""
     return Trainer(scene, TrainConfig(**{**SCHEDULE, **options})), Run(folder, time.perf_counter())
 
 
@@ -197,7 +197,7 @@ def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
     (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
     save_gaussians("start.ply", SplatFile(some_splats(50)))
     begin = ["train", "-s", str(root), "--start_ply", "start.ply", "--viewer", "--port", "1234", "-m"]
-    monkeypatch.setattr("warp_splat.train._watched", lambda *_: nullcontext())
+    monkeypatch.setattr("warp_splat.training.command._watched", lambda *_: nullcontext())
     assert main([*begin, "whole", "--iterations", "6"]) == 0
     with monkeypatch.context() as patch:
         interrupt(patch, 1)
@@ -315,7 +315,7 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_pa
     options = [*SHORT, "--iterations", "300", "--checkpoint_interval", "0.00001"]
     assert train(tmp_path / "whole", *options) == 0
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["warp_splat.train"])
+    processes.set_forkserver_preload(["warp_splat.training.command"])
     moment, kills, runs, reached = random.Random(0), 0, 0, 0
     while True:
         folder = tmp_path / f"model{runs}"
@@ -371,7 +371,7 @@ def test_a_disk_that_is_full_costs_the_checkpoint_only(tmp_path, monkeypatch, ca
     def full(path, *rest):
         raise InputError(f"{path}: could not be written (no space left on device).")
 
-    monkeypatch.setattr("warp_splat.run.save_checkpoint", full)
+    monkeypatch.setattr("warp_splat.training.record.save_checkpoint", full)
     assert train(tmp_path / "model", "--iterations", "5", "--checkpoint_iterations", "3") == 0
     assert capsys.readouterr().err.count("no space left") == 3  # at the start, after iteration 3, at the end
     assert ply_path(tmp_path / "model", 5).is_file()

@@ -9,18 +9,19 @@ import torch
 import warp as wp
 from scenes import SCENES
 
-from warp_splat import RasterOptions, cli, renderer
-from warp_splat.adjoints import list_inputs
-from warp_splat.binning import bin_tiles
-from warp_splat.blocks import adjoint_of_blocks, blend_blocks
-from warp_splat.compare import adjoints, knobs, oracle, report, source, truth, workloads
+from warp_splat import RasterOptions, cli
+from warp_splat.compare import adjoints, knobs, oracle, plots, source, truth, workloads
 from warp_splat.config import ADJOINTS
-from warp_splat.kernels.blend_lanes import BLOCKS
+from warp_splat.kernels.cpu.blend import BLOCKS
+from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.lanes import LANES, vec16
-from warp_splat.kernels.taped_lanes import make_walk
-from warp_splat.launch import launch, view
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Blend, Dropped
+from warp_splat.raster import api
+from warp_splat.raster.adjoints import list_inputs
+from warp_splat.raster.api import Blend, Dropped
+from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime.launch import launch, view
 
 PLAIN = RasterOptions()
 WITHOUT_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is accepted where there is one")
@@ -107,7 +108,7 @@ def test_derivative_lines_are_counted_for_every_mode():
 def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     monkeypatch.setattr(knobs, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
-    monkeypatch.setattr(report, "KNOB_STYLES", {"t_min": ("k", "o"), "alpha_min": ("b", "s")})
+    monkeypatch.setattr(plots, "KNOB_STYLES", {"t_min": ("k", "o"), "alpha_min": ("b", "s")})
     scenes = [workloads.layered(10), workload()]
     measured, lines = adjoints.measure(scenes, ["stepwise"], lambda _: None), []
     rows = adjoints.records(measured)
@@ -124,13 +125,13 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     assert by_name["degree1", "stepwise", "means"]["cosine"] == pytest.approx(1, abs=1e-6)
     assert by_name["degree1", "central differences", "opacities"]["relative_error"] < 0.05
     assert by_name["degree1", "central differences", "opacities"]["note"].endswith("extrapolated")
-    lines += report.adjoint_table(measured).splitlines()
-    report.plot_errors(tmp_path / "errors.png", measured)
-    report.plot_memory(tmp_path / "memory.png", measured)
-    report.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
+    lines += plots.adjoint_table(measured).splitlines()
+    plots.plot_errors(tmp_path / "errors.png", measured)
+    plots.plot_memory(tmp_path / "memory.png", measured)
+    plots.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
     turned = knobs.measure(scenes, lambda _: None)
-    report.plot_knobs(tmp_path / "knobs.png", turned)
-    lines += report.knob_table(turned).splitlines()
+    plots.plot_knobs(tmp_path / "knobs.png", turned)
+    lines += plots.knob_table(turned).splitlines()
     assert len({len(line) for line in lines}) == 2  # two tables, every line as long as its header
     exact = {item.variant: item.image_error for item in turned if item.scene == "degree1"}
     assert exact["alpha_min 0"] < 1e-5 < exact["alpha_min 0.003922 *"] and exact["t_min 0.0001 *"] < 1e-3
@@ -140,8 +141,8 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
 def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
     """Its kernels run in fibers, its memory is told by a stub; all else is what a card would see."""
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setattr(renderer, "blend_lanes", blend_blocks)
-    monkeypatch.setattr(renderer, "adjoint_of_lanes", adjoint_of_blocks)
+    monkeypatch.setattr(api, "blend_lanes", blend_blocks)
+    monkeypatch.setattr(api, "adjoint_of_lanes", adjoint_of_blocks)
     monkeypatch.setattr(workloads, "LAYERED_SIZE", 16)
     monkeypatch.setattr(workloads.Workload, "device", torch.device("cuda"))
     for name, value in (("memory_allocated", 3), ("max_memory_allocated", 10), ("reset_peak_memory_stats", None)):
@@ -155,16 +156,16 @@ def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
     for item in measured[:-1]:
         assert item.worst[1] < 1e-5 and item.image_error < 1e-5, item.variant
         assert item.memory == 7 and len(item.forward) == len(item.backward) == 2 and item.rules is None
-    assert report.adjoint_table(measured).count("\n") == 1 + len(measured)
+    assert plots.adjoint_table(measured).count("\n") == 1 + len(measured)
 
 
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
-    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda device: 2**10)
+    monkeypatch.setattr("warp_splat.raster.adjoints.available_memory", lambda device: 2**10)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     measured = adjoints.measure([workload()], ["stored"], lambda _: None)
     row = next(item for item in measured if item.variant == "stored")
     assert "transmittances" in row.note and not row.backward
-    assert "stored" in report.adjoint_table(measured)
+    assert "stored" in plots.adjoint_table(measured)
 
 
 @pytest.mark.parametrize(

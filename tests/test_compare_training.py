@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warp_splat.compare import training
+from warp_splat.compare import trained
 from warp_splat.config import ADJOINTS
 from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.scene import load_scene
-from warp_splat.train import embedded_scene
+from warp_splat.scene.embedded import embedded_scene
 
 STEPS = 24
-SCHEDULE = {**training.SHORT, "iterations": STEPS, "densify_from_iter": 10, "densification_interval": 12}
+SCHEDULE = {**trained.SHORT, "iterations": STEPS, "densify_from_iter": 10, "densification_interval": 12}
 
 
 @pytest.fixture(scope="module")
@@ -26,28 +26,28 @@ def scene():
 
 @pytest.fixture
 def tiny(monkeypatch):
-    monkeypatch.setattr(training, "SHORT", SCHEDULE)
-    monkeypatch.setattr(training, "SEEDS", (0, 1))
-    monkeypatch.setattr(training, "EVALUATIONS", 4)
+    monkeypatch.setattr(trained, "SHORT", SCHEDULE)
+    monkeypatch.setattr(trained, "SEEDS", (0, 1))
+    monkeypatch.setattr(trained, "EVALUATIONS", 4)
 
 
 def test_short_schedule_is_whole_within_its_steps():
-    assert set(EMBEDDED_DEFAULTS[""]) < set(training.SHORT)
-    assert training.SHORT["iterations"] == training.SHORT["position_lr_max_steps"] == 300
-    assert training.COMPARED[-1] < 2 * training.SHORT["densification_interval"] < training.SHORT["densify_until_iter"]
+    assert set(EMBEDDED_DEFAULTS[""]) < set(trained.SHORT)
+    assert trained.SHORT["iterations"] == trained.SHORT["position_lr_max_steps"] == 300
+    assert trained.COMPARED[-1] < 2 * trained.SHORT["densification_interval"] < trained.SHORT["densify_until_iter"]
 
 
 def test_run_writes_its_files(tiny, scene, tmp_path):
     said = []
-    results = training.run(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)
+    results = trained.run(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)
     assert set(json.loads((tmp_path / "new/training.json").read_text())) == set(results)
     assert results["schedule"]["iterations"] == STEPS
     with open(tmp_path / "new/training.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     columns = "scene variant seed psnr ssim gaussians longest_list lists_cut iterations_per_second refused".split()
     assert list(rows[0]) == columns
-    late = [f"cap {cap}, rendering only" for cap in training.CAPS]
-    further = [*(f"cap {cap}" for cap in training.CAPS), "ellipsoid"]
+    late = [f"cap {cap}, rendering only" for cap in trained.CAPS]
+    further = [*(f"cap {cap}" for cap in trained.CAPS), "ellipsoid"]
     names = [(row["variant"], row["seed"]) for row in rows]
     assert names[:6] == [(name, "0") for name in ["manual", "stepwise", *further]]
     assert names[6:8] == [("manual", "1"), ("stepwise", "1")]
@@ -65,12 +65,12 @@ def test_run_writes_its_files(tiny, scene, tmp_path):
 
 
 def test_modes_train_alike(scene, monkeypatch):
-    monkeypatch.setattr(training, "EVALUATIONS", STEPS)
-    monkeypatch.setattr(training, "COMPARED", ())
+    monkeypatch.setattr(trained, "EVALUATIONS", STEPS)
+    monkeypatch.setattr(trained, "COMPARED", ())
     losses = []
     for mode in ADJOINTS:
-        trainer = training.make_trainer(scene, {**SCHEDULE, "densify_until_iter": 0}, 0, adjoint=mode)
-        list(training.train_run(trainer, result := training.Run("", mode, 0), {}))
+        trainer = trained.make_trainer(scene, {**SCHEDULE, "densify_until_iter": 0}, 0, adjoint=mode)
+        list(trained.train_run(trainer, result := trained.Run("", mode, 0), {}))
         losses.append([record["loss"] for record in result.history])
     assert np.mean(losses[0][-5:]) < 0.9 * np.mean(losses[0][:5])
     np.testing.assert_allclose(losses[1:], [losses[0]] * 3, rtol=1e-3)
@@ -79,16 +79,16 @@ def test_modes_train_alike(scene, monkeypatch):
 def test_cap_of_one_entry_costs_quality(scene):
     qualities = []
     for cap in (None, 1):
-        trainer = training.make_trainer(scene, SCHEDULE, 0, max_steps=cap)
-        list(training.train_run(trainer, result := training.Run("", "", 0), {}))
+        trainer = trained.make_trainer(scene, SCHEDULE, 0, max_steps=cap)
+        list(trained.train_run(trainer, result := trained.Run("", "", 0), {}))
         qualities.append(result.history[-1]["psnr"])
     assert qualities[1] < qualities[0] - 1
 
 
 def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("warp_splat.adjoints.available_memory", lambda device: 0)
+    monkeypatch.setattr("warp_splat.raster.adjoints.available_memory", lambda device: 0)
     said = []
-    results = training.run(tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append)
+    results = trained.run(tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append)
     assert {record["scene"] for record in results["summary"]} == {"embedded", "other"}
     record = results["summary"][1]
     assert record["variant"] == "stored" and "take" in record["refused"]

@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from warp_splat.config import TrainConfig
-from warp_splat.densify import Densifier, rotate
 from warp_splat.gaussians import GaussianModel, along_curve
-from warp_splat.optimizer import Optimizer
+from warp_splat.training.densify import Densifier, rotate
+from warp_splat.training.optimizer import Optimizer
 
 EXTENT = 10.0
 

@@ -4,8 +4,10 @@ import pytest
 import torch
 import warp as wp
 
-from warp_splat import InputError, devices, lanes, launch, renderer, selftest
+from warp_splat import InputError
 from warp_splat.config import ADJOINTS
+from warp_splat.raster import api, cpu, selftest
+from warp_splat.runtime import devices, launch
 
 CPU = torch.device("cpu")
 
@@ -65,7 +67,7 @@ def test_self_test(adjoint, device):
 
 
 def test_kernels_that_do_nothing_are_found(monkeypatch):
-    monkeypatch.setattr(lanes, "launch", lambda *arguments, **options: None)
+    monkeypatch.setattr(cpu, "launch", lambda *arguments, **options: None)
     monkeypatch.setattr(torch, "empty", torch.zeros)
     monkeypatch.setattr(torch.Tensor, "new_empty", torch.Tensor.new_zeros)
     with pytest.raises(InputError, match=r"--device cpu: the self-test expected 0\.\d+ as a pixel and found 0: "):
@@ -90,10 +92,10 @@ def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
 @pytest.mark.parametrize("factor", [0.0, 1.001, float("nan")])
 def test_a_wrong_gradient_is_found(factor, monkeypatch):
     def wrong(*arguments):
-        slots, adj_background, bad = lanes.adjoint_of_lanes(*arguments)
+        slots, adj_background, bad = cpu.adjoint_of_lanes(*arguments)
         return factor * slots, adj_background, bad
 
-    monkeypatch.setattr(renderer, "adjoint_of_lanes", wrong)
+    monkeypatch.setattr(api, "adjoint_of_lanes", wrong)
     with pytest.raises(InputError, match=r"self-test expected \S+ as a gradient"):
         selftest.check_device(CPU)
 
@@ -106,6 +108,6 @@ def test_kernels_that_cannot_run_are_explained(error, words, monkeypatch):
     def fail(*arguments):
         raise error
 
-    monkeypatch.setattr(renderer, "blend_lanes", fail)
+    monkeypatch.setattr(api, "blend_lanes", fail)
     with pytest.raises(InputError, match=f"--device cpu: .*{words}.* or use another device"):
         selftest.check_device(CPU)

@@ -18,11 +18,11 @@ import torch
 from torchrun_steps import CONFIG, STEPS
 
 from warp_splat.config import TrainConfig
-from warp_splat.distributed import ALONE, Processes, join
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
-from warp_splat.trainer import Trainer
+from warp_splat.runtime.distributed import ALONE, Processes, join
+from warp_splat.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "assets" / "still_life"
@@ -143,7 +143,8 @@ def test_when_a_process_is_killed_the_other_saves_and_stops(killed, tmp_path):
 #: Training in which process 1 fails in step 29 (warming up is the first call); 0 gives up on it after 3 seconds.
 FAILING = """
 import datetime, os, signal, sys
-from warp_splat import distributed, trainer
+from warp_splat.runtime import distributed
+from warp_splat.training import trainer
 from warp_splat.cli import main
 loss, calls = trainer.image_loss, []
 def failing(*arguments, **options):

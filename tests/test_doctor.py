@@ -11,9 +11,9 @@ from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, wri
 from test_scene_input import BAD
 
 from warp_splat.cli import main
-from warp_splat.doctor import geometry
-from warp_splat.doctor.forecast import forecast
-from warp_splat.doctor.subject import read_subject
+from warp_splat.inspect import geometry
+from warp_splat.inspect.cost import forecast
+from warp_splat.inspect.subject import read_subject
 
 EMBEDDED = Path(__file__).parents[1] / "assets" / "still_life"
 
@@ -170,7 +170,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("case", DAMAGE)
 def test_damage_is_found(life, tmp_path, capsys, monkeypatch, case):
-    monkeypatch.setattr("warp_splat.doctor.run.draw", lambda subject, measured: ())  # takes long
+    monkeypatch.setattr("warp_splat.inspect.command.draw", lambda subject, measured: ())  # takes long
     damage, (level, check), text = DAMAGE[case]
     damage(life)
     findings, _ = examine(life, tmp_path, capsys, 1 if level == "error" else 0)
@@ -179,7 +179,7 @@ def test_damage_is_found(life, tmp_path, capsys, monkeypatch, case):
 
 @pytest.mark.parametrize("case", BAD)
 def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case):
-    monkeypatch.setattr("warp_splat.doctor.run.draw", lambda subject, measured: ())
+    monkeypatch.setattr("warp_splat.inspect.command.draw", lambda subject, measured: ())
     source, options = BAD[case][0](tmp_path)
     if options.keys() - {"images"}:
         return  # of the resolution or the split, which this command does not have

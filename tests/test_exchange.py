@@ -21,15 +21,15 @@ from splat_files import (
 
 from warp_splat.cli import main
 from warp_splat.config import RasterOptions
-from warp_splat.convert import losses
 from warp_splat.errors import InputError
+from warp_splat.evaluation.metrics import psnr
+from warp_splat.formats.convert import losses
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import is_antialiased
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
-from warp_splat.metrics import psnr
-from warp_splat.render import make_picture
+from warp_splat.rendering.command import make_picture
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward

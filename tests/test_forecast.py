@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warp_splat import forecast
 from warp_splat.camera import Camera
 from warp_splat.config import TrainConfig
 from warp_splat.scene.types import Scene, View
+from warp_splat.training import memory
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -54,24 +54,22 @@ def test_forecast_is_what_a_step_takes(point, kinds):
     ],
 )
 def test_grounds(scene, options, count, reason):
-    told = forecast.describe(scene, TrainConfig(**options), len(scene.points))
+    told = memory.describe(scene, TrainConfig(**options), len(scene.points))
     assert told.startswith("About ") and f" at {count} Gaussians (" in told and reason in told
 
 
 def test_what_does_not_fit_is_told(scene, monkeypatch):
-    pair = forecast.step_memory(10**6, 16, 3 * 10**6, 600 * 400) * 2
-    own = forecast.GIB
-    monkeypatch.setattr(
-        forecast.psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=own))
-    )
+    pair = memory.step_memory(10**6, 16, 3 * 10**6, 600 * 400) * 2
+    own = memory.GIB
+    monkeypatch.setattr(memory.psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=own)))
     config = TrainConfig(max_gaussians=10**6)
     for available, fits in ((pair, True), (pair - 2, False)):
-        monkeypatch.setattr(forecast, "available_memory", lambda device, available=available: available)
-        told = forecast.describe(scene, config, len(scene.points), processes=2)
-        assert "in each of 2 processes" in told and f"{(own + pair / 2) / forecast.GIB:.1f} GiB" in told
+        monkeypatch.setattr(memory, "available_memory", lambda device, available=available: available)
+        told = memory.describe(scene, config, len(scene.points), processes=2)
+        assert "in each of 2 processes" in told and f"{(own + pair / 2) / memory.GIB:.1f} GiB" in told
         assert ("(-r)" not in told and "Only" not in told) if fits else ("(-r)" in told and "Only" in told)
 
 
 def test_stored_states_are_counted():
-    more = forecast.step_memory(10, 16, 1000, 100, "stored") - forecast.step_memory(10, 16, 1000, 100)
+    more = memory.step_memory(10, 16, 1000, 100, "stored") - memory.step_memory(10, 16, 1000, 100)
     assert more == 1000 * 1024

@@ -12,7 +12,7 @@ import warp as wp
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
-from warp_splat.renderer import Blend, Dropped
+from warp_splat.raster.api import Blend, Dropped
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))

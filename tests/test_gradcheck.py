@@ -5,10 +5,11 @@ import pytest
 import torch
 from scenes import SCENES
 
-from warp_splat import InputError, RasterOptions, check_gradients, differences, renderer
+from warp_splat import InputError, RasterOptions, check_gradients
 from warp_splat.compare import oracle
 from warp_splat.config import ADJOINTS
-from warp_splat.differences import INPUTS, INTERMEDIATES
+from warp_splat.raster import api, differences
+from warp_splat.raster.differences import INPUTS, INTERMEDIATES
 
 EVERYTHING = INPUTS + INTERMEDIATES
 VARIANTS = [
@@ -104,12 +105,12 @@ def make_means_not_finite(gradients):
 @pytest.mark.parametrize(
     ("function", "change", "named"),
     [
-        (renderer.Blend, scale_conics, {"conics", "quats", "scales"}),
-        (renderer.Blend, scale_opacities, {"opacities2d", "opacities"}),
-        (renderer.Blend, forget_background, {"background"}),
-        (renderer.Project, flip_one_entry_of_quats, {"quats"}),
-        (renderer.Project, forget_higher_degrees, {"sh"}),
-        (renderer.Project, make_means_not_finite, {"means"}),
+        (api.Blend, scale_conics, {"conics", "quats", "scales"}),
+        (api.Blend, scale_opacities, {"opacities2d", "opacities"}),
+        (api.Blend, forget_background, {"background"}),
+        (api.Project, flip_one_entry_of_quats, {"quats"}),
+        (api.Project, forget_higher_degrees, {"sh"}),
+        (api.Project, make_means_not_finite, {"means"}),
     ],
 )
 def test_a_wrong_gradient_is_named(function, change, named, monkeypatch):
@@ -132,12 +133,12 @@ def test_turning_balls_changes_nothing(monkeypatch):
     )
     arguments = (means, upright, balls, opacities, sh, scene.camera)
     assert check_gradients(*arguments, parameters=["quats"]).ok
-    spoil(monkeypatch, renderer.Project, lambda gradients: gradients.__setitem__(1, gradients[1] + 1))
+    spoil(monkeypatch, api.Project, lambda gradients: gradients.__setitem__(1, gradients[1] + 1))
     assert check_gradients(*arguments, parameters=["quats"]).named("off") == ["quats"]
 
 
 def test_a_uniform_error_is_measured(monkeypatch):
-    spoil(monkeypatch, renderer.Blend, scale_conics)
+    spoil(monkeypatch, api.Blend, scale_conics)
     report = check("degree1", parameters=["conics"])
     assert report.rows[0].error == pytest.approx(0.05, rel=0.02)
     assert report.worst.analytic == pytest.approx(1.05 * report.worst.difference, rel=0.01)
@@ -152,7 +153,7 @@ def test_the_gaussian_that_is_off_is_found(monkeypatch):
         gradients[2] = gradients[2].clone()
         gradients[2][loudest] = 0
 
-    spoil(monkeypatch, renderer.Project, change)
+    spoil(monkeypatch, api.Project, change)
     report = check("degree1")
     assert report.named("off") == ["scales"]
     assert (report.worst.name, report.worst.index) == ("scales", loudest)

@@ -20,7 +20,7 @@ from test_train import fails
 from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import LAST, load_checkpoint, load_options, save_checkpoint
-from warp_splat.run import Run, keep, restore
+from warp_splat.training.record import Run, keep, restore
 
 
 @pytest.fixture(scope="module")

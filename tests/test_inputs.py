@@ -20,8 +20,8 @@ from splat_files import some_file
 from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
-from warp_splat.losses import image_loss
-from warp_splat.trainer import Trainer
+from warp_splat.training.loss import image_loss
+from warp_splat.training.trainer import Trainer
 
 
 def test_images_are_found_by_their_stems(tmp_path):
@@ -97,7 +97,7 @@ def seen_targets(monkeypatch, scene, steps, **options):
         found.append((image.detach().clone(), target.clone()))
         return image_loss(image, target, *arguments, **options)
 
-    monkeypatch.setattr("warp_splat.trainer.image_loss", spy)
+    monkeypatch.setattr("warp_splat.training.trainer.image_loss", spy)
     for iteration in range(1, steps + 1):
         trainer.differentiate(iteration)
         trainer.update(iteration)

@@ -8,7 +8,7 @@ import pytest
 import torch
 import warp as wp
 
-from warp_splat import launch
+from warp_splat.runtime import launch
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 

@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
-from warp_splat import InputError, losses, set_threads
-from warp_splat.launch import get_threads, profile
-from warp_splat.losses import LossByConvolution, image_loss
+from warp_splat import InputError, set_threads
+from warp_splat.runtime.launch import get_threads, profile
+from warp_splat.training import loss as losses
+from warp_splat.training.loss import LossByConvolution, image_loss
 
 
 def oracle(x, y, share):

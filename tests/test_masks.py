@@ -18,11 +18,11 @@ from test_losses import oracle
 
 from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
-from warp_splat.evaluate import evaluate_views
-from warp_splat.losses import LossByConvolution, image_loss
-from warp_splat.metrics import METRICS, psnr, ssim
+from warp_splat.evaluation.metrics import METRICS, psnr, ssim
+from warp_splat.evaluation.views import evaluate_views
 from warp_splat.scene.images import read_mask
-from warp_splat.trainer import Trainer
+from warp_splat.training.loss import LossByConvolution, image_loss
+from warp_splat.training.trainer import Trainer
 
 
 def some_mask(height=HEIGHT, width=WIDTH):

@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 
 from warp_splat.errors import InputError
+from warp_splat.evaluation.metrics import METRICS, evaluate_folder, psnr, ssim, write_results
+from warp_splat.evaluation.perceptual import choose_metrics, flip
 from warp_splat.formats.png import load_png, save_png
-from warp_splat.metrics import METRICS, evaluate_folder, psnr, ssim, write_results
-from warp_splat.perceptual import choose_metrics, flip
 
 
 def images(height, width, noise=20, seed=0):
@@ -208,7 +208,7 @@ def test_flip_sees_nothing_under_a_mask():
 
 
 def test_flip_that_is_not_installed_is_named(monkeypatch):
-    monkeypatch.setattr("warp_splat.perceptual.find_spec", lambda _: None)
+    monkeypatch.setattr("warp_splat.evaluation.perceptual.find_spec", lambda _: None)
     metrics, absent = choose_metrics("")
     assert set(metrics) == set(METRICS)
     assert [sentence.split()[0] for sentence in absent] == ["FLIP", "LPIPS"] and "pip install flip" in absent[0]

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import warp_splat
-from warp_splat import launch
+from warp_splat.runtime import launch
 
 ROOT = Path(__file__).parents[1]
 NAMES = warp_splat.__all__
@@ -29,7 +29,7 @@ def python(code):
 
 def test_every_public_name_exists_after_any_other_import():
     """One process for all: lazily loaded names must not be shadowed by modules of the same name."""
-    lines = ["import warp_splat.trainer", "from warp_splat import *"]
+    lines = ["import warp_splat.training.trainer", "from warp_splat import *"]
     lines += [f"from warp_splat import {a}, {b}" for a, b in itertools.permutations(NAMES, 2)]
     lines += ["import types", f"names = {NAMES!r}"]
     lines += ["assert not any(isinstance(getattr(warp_splat, name), types.ModuleType) for name in names)"]

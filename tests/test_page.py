@@ -18,17 +18,17 @@ from splat_files import covariances, some_splats
 
 from warp_splat.cli import main
 from warp_splat.config import RasterOptions
+from warp_splat.evaluation.metrics import psnr
+from warp_splat.export_html.command import make_page
+from warp_splat.export_html.pack import pack, shown
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.png import load_png
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.metrics import psnr
-from warp_splat.page.export import make_page
-from warp_splat.page.pack import pack, shown
-from warp_splat.render import make_picture
+from warp_splat.rendering.camera_paths import orbit_cameras
+from warp_splat.rendering.command import make_picture
 from warp_splat.scene.types import View
-from warp_splat.ways import orbit_cameras
 
 EVIL = "</script><script>window.evil = 1</script><img src=x onerror='window.evil = 1'>\u2028.jpg"
 OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "LINEAR": False, "BACKGROUND": 0.0}
@@ -54,7 +54,7 @@ class Blocks(HTMLParser):
 
 
 def unpacked(data, count, coefficients):
-    """The numbers of warp_splat/page/pack.py's table, decoded as it says."""
+    """The numbers of warp_splat/export_html/pack.py's table, decoded as it says."""
     planes = np.frombuffer(gzip.decompress(data), np.uint8).reshape(-1, count)
     rows = np.ascontiguousarray(planes.T)
     shorts = rows[:, 12:32].copy().view("<i2").astype(np.float64)
@@ -300,7 +300,7 @@ def test_what_cannot_be_exported_is_refused_and_an_older_page_stays(tmp_path, ca
     ):
         assert main(["export-html", *map(str, arguments)]) == 1
         assert re.search(sentence, capsys.readouterr().err)
-    monkeypatch.setattr("warp_splat.page.export.LONGEST", 100)
+    monkeypatch.setattr("warp_splat.export_html.command.LONGEST", 100)
     assert main(["export-html", str(folder), str(target)]) == 1
     assert "use --max_gaussians" in capsys.readouterr().err
     assert target.read_text() == "older" and sorted(path.name for path in tmp_path.iterdir()) == ["model", "page.html"]

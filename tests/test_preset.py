@@ -11,7 +11,7 @@ from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
-from warp_splat.trainer import Trainer
+from warp_splat.training.trainer import Trainer
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 

@@ -14,11 +14,11 @@ import sys
 sys.path.insert(0, "tests")
 import numpy as np, torch
 import warp_splat
-from warp_splat.kernels import build
+from warp_splat.kernels import compiler
 
 for options in [value for name, value in vars(build).items() if name.isupper() and name[0] != "_"]:  # read later
     options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", sys.argv[1])
-from warp_splat.losses import image_loss
+from warp_splat.training.loss import image_loss
 from scenes import SCENES
 
 scene = SCENES["degree3"]()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from warp_splat import projection
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.harmonics import C0, C1
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped
+from warp_splat.raster import project as projection
+from warp_splat.raster.api import Dropped
+from warp_splat.raster.project import Project, camera_view
 
 CAMERA = Camera(70, 53, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
 OPTIONS = {

@@ -13,9 +13,10 @@ import torch
 from scenes import PARAMETERS, SCENES
 
 import warp_splat
-from warp_splat import InputError, RasterOptions, adjoints
+from warp_splat import InputError, RasterOptions
 from warp_splat.compare import oracle
 from warp_splat.config import ADJOINTS
+from warp_splat.raster import adjoints
 
 IMAGE_MAX, IMAGE_MEAN = 1e-4, 1e-5  # allowed error of image and alpha
 SHARE = 0.02  # at a fragile pixel: the largest weight that one decision moves is about 1e-2

@@ -11,7 +11,7 @@ from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, r
 import warp_splat
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
-from warp_splat.losses import image_loss
+from warp_splat.training.loss import image_loss
 
 
 def equal(first, second):

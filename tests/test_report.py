@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from warp_splat import report
 from warp_splat.errors import InputError
+from warp_splat.evaluation import report
 from warp_splat.formats.png import load_png, save_png, save_video
+from warp_splat.text import format_table
 
 
 def view(name="0001.jpg", height=60, width=80, gap=8):
@@ -122,22 +123,22 @@ def test_running_mean_keeps_constants_and_slopes():
 
 
 def test_importing_the_report_loads_no_matplotlib():
-    modules = "warp_splat.report, warp_splat.formats.png"
+    modules = "warp_splat.evaluation.report, warp_splat.formats.png"
     program = f"import sys, {modules}; sys.exit(not {{'matplotlib', 'av'}}.isdisjoint(sys.modules))"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
 def test_format_table():
-    table = report.format_table(["view", "PSNR", "note"], [["0012.jpg", 24.1, "a|b"], ["z", "-", ""]])
+    table = format_table(["view", "PSNR", "note"], [["0012.jpg", 24.1, "a|b"], ["z", "-", ""]])
     assert table.splitlines() == [
         "| view     | PSNR | note |",
         "| -------- | ---: | ---- |",
         "| 0012.jpg | 24.1 | a\\|b |",
         "| z        |    - |      |",
     ]
-    assert report.format_table(["a"], []).splitlines() == ["| a   |", "| --- |"]
+    assert format_table(["a"], []).splitlines() == ["| a   |", "| --- |"]
     with pytest.raises(InputError, match="expected 2 cells"):
-        report.format_table(["a", "b"], [["only one"]])
+        format_table(["a", "b"], [["only one"]])
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 63), (1, 1)])

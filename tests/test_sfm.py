@@ -21,7 +21,7 @@ from warp_splat.config import SfmConfig, TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
-from warp_splat.sfm.run import scene_for, sfm
+from warp_splat.sfm.command import scene_for, sfm
 from warp_splat.sfm.video import sample_frames
 
 COUNT = 6

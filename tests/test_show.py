@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from warp_splat.cli import main
+from warp_splat.evaluation.metrics import METRICS, psnr
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.png import load_png
-from warp_splat.metrics import METRICS, psnr
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 SHORT = "--eval -r 65 --iterations 20 --densify_from_iter 5 --densification_interval 5".split()  # an odd size

@@ -10,10 +10,10 @@ import pytest
 import scenes
 import torch
 
-from warp_splat.compare import stability, stability_blend, stability_check, stability_numbers, stability_scenes
+from warp_splat.compare.stability import arithmetic, cases, inputs, pixel_loop, verdict
 from warp_splat.config import ADJOINTS, BLUR
 
-VERDICTS = [(case, mode) for case in stability.CASES for mode in stability.modes_of(case, ADJOINTS)]
+VERDICTS = [(case, mode) for case in cases.CASES for mode in cases.modes_of(case, ADJOINTS)]
 
 
 @pytest.mark.parametrize(
@@ -26,25 +26,25 @@ def test_case(case, mode, record_property):
 
 
 def test_names_are_unique():
-    names = [case.name for case in stability.CASES]
+    names = [case.name for case in cases.CASES]
     assert len(set(names)) == len(names)
 
 
 def small_truth():
-    return stability_check.truth(stability_blend.ordinary)
+    return verdict.truth(pixel_loop.ordinary)
 
 
 def broken(monkeypatch, change):
     """The outcome of the ordinary case when ``change`` is done to the renderer's output."""
-    draw = stability_check.draw
+    draw = verdict.draw
 
     def drawn(*arguments):
         out = draw(*arguments)
         change(out)
         return out
 
-    monkeypatch.setattr(stability_check, "draw", drawn)
-    return stability_check.compare(small_truth(), "manual")
+    monkeypatch.setattr(verdict, "draw", drawn)
+    return verdict.compare(small_truth(), "manual")
 
 
 def spoil(value):
@@ -65,14 +65,14 @@ def test_a_wrong_pixel_fails(monkeypatch, value):
 
 
 def test_a_wrong_gradient_fails(monkeypatch):
-    differentiate = stability_check.differentiate
+    differentiate = verdict.differentiate
 
     def scaled(*arguments):
         return {name: value * (1.001 if name == "scales" else 1) for name, value in differentiate(*arguments).items()}
 
     truth = small_truth()
-    monkeypatch.setattr(stability_check, "differentiate", scaled)
-    failures = stability_check.compare(truth, "manual").failures
+    monkeypatch.setattr(verdict, "differentiate", scaled)
+    failures = verdict.compare(truth, "manual").failures
     assert len(failures) == 1 and "scales" in failures[0]
 
 
@@ -90,29 +90,29 @@ def test_a_gaussian_that_should_be_left_out_fails():
     truth = small_truth()
     drawn = int(truth.out.touches.nonzero()[0])
     stated = replace(truth, problem=replace(truth.problem, left_out=(drawn,)))
-    assert any("left out" in failure for failure in stability_check.compare(stated, "manual").failures)
+    assert any("left out" in failure for failure in verdict.compare(stated, "manual").failures)
 
 
 def test_the_condition_of_an_ordinary_problem_is_within_the_usual_limits():
     """So that asking for it loosens nothing where nothing is extreme."""
-    truth = stability_check.truth(lambda: replace(stability_blend.ordinary(), conditioned=True))
-    assert truth.image_limit == stability_check.IMAGE_LIMIT
-    assert set(truth.gradient_limits.values()) == {stability_check.GRADIENT_LIMIT}
+    truth = verdict.truth(lambda: replace(pixel_loop.ordinary(), conditioned=True))
+    assert truth.image_limit == verdict.IMAGE_LIMIT
+    assert set(truth.gradient_limits.values()) == {verdict.GRADIENT_LIMIT}
 
 
 def test_the_exact_determinant_is_that_of_the_matrix():
     a1, a2 = (np.array([row], dtype=np.float32) for row in ([3, -1, 2], [0.5, 4, -7]))
     rows = np.concatenate([a1, a2]).astype(np.float64)
     expected = np.linalg.det(rows @ rows.T + float(np.float32(BLUR)) * np.eye(2))
-    (exact,) = stability_numbers.exact_determinant(a1, a2)
+    (exact,) = arithmetic.exact_determinant(a1, a2)
     assert isinstance(exact, Fraction) and float(exact) == pytest.approx(expected, rel=1e-12)
-    for formula in (stability_numbers.usual_determinant, stability_numbers.our_determinant):
+    for formula in (arithmetic.usual_determinant, arithmetic.our_determinant):
         assert formula(a1, a2)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_exact_loss_of_equal_images_is_zero():
     image = torch.rand(13, 17, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    assert stability_numbers.exact_loss(image, image).item() == pytest.approx(0, abs=1e-12)
+    assert arithmetic.exact_loss(image, image).item() == pytest.approx(0, abs=1e-12)
 
 
 def test_exact_loss_in_one_window():
@@ -123,43 +123,43 @@ def test_exact_loss_in_one_window():
     var, cov = w * (x * x + y * y) - w * w * (x * x + y * y), w * x * y - w * w * x * y
     ssim = (2 * w * w * x * y + 1e-4) * (2 * cov + 9e-4) / ((w * w * (x * x + y * y) + 1e-4) * (var + 9e-4))
     pictures = (torch.full((1, 1, 3), value, dtype=torch.float64) for value in (x, y))
-    assert stability_numbers.exact_loss(*pictures).item() == pytest.approx(0.8 * 0.4 + 0.2 * (1 - ssim), rel=1e-12)
+    assert arithmetic.exact_loss(*pictures).item() == pytest.approx(0.8 * 0.4 + 0.2 * (1 - ssim), rel=1e-12)
 
 
 def test_exact_adam_is_torchs():
     parameter = torch.zeros(1, dtype=torch.float64, requires_grad=True)
-    adam = torch.optim.Adam([parameter], lr=0.01, eps=stability_numbers.ADAM_EPS)
-    for _ in range(stability_numbers.STEPS):
+    adam = torch.optim.Adam([parameter], lr=0.01, eps=arithmetic.ADAM_EPS)
+    for _ in range(arithmetic.STEPS):
         parameter.grad = torch.full_like(parameter, 0.3)
         adam.step()
-    assert stability_numbers.exact_adam(0.3, 0.01, sparse=False) == pytest.approx(parameter.item(), rel=1e-12)
+    assert arithmetic.exact_adam(0.3, 0.01, sparse=False) == pytest.approx(parameter.item(), rel=1e-12)
 
 
 def test_needles_point_where_they_are_asked_to():
     camera = scenes.make_camera(20, 16)
     angles, tilts = np.linspace(0, np.pi, 9, endpoint=False), np.linspace(0, 1.5, 9)
-    quats = torch.from_numpy(stability_scenes.facing(camera, angles, tilts))
-    axis = stability_check.oracle.rotation_matrices(quats)[:, :, 0].numpy() @ camera.rotation.T
+    quats = torch.from_numpy(inputs.facing(camera, angles, tilts))
+    axis = verdict.oracle.rotation_matrices(quats)[:, :, 0].numpy() @ camera.rotation.T
     expected = np.stack([np.cos(tilts) * np.cos(angles), np.cos(tilts) * np.sin(angles), np.sin(tilts)], 1)
     assert np.abs(axis - expected).max() < 1e-12
 
 
 def test_a_point_is_placed_at_its_pixel():
-    camera = stability_scenes.look(30, 20, fov=70, seed=3)
+    camera = inputs.look(30, 20, fov=70, seed=3)
     pixels, depth = np.array([[4.5, 17.0], [29.0, 0.5]]), np.array([2.0, 7.0])
-    points = stability_scenes.at_pixels(pixels, depth, camera) @ camera.rotation.T + camera.translation
+    points = inputs.at_pixels(pixels, depth, camera) @ camera.rotation.T + camera.translation
     shown = points[:, :2] / points[:, 2:] * camera.fx + [camera.cx, camera.cy]
     assert np.abs(shown - pixels).max() < 1e-9 and np.abs(points[:, 2] - depth).max() < 1e-9
 
 
 def test_run_writes_and_counts(tmp_path, monkeypatch):
     """With few cases: the table, the files, and the number of failed verdicts."""
-    chains = [case for case in stability.CASES if case.name.startswith("chain_1")]
-    wrong = stability_check.Case("wrong", "none", "fails", lambda _mode: failing, modal=False)
-    failing = stability_check.Outcome("nothing", 1.0, 0.0, None, 0.0, "-", ("stated, and not so",))
-    monkeypatch.setattr(stability, "CASES", (*chains, wrong))
+    chains = [case for case in cases.CASES if case.name.startswith("chain_1")]
+    wrong = verdict.Case("wrong", "none", "fails", lambda _mode: failing, modal=False)
+    failing = verdict.Outcome("nothing", 1.0, 0.0, None, 0.0, "-", ("stated, and not so",))
+    monkeypatch.setattr(cases, "CASES", (*chains, wrong))
     lines = []
-    assert stability.run(tmp_path / "out", ["manual"], lines.append) == 1
+    assert cases.run(tmp_path / "out", ["manual"], lines.append) == 1
     assert "FAIL" in lines[0] and any("stated, and not so" in line for line in lines)
     verdicts = json.loads((tmp_path / "out/stability.json").read_text())["verdicts"]
     with (tmp_path / "out/stability.csv").open(newline="") as file:
@@ -169,10 +169,10 @@ def test_run_writes_and_counts(tmp_path, monkeypatch):
 
 
 def test_a_verdict_names_the_modes_that_failed():
-    good = stability_check.Outcome("nothing", 0.0, 0.0, None, 0.0, "-", ())
+    good = verdict.Outcome("nothing", 0.0, 0.0, None, 0.0, "-", ())
     bad = replace(good, failures=("wrong",))
     verdicts = [
-        stability.Row(stability.CASES[0], {"manual": first, "stored": second}).verdict
+        cases.Row(cases.CASES[0], {"manual": first, "stored": second}).verdict
         for first, second in ((good, good), (good, bad), (bad, bad))
     ]
     assert verdicts == ["pass", "FAIL stored", "FAIL"]

@@ -9,10 +9,11 @@ import pytest
 import torch
 import warp as wp
 
-from warp_splat import RasterOptions, launch
+from warp_splat import RasterOptions
 from warp_splat.config import ALPHA_MIN, T_MIN
-from warp_splat.projection import Project, camera_view
-from warp_splat.renderer import Dropped
+from warp_splat.raster.api import Dropped
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime import launch
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))

@@ -10,12 +10,14 @@ import pytest
 import torch
 import warp as wp
 
-from warp_splat import Camera, binning, launch, projection, rasterize
+from warp_splat import Camera, rasterize
 from warp_splat.config import TrainConfig
-from warp_splat.densify import Densifier
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project import quarantine
-from warp_splat.optimizer import EPS, Optimizer
+from warp_splat.raster import bin, project
+from warp_splat.runtime import launch
+from warp_splat.training.densify import Densifier
+from warp_splat.training.optimizer import EPS, Optimizer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -118,9 +120,9 @@ def test_statistics_are_those_of_all_rows(threads, model):
 def test_rows_are_taken_and_put(threads):
     rng = np.random.default_rng(0)
     order, values = rng.permutation(COUNT).astype(np.int32), rng.integers(0, 10**9, COUNT).astype(np.int32)
-    assert (binning._taken(values, order) == values[order]).all()
-    assert (binning._put(values.astype(np.int64), order)[order] == values).all()
-    assert len(binning._taken(values, order[:0])) == len(binning._put(values[:0], order[:0])) == 0
+    assert (bin._taken(values, order) == values[order]).all()
+    assert (bin._put(values.astype(np.int64), order)[order] == values).all()
+    assert len(bin._taken(values, order[:0])) == len(bin._put(values[:0], order[:0])) == 0
 
 
 def test_what_runs_beside_runs_once(threads):
@@ -145,7 +147,7 @@ def test_sums_find_what_is_not_finite(threads, rows, value, finite):
     tensors = [torch.ones(COUNT, 3), torch.ones(COUNT)]
     for row, sign in zip(rows, (1.0, -1.0), strict=False):
         tensors[0][row] = sign * value
-    assert projection._all_finite(tensors) == finite
+    assert project._all_finite(tensors) == finite
 
 
 def test_a_sum_that_overflows_drops_nothing():

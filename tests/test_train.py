@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from warp_splat.cli import main
+from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.png import load_png
-from warp_splat.metrics import psnr
 
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "assets" / "still_life"
@@ -252,7 +252,7 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
 
 
 def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, capsys):
-    from warp_splat import train as module  # noqa: PLC0415
+    from warp_splat.training import command as module  # noqa: PLC0415
     from warp_splat.errors import InputError  # noqa: PLC0415
 
     def full(path, image):
@@ -284,7 +284,9 @@ def fail_at(monkeypatch, target, call, error):
 
 
 def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
-    fail_at(monkeypatch, "warp_splat.trainer.image_loss", 11, RuntimeError("planted"))  # the first call warms up
+    fail_at(
+        monkeypatch, "warp_splat.training.trainer.image_loss", 11, RuntimeError("planted")
+    )  # the first call warms up
     with pytest.raises(RuntimeError, match="planted"):
         train(tmp_path)
     assert len(load_ply(ply_path(tmp_path, 9)).means) == 4500
@@ -293,11 +295,11 @@ def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("target", "error", "where"),
     [
-        ("warp_splat.renderer.bin_tiles", MemoryError(), "in stage 'bin'"),
-        ("warp_splat.renderer.bin_tiles", RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), "'bin'"),
-        ("warp_splat.renderer.adjoint_of_lanes", torch.OutOfMemoryError("CUDA out of memory."), "'adjoint of blend'"),
+        ("warp_splat.raster.api.bin_tiles", MemoryError(), "in stage 'bin'"),
+        ("warp_splat.raster.api.bin_tiles", RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), "'bin'"),
+        ("warp_splat.raster.api.adjoint_of_lanes", torch.OutOfMemoryError("CUDA out of memory."), "'adjoint of blend'"),
         (
-            "warp_splat.trainer.image_loss",
+            "warp_splat.training.trainer.image_loss",
             RuntimeError("[enforce fail] . not enough memory: you"),
             "between two stages",
         ),
@@ -323,7 +325,7 @@ def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
     ],
 )
 def test_memory_that_runs_out_while_rendering_is_explained(options, error, words, trained, monkeypatch, capsys):
-    fail_at(monkeypatch, "warp_splat.renderer.bin_tiles", 3, error)
+    fail_at(monkeypatch, "warp_splat.raster.api.bin_tiles", 3, error)
     message = fails(capsys, "render", "-m", str(trained), *options)
     count = len(load_ply(ply_path(trained, 60)).means)
     assert all(word in message for word in (*words, f"Out of memory on cpu in stage 'bin', with {count} Gaussians"))
@@ -332,7 +334,7 @@ def test_memory_that_runs_out_while_rendering_is_explained(options, error, words
 
 def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkeypatch, capsys):
     """NaN from the loss in one pixel of one step: the run goes on and says so at its end."""
-    from warp_splat import trainer  # noqa: PLC0415
+    from warp_splat.training import trainer  # noqa: PLC0415
 
     loss, steps = trainer.image_loss, []
 

@@ -17,8 +17,8 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.viewer import server
+from warp_splat.viewer.command import make_draw, view
 from warp_splat.viewer.pace import MOST
-from warp_splat.viewer.run import make_draw, view
 
 
 @pytest.fixture
@@ -175,8 +175,8 @@ def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, so
         draws.append(draw)
         yield SimpleNamespace(announcement="")
 
-    monkeypatch.setattr("warp_splat.viewer.run.Viewer", served)
-    monkeypatch.setattr("warp_splat.viewer.run.interruptible", lambda: nullcontext([2]))
+    monkeypatch.setattr("warp_splat.viewer.command.Viewer", served)
+    monkeypatch.setattr("warp_splat.viewer.command.interruptible", lambda: nullcontext([2]))
     assert view(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
     draws.append(make_draw(GaussianModel.from_splats(some_gaussians(50)), {}))
     drawn, plain = (draw(PHOTO, False).image for draw in draws)

@@ -14,13 +14,13 @@ from torch.nn import functional
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
+from warp_splat.color import to_bytes
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.scene import load_scene
-from warp_splat.trainer import to_bytes
-from warp_splat.viewer.camera import framed
-from warp_splat.viewer.run import make_draw
+from warp_splat.viewer.browser_camera import framed
+from warp_splat.viewer.command import make_draw
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 WIDTH, HEIGHT = 1000, 600

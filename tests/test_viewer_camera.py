@@ -13,7 +13,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import NEAR
 from warp_splat.errors import InputError
 from warp_splat.viewer import server
-from warp_splat.viewer.camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
+from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
 from warp_splat.viewer.pace import FEWEST, MOST, Pace
 from warp_splat.viewer.picture import depth_colors, depth_range, overlay
 

@@ -12,10 +12,10 @@ from scene_files import write_colmap
 
 from warp_splat.cli import main
 from warp_splat.config import TrainConfig
-from warp_splat.run import Run, finish
-from warp_splat.trainer import Trainer
+from warp_splat.training.live import TrainingViewer
+from warp_splat.training.record import Run, finish
+from warp_splat.training.trainer import Trainer
 from warp_splat.viewer import server
-from warp_splat.viewer.training import TrainingViewer
 
 
 def steps(watch, count=12):
@@ -42,8 +42,8 @@ def test_training_is_the_same_with_somebody_looking(fake_viser, monkeypatch):
 
     def watched(trainer, run):
         at_rest(monkeypatch)
-        monkeypatch.setattr("warp_splat.viewer.training.REFRESH", 0.0)
-        monkeypatch.setattr("warp_splat.viewer.training.SHARE", 1e9)
+        monkeypatch.setattr("warp_splat.training.live.REFRESH", 0.0)
+        monkeypatch.setattr("warp_splat.training.live.SHARE", 1e9)
         viewer, training = watch_training(trainer, run)
         for number, kind in enumerate(("image", "depth", "alpha")):
             clients.append(FakeClient(number, trainer.scene.train[0].camera))
@@ -158,8 +158,8 @@ def visited(monkeypatch, folder):
     (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
     monkeypatch.setattr(sys.modules["viser"], "ViserServer", Visited)
     monkeypatch.setattr(server, "DESERTED", 0.0)
-    monkeypatch.setattr("warp_splat.viewer.training.REFRESH", 0.0)
-    monkeypatch.setattr("warp_splat.viewer.training.SHARE", 1e9)
+    monkeypatch.setattr("warp_splat.training.live.REFRESH", 0.0)
+    monkeypatch.setattr("warp_splat.training.live.SHARE", 1e9)
     monkeypatch.setattr(server.Viewer, "wait", lambda viewer, seconds: viewer.server.wait())
     at_rest(monkeypatch)
     return ["train", "-s", str(root), "-m", str(folder / "model"), "--viewer", "--iterations", "3"]
@@ -174,7 +174,7 @@ def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, cap
         seen.seen = [len(seen.client.frames), seen.gui.add_button().disabled]
         return finish(*_)
 
-    monkeypatch.setattr("warp_splat.train.finish", evaluated)
+    monkeypatch.setattr("warp_splat.training.command.finish", evaluated)
     assert main(command) == 0
     seen, said = Visited.last, capsys.readouterr()
     assert seen.seen == [3, True] and seen.waits == 2 and seen.stopped  # after two steps and at the end

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from warp_splat import ways
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
+from warp_splat.rendering import camera_paths
 from warp_splat.scene.types import Scene, View
 
 LENS = Camera(80, 60, 70.0, 71.0, 41.0, 29.0, np.eye(3), np.zeros(3))
@@ -27,7 +27,7 @@ def circle(count, radius=3.0, turn=1.5 * np.pi):
     """Cameras on a part of a circle around the origin, looking at it from above."""
     angles = np.linspace(0, turn, count)
     places = [np.array([radius * np.cos(a), radius * np.sin(a), 1.0]) for a in angles]
-    return [ways.look_at(LENS, place, np.zeros(3), UP) for place in places]
+    return [camera_paths.look_at(LENS, place, np.zeros(3), UP) for place in places]
 
 
 def centers(cameras):
@@ -35,14 +35,14 @@ def centers(cameras):
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
-    camera = ways.look_at(LENS, np.array([1.0, 2.0, 3.0]), np.array([-2.0, 0.5, 1.0]), UP)
+    camera = camera_paths.look_at(LENS, np.array([1.0, 2.0, 3.0]), np.array([-2.0, 0.5, 1.0]), UP)
     np.testing.assert_allclose(camera.center, [1, 2, 3], atol=1e-12)
     seen = camera.rotation @ np.array([-2.0, 0.5, 1.0]) + camera.translation
     np.testing.assert_allclose(seen[:2], 0, atol=1e-12)
     assert seen[2] > 0 and (camera.rotation @ UP)[1] < 0 and abs((camera.rotation @ UP)[0]) < 1e-12
 
 
-@pytest.mark.parametrize("make", [ways.focus_orbit, ways.spiral_cameras])
+@pytest.mark.parametrize("make", [camera_paths.focus_orbit, camera_paths.spiral_cameras])
 def test_closed_ways_are_even_and_look_at_the_thing(make):
     cameras = make(scene_of(circle(20)), 60, LENS)
     steps = np.linalg.norm(np.diff(centers([*cameras, cameras[0]]), axis=0), axis=1)
@@ -56,7 +56,7 @@ def test_closed_ways_are_even_and_look_at_the_thing(make):
 def test_path_passes_its_cameras_and_nothing_jumps():
     """Through every camera where there are few; between them it stays on the circle that they were taken from."""
     given = circle(12)
-    path = ways.path_cameras(scene_of(given), 221, LENS)
+    path = camera_paths.path_cameras(scene_of(given), 221, LENS)
     distances = np.linalg.norm(centers(path)[:, None] - centers(given), axis=2)
     np.testing.assert_allclose(path[0].center, given[0].center, atol=1e-9)
     np.testing.assert_allclose(path[0].rotation, given[0].rotation, atol=1e-9)
@@ -72,14 +72,14 @@ def test_path_follows_names_unless_they_are_in_no_order():
     given = circle(40)
     length = np.linalg.norm(np.diff(centers(given), axis=0), axis=1).sum()
     for order in (np.arange(40), np.random.default_rng(1).permutation(40)):
-        path = ways.path_cameras(scene_of([given[index] for index in order]), 400, LENS)
+        path = camera_paths.path_cameras(scene_of([given[index] for index in order]), 400, LENS)
         np.testing.assert_allclose(path[0].center, given[order[0]].center, atol=1e-9)
         assert np.linalg.norm(np.diff(centers(path), axis=0), axis=1).sum() < 1.6 * length
 
 
 def test_path_takes_cameras_at_one_place_and_refuses_a_single_one():
     turning = [replace(LENS, rotation=Rotation.from_rotvec([0, 0.1 * k, 0]).as_matrix()) for k in range(5)]
-    path = ways.path_cameras(scene_of([*turning, turning[-1]]), 30, LENS)
+    path = camera_paths.path_cameras(scene_of([*turning, turning[-1]]), 30, LENS)
     assert np.abs(centers(path)).max() < 1e-9 and len(path) == 30
     with pytest.raises(InputError, match="two places or more"):
-        ways.path_cameras(scene_of([LENS, LENS]), 30, LENS)
+        camera_paths.path_cameras(scene_of([LENS, LENS]), 30, LENS)

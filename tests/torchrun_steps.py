@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_splat import launch
 from warp_splat.config import TrainConfig
-from warp_splat.distributed import GroupError, join
+from warp_splat.runtime import launch
+from warp_splat.runtime.distributed import GroupError, join
 from warp_splat.scene import load_scene
-from warp_splat.trainer import Trainer
+from warp_splat.training.trainer import Trainer
 
 STEPS = 3
 #: Densifies after the third step, before which each process has seen other views.

@@ -12,13 +12,13 @@ _HOMES = {
     "Camera": "camera",
     "InputError": "errors",
     "RasterOptions": "config",
-    "RenderOutput": "renderer",
-    "check_gradients": "gradcheck",
-    "get_threads": "launch",
+    "RenderOutput": "raster.api",
+    "check_gradients": "raster.gradcheck",
+    "get_threads": "runtime.launch",
     "load_scene": "scene",
-    "rasterize": "renderer",
-    "rasterize_views": "renderer",
-    "set_threads": "launch",
+    "rasterize": "raster.api",
+    "rasterize_views": "raster.api",
+    "set_threads": "runtime.launch",
 }
 __all__ = [
     "Camera",
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from warp_splat.camera import Camera
     from warp_splat.config import RasterOptions
     from warp_splat.errors import InputError
-    from warp_splat.gradcheck import check_gradients
-    from warp_splat.launch import get_threads, set_threads
-    from warp_splat.renderer import RenderOutput, rasterize, rasterize_views
+    from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
+    from warp_splat.raster.gradcheck import check_gradients
+    from warp_splat.runtime.launch import get_threads, set_threads
     from warp_splat.scene import load_scene
 
 

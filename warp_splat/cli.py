@@ -24,8 +24,8 @@ from warp_splat.config import (
 )
 from warp_splat.errors import InputError
 from warp_splat.flags import FOREIGN_FLAGS
-from warp_splat.interrupts import leaving_at_once
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
+from warp_splat.runtime.interrupts import leaving_at_once
 
 Config = (
     SfmConfig
@@ -39,14 +39,26 @@ Config = (
 )
 #: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
 COMMANDS = {
-    "sfm": (SfmConfig, "sfm.run.sfm", "compute the cameras of photographs or of a video: a scene to train on"),
-    "inspect": (InspectConfig, "doctor.run.inspect", "examine a scene before training: verdicts, a page with pictures"),
-    "train": (TrainConfig, "train.train", "train Gaussians on a scene's photographs"),
-    "render": (RenderConfig, "render.render", "render the views of a trained model with their metrics, or a video"),
-    "view": (ViewConfig, "viewer.run.view", "look at a trained model in a browser"),
-    "convert": (ConvertConfig, "convert.convert", "convert Gaussians between .ply, .splat, .spz and glTF"),
-    "export-html": (ExportHtmlConfig, "page.export.export_html", "write a page that shows a model in any browser"),
-    "compare": (CompareConfig, "compare.run.compare", "compare adjoints, knobs and models: error against run time"),
+    "sfm": (SfmConfig, "sfm.command.sfm", "compute the cameras of photographs or of a video: a scene to train on"),
+    "inspect": (
+        InspectConfig,
+        "inspect.command.inspect",
+        "examine a scene before training: verdicts, a page with pictures",
+    ),
+    "train": (TrainConfig, "training.command.train", "train Gaussians on a scene's photographs"),
+    "render": (
+        RenderConfig,
+        "rendering.command.render",
+        "render the views of a trained model with their metrics, or a video",
+    ),
+    "view": (ViewConfig, "viewer.command.view", "look at a trained model in a browser"),
+    "convert": (ConvertConfig, "formats.convert.convert", "convert Gaussians between .ply, .splat, .spz and glTF"),
+    "export-html": (
+        ExportHtmlConfig,
+        "export_html.command.export_html",
+        "write a page that shows a model in any browser",
+    ),
+    "compare": (CompareConfig, "compare.command.compare", "compare adjoints, knobs and models: error against run time"),
 }
 
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+import torch
+
 TOE = 0.0031308  # below, sRGB is linear (IEC 61966-2-1)
 
 
@@ -16,3 +19,9 @@ def to_srgb(linear: Any, where: Callable) -> Any:
 def from_srgb(encoded: Any, where: Callable) -> Any:
     """The inverse of :func:`to_srgb`."""
     return where(encoded <= 12.92 * TOE, encoded / 12.92, ((encoded.clip(12.92 * TOE) + 0.055) / 1.055) ** 2.4)
+
+
+def to_bytes(image: torch.Tensor, linear: bool = False) -> np.ndarray:
+    """[H, W, 3] float image, clamped to 0..1, as uint8 for a screen; ``linear``: it is in linear light."""
+    image = image.detach().clamp(0.0, 1.0)
+    return ((to_srgb(image, torch.where) if linear else image) * 255.0).round().to(torch.uint8).cpu().numpy()

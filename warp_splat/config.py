@@ -30,7 +30,7 @@ PROJECTIONS = ("affine", "ellipsoid")  # see RasterOptions, as for all that foll
 EXTENTS = ("ellipse", "square")
 LOSS_SPACES = ("srgb", "log")
 EXP_DEGREES = (3, 4, 5, 6, None)
-VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.ways
+VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.rendering.camera_paths
 
 LPIPS_HELP = "also measure LPIPS: torchvision's weights of VGG16 or AlexNet, a .pth file; needs the package lpips"
 

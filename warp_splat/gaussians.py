@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.harmonics import C0
-from warp_splat.launch import in_slices, torch_slices
+from warp_splat.runtime.launch import in_slices, torch_slices
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points

@@ -1,9 +1,9 @@
 """Adjoint against adjoint: error, time and memory, by scene and parameter.
 
 All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
-instance (:mod:`warp_splat.adjoints` says where they differ). Beside the modes of ``rasterize`` stand ``generated``
-(``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong), the thesis's
-loop cap, and central differences.
+instance (:mod:`warp_splat.raster.adjoints` says where they differ). Beside the modes of ``rasterize`` stand
+``generated`` (``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong),
+the thesis's loop cap, and central differences.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat import launch
 from warp_splat.compare.source import derivative_lines
-from warp_splat.compare.training import CAPS
+from warp_splat.compare.trained import CAPS
 from warp_splat.compare.truth import Error, Truth, compute_truth, errors_of, gradients_of
 from warp_splat.compare.workloads import Workload
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.renderer import render
+from warp_splat.raster.api import render
+from warp_splat.runtime import launch
 
 ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
 REPEATS = 5

@@ -7,18 +7,18 @@ from pathlib import Path
 
 KERNELS = Path(__file__).parents[1] / "kernels"
 
-_CLAMP = ("blend.adj_alpha_of",)
+_CLAMP = ("splat.adj_alpha_of",)
 _EXP = ("step.adj_exp2_known", "step.adj_opaque", *_CLAMP)
 _ROOT = ("step.conic_from_root",)
-_READ = ("taped_lanes.adj_spread", "taped_lanes.adj_collect", "taped_lanes.adj_exp2_value", *_ROOT)
-_BEGIN = ("taped_lanes.replay_begin", "taped_lanes.adj_begin")
-_UNDO = ("taped_lanes.replay_front_of", "taped_lanes.adj_front_of", "blend.odds_of")
-_KEPT = ("taped_lanes.replay_front_of_kept", "taped_lanes.adj_front_of_kept")
+_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "cpu/taped.adj_exp2_value", *_ROOT)
+_BEGIN = ("cpu/taped.replay_begin", "cpu/taped.adj_begin")
+_UNDO = ("cpu/taped.replay_front_of", "cpu/taped.adj_front_of", "splat.odds_of")
+_KEPT = ("cpu/taped.replay_front_of_kept", "cpu/taped.adj_front_of_kept")
 
 #: Rules: functions that state a derivative or an inverse. Of overloads, one is counted.
 RULES = {
-    "manual": ("step.make_manual", "step.geometry_from_moments", "blend.adj_alpha_blend", "blend.odds_of", *_CLAMP),
-    "stepwise": ("blend.odds_of", *_EXP, *_ROOT),
+    "manual": ("step.make_manual", "step.geometry_from_moments", "splat.adj_alpha_blend", "splat.odds_of", *_CLAMP),
+    "stepwise": ("splat.odds_of", *_EXP, *_ROOT),
     "reversible": (*_BEGIN, *_UNDO, *_EXP, *_READ),
     "stored": (*_BEGIN, *_KEPT, *_EXP, *_READ),
     "generated": (*_BEGIN, *_UNDO, "lanes.adj_halved"),
@@ -26,14 +26,14 @@ RULES = {
 }
 #: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
 _KNOWN = ("step.exp2_known", "step.opaque")
-_LOOP = ("adjoint_lanes.adj_blend", "adjoint_lanes.folded")
-_WALK = ("taped_lanes.walk", "taped_lanes.spread", "taped_lanes.collect", "taped_lanes.exp2_value", *_KNOWN)
+_LOOP = ("cpu/adjoint.adj_blend", "cpu/adjoint.folded")
+_WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "cpu/taped.exp2_value", *_KNOWN)
 PLUMBING = {
-    "manual": (*_LOOP, "adjoint_lanes._make_manual_body"),
-    "stepwise": (*_LOOP, "adjoint_lanes._make_stepwise_body", "step.make_stepwise", *_KNOWN),
-    "reversible": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of"),
-    "stored": (*_WALK, "taped_lanes.begin", "taped_lanes.front_of_kept"),
-    "generated": ("taped_lanes.walk", "taped_lanes.begin", "taped_lanes.front_of"),
+    "manual": (*_LOOP, "cpu/adjoint._make_manual_body"),
+    "stepwise": (*_LOOP, "cpu/adjoint._make_stepwise_body", "step.make_stepwise", *_KNOWN),
+    "reversible": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of"),
+    "stored": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of_kept"),
+    "generated": ("cpu/taped.walk", "cpu/taped.begin", "cpu/taped.front_of"),
     "plain": _WALK,
 }
 

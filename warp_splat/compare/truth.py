@@ -9,7 +9,7 @@ import torch
 from warp_splat.compare import oracle
 from warp_splat.compare.workloads import Workload
 from warp_splat.config import RasterOptions
-from warp_splat.renderer import render
+from warp_splat.raster.api import render
 
 ZERO = 1e-12  # norm of a gradient that is rounding only, as that of the rotation of a ball
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "background", "means2d")

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.compare.training import SHORT
+from warp_splat.compare.trained import SHORT
 from warp_splat.config import RasterOptions, TrainConfig
 from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
-from warp_splat.train import embedded_scene
-from warp_splat.trainer import Trainer
+from warp_splat.training.trainer import Trainer
 
 CANDIDATES = (10, 100, 1000, 10_000)  # per pixel of the layered scenes
 LAYERED_SIZE = 96  # px
@@ -25,7 +25,7 @@ SAMPLES = 192  # pixels at which float64 is computed
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """Activated Gaussians, as :func:`warp_splat.renderer.render` takes them, a camera, and pixels to look at."""
+    """Activated Gaussians, as :func:`warp_splat.raster.api.render` takes them, a camera, and pixels to look at."""
 
     name: str
     gaussians: tuple[torch.Tensor, ...]  # means, quats, scales, opacities, sh_dc, sh_rest

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.build import IN_ORDER
+from warp_splat.kernels.compiler import IN_ORDER
 
 
 @functools.cache

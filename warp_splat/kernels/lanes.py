@@ -2,12 +2,12 @@
 
 Warp's CPU backend is scalar C++; LLVM turns a ``vec16`` into one AVX-512 register (two of AVX2, four of NEON) if
 the code has no branch per lane and no libm call. Each operation here has a scalar and a lane overload, so that the
-pieces of :mod:`warp_splat.kernels.blend`, generic in their argument types, compile to either.
+pieces of :mod:`warp_splat.kernels.splat`, generic in their argument types, compile to either.
 """
 
 import warp as wp
 
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY
 
 wp.set_module_options(FORWARD_ONLY)
 

@@ -27,9 +27,9 @@ import functools
 import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR, OUTLINE, OUTLINE_REACH
-from warp_splat.kernels.blend import reach_of
-from warp_splat.kernels.build import DIFFERENTIABLE_LANES, IN_ORDER
+from warp_splat.kernels.compiler import DIFFERENTIABLE_LANES, IN_ORDER
 from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
+from warp_splat.kernels.splat import reach_of
 
 wp.set_module_options(IN_ORDER)
 

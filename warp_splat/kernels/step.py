@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.blend import (
+from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.lanes import fill, inner, times, vec16, where_less
+from warp_splat.kernels.splat import (
     LN_2,
     LOG2_E,
     adj_alpha_blend,
@@ -21,8 +23,6 @@ from warp_splat.kernels.blend import (
     make_exp,
     odds_of,
 )
-from warp_splat.kernels.build import FORWARD_ONLY
-from warp_splat.kernels.lanes import fill, inner, times, vec16, where_less
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -91,7 +91,7 @@ def geometry_from_moments(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.
 
 @functools.cache
 def make_manual(exp_degree: int | None, number: type) -> wp.Function:
-    """The adjoint of a step by hand (top of :mod:`warp_splat.kernels.blend`)."""
+    """The adjoint of a step by hand (top of :mod:`warp_splat.kernels.splat`)."""
     exp2_minus = make_exp(exp_degree)
 
     @wp.func

@@ -19,8 +19,8 @@ then to write them: it is the same machine code, and rounds alike.
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.blend import LOG2_E, Splat2D, reach_of
-from warp_splat.kernels.build import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.splat import LOG2_E, Splat2D, reach_of
 
 wp.set_module_options(FORWARD_ONLY)
 

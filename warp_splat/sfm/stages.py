@@ -19,7 +19,7 @@ import pycolmap
 from tqdm import tqdm
 
 from warp_splat.errors import InputError
-from warp_splat.interrupts import interruptible
+from warp_splat.runtime.interrupts import interruptible
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds

@@ -9,11 +9,10 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from warp_splat.color import to_srgb
+from warp_splat.color import to_bytes, to_srgb
 from warp_splat.config import NEAR
-from warp_splat.renderer import RenderOutput
-from warp_splat.trainer import to_bytes
-from warp_splat.viewer.camera import Box
+from warp_splat.raster.api import RenderOutput
+from warp_splat.viewer.browser_camera import Box
 
 KINDS = ("image", "depth", "alpha")
 DEPTH_SHARES = (0.02, 0.98)  # of the pixels; what is nearer or farther has the color of the ends

@@ -21,13 +21,13 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import TILE
 from warp_splat.errors import InputError
-from warp_splat.renderer import RenderOutput
+from warp_splat.raster.api import RenderOutput
+from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene.types import Scene, View
-from warp_splat.viewer.camera import look_at_all, look_from
+from warp_splat.viewer.browser_camera import look_at_all, look_from
 from warp_splat.viewer.pace import MOST
 from warp_splat.viewer.picture import KINDS, overlay, paint
 from warp_splat.viewer.watcher import Watcher
-from warp_splat.ways import focus_point
 
 if TYPE_CHECKING:
     import viser

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
 from warp_splat.scene.types import View
-from warp_splat.viewer.camera import Box, browser_camera, fitting_fov, framed, is_at, pivot, sized
+from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, pivot, sized
 from warp_splat.viewer.pace import Pace
 from warp_splat.viewer.picture import KINDS
 

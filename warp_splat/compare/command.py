@@ -1,0 +1,112 @@
+"""``warp-splat compare``: which comparison to run, and where its results go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from warp_splat.compare import adjoints, knobs, plots, trained
+from warp_splat.compare.stability import cases
+from warp_splat.compare.volume import measure
+from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
+from warp_splat.config import ADJOINTS, CompareConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluation.report import machine
+from warp_splat.formats.atomic import atomic_write, write_csv, write_json
+from warp_splat.raster.gradcheck import check_gradients
+from warp_splat.raster.selftest import settle_device
+from warp_splat.runtime import launch
+from warp_splat.scene.types import Scene
+
+DIRECTIONS = 4  # per parameter
+
+
+def compare(config: CompareConfig) -> int:
+    """Run the comparison that ``config`` asks for; returns the process's exit code (1 if a stability verdict failed).
+
+    Raises:
+        InputError: for an unknown mode, an unusable scene or output folder.
+    """
+    unknown = [mode for mode in config.modes if mode not in ADJOINTS]
+    if unknown or not config.modes:
+        raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
+    if config.stability and config.volume:
+        raise InputError("--stability, --volume: expected one of them, got both; run the command twice.")
+    if (config.stability or config.volume) and (config.scene or config.full):
+        raise InputError("--scene, --full: these belong to the comparison without --stability and --volume.")
+    wanted = config.device
+    if config.stability or config.volume:
+        if wanted == "cuda":
+            raise InputError("--device cuda: --stability and --volume compute on the CPU only; use --device cpu.")
+        wanted = "cpu"
+    device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
+    out, log = Path(config.out), []
+    with atomic_write(out / ".writable") as path:  # to fail before all measuring, not after
+        path.touch()
+    (out / ".writable").unlink()
+
+    def say(text: str = "") -> None:
+        print(text)
+        log.append(text)
+
+    if config.stability:
+        name, code = "stability", 1 if cases.run(out, config.modes, say) else 0
+    elif config.volume:
+        name, code = "volume", 0
+        measure.run(out, say)
+    else:
+        name, code = "compare", 0
+        scenes = named_scenes(config.scene, print)
+        _compare_pixel_loops(config, scenes, device, out, say)
+        trained.run(out, config.modes, scenes, config.full, say, device.type)
+    card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
+    say(f"\nMeasured on {card}{machine()}, {launch.get_threads()} threads.")
+    with atomic_write(out / f"{name}.txt") as path:
+        path.write_text("\n".join(log) + "\n", encoding="utf-8")
+    print(f"Tables and plots: {out}")
+    return code
+
+
+def _compare_pixel_loops(
+    config: CompareConfig, scenes: dict[str, Scene], device: torch.device, out: Path, say: Callable[[str], None]
+) -> None:
+    """Adjoints on every workload; knobs on the layered scene and those trained longest."""
+    print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
+    workloads = all_workloads(scenes, device, say)
+    measured = adjoints.measure(workloads, config.modes, say)
+    say(f"\n{plots.adjoint_table(measured)}\n")
+    _write(out, "adjoints", measured)
+    plots.plot_errors(out / "adjoints.png", measured)
+    plots.plot_memory(out / "memory.png", measured)
+    plots.plot_stages(out / "stages.png", measured, config.modes)
+    _check_directions(workloads, out, say)
+    turned = knobs.measure(_for_knobs(workloads), say)
+    say(f"\n{plots.knob_table(turned)}\n")
+    _write(out, "knobs", turned)
+    plots.plot_knobs(out / "knobs.png", turned)
+
+
+def _check_directions(workloads: list[Workload], out: Path, say: Callable[[str], None]) -> None:
+    """The gradients of the whole image against finite differences, for the scenes in training."""
+    found = {}
+    for workload in workloads:
+        if "," in workload.name:
+            *geometry, sh_dc, sh_rest = workload.gaussians
+            scene = (*geometry, (sh_dc, sh_rest), workload.camera, workload.background)
+            check = check_gradients(*scene, options=workload.options, directions=DIRECTIONS)
+            say(f"{workload.name}: along random directions, against finite differences\n\n{check}\n")
+            found[workload.name] = [asdict(row) for row in check.rows]
+    write_json(out / "directions.json", found)
+
+
+def _for_knobs(workloads: list[Workload]) -> list[Workload]:
+    last = {workload.name.split(",")[0]: workload for workload in workloads if "," in workload.name}
+    return [workload for workload in workloads if workload.name == "1000 layers"] + list(last.values())
+
+
+def _write(out: Path, name: str, measured: list[adjoints.Measurement]) -> None:
+    write_csv(out / f"{name}.csv", adjoints.records(measured))
+    write_json(out / f"{name}.json", [asdict(item) for item in measured])

@@ -1,0 +1,1 @@
+"""Stiff and extreme cases: what float64 says, and what every adjoint gives."""

@@ -1,0 +1,146 @@
+"""Stiff and extreme cases: what float64 says, what every adjoint gives, and whether that is what was stated.
+
+A catalogue of named inputs at the ends of what float32 holds. Each has a stated outcome: as in float64 within a limit,
+or left out and counted; never NaN or infinity where float64 is finite. ``warp-splat compare --stability`` writes the
+table, and the tests run the same catalogue. The bounds are those of Higham, Accuracy and Stability of Numerical
+Algorithms, 2002: n eps for a product of n rounded factors, and the condition of a problem where that is larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from warp_splat.compare.stability import arithmetic, pixel_loop, shapes
+from warp_splat.compare.stability.verdict import EPS, Case, Outcome
+from warp_splat.evaluation import report
+from warp_splat.formats.atomic import write_csv, write_json
+from warp_splat.text import format_table
+
+CASES = (*pixel_loop.CASES, *shapes.CASES, *arithmetic.CASES)
+MARKERS = ("o", "s", "^", "D")
+NO_MODE = ""  # of a case that involves no adjoint
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case and its outcome in every mode; in ``NO_MODE`` alone where none is involved."""
+
+    case: Case
+    outcomes: dict[str, Outcome]
+
+    @property
+    def verdict(self) -> str:
+        """Whether every statement held; if not in every mode, in which."""
+        failed = [mode for mode, outcome in self.outcomes.items() if outcome.failures]
+        if not failed:
+            return "pass"
+        return "FAIL" if len(failed) == len(self.outcomes) else f"FAIL {', '.join(failed)}"
+
+
+def run(out: Path, modes: Sequence[str], say: Callable[[str], None] = print) -> int:
+    """Measure every case in every mode; print the table, write it and the plot.
+
+    Args:
+        out: folder for ``stability.json``, ``stability.csv`` and ``stability.png``.
+        modes: of the adjoint, some of ``warp_splat.config.ADJOINTS``.
+        say: prints a line.
+
+    Returns:
+        The number of verdicts (case by mode) that failed.
+    """
+    rows = [Row(case, {mode: case.run(mode) for mode in modes_of(case, modes)}) for case in CASES]
+    say(format_table(["case", "float64 says", "value", *modes, "limit", "counted", "verdict"], table(rows, modes)))
+    for row in rows:
+        for mode, outcome in row.outcomes.items():
+            if outcome.failures:
+                say(f"{row.case.name} {mode}: {'; '.join(outcome.failures)}")
+    out.mkdir(parents=True, exist_ok=True)
+    _write(out, rows)
+    plot(out / "stability.png", rows)
+    failed = sum(bool(outcome.failures) for row in rows for outcome in row.outcomes.values())
+    say(f"{failed} of {sum(len(row.outcomes) for row in rows)} verdicts failed.")
+    return failed
+
+
+def modes_of(case: Case, modes: Sequence[str]) -> Sequence[str]:
+    """The modes in which a case is run."""
+    return modes if case.modal else (NO_MODE,)
+
+
+def table(rows: Sequence[Row], modes: Sequence[str]) -> list[list[str]]:
+    """Cells: error of the value, of the gradients in each mode and their limit, what was counted, the verdict."""
+    cells = []
+    for row in rows:
+        first = next(iter(row.outcomes.values()))
+        errors = [_error(row.outcomes.get(mode, first).gradient_error) for mode in modes]
+        value = max(outcome.value_error for outcome in row.outcomes.values())
+        limit = "-" if first.gradient_error is None else _error(first.gradient_limit)
+        cells.append([row.case.name, first.says, _error(value), *errors, limit, first.counted, row.verdict])
+    return cells
+
+
+def _error(value: float | None) -> str:
+    return "-" if value is None else "0" if value == 0 else f"{value:.0e}"
+
+
+def _write(out: Path, rows: Sequence[Row]) -> None:
+    """Everything that was measured: nested as JSON, a line for each case and mode as CSV."""
+    flat = [
+        {"case": row.case.name, "group": row.case.group, "claim": row.case.claim, "mode": mode, **asdict(outcome)}
+        for row in rows
+        for mode, outcome in row.outcomes.items()
+    ]
+    measured = {
+        "verdicts": flat,
+        "determinant": {"ratios": arithmetic.RATIOS, **arithmetic.determinant_errors()},
+        "eps": EPS,
+    }
+    write_json(out / "stability.json", measured)
+    write_csv(out / "stability.csv", [{**line, "failures": "; ".join(line["failures"])} for line in flat])
+
+
+def plot(path: Path, rows: Sequence[Row]) -> None:
+    """Draw the growth of rounding along a chain against its bound, and the error of two formulas for a determinant."""
+    figure = report.new_figure(report.WIDTH, 3.2, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _plot_chains(left, {row.case.name: row for row in rows})
+    _plot_determinant(right)
+    for axes in (left, right):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.minorticks_off()
+    report.save_figure(figure, path)
+
+
+def _plot_chains(axes, rows: dict[str, Row]) -> None:
+    report.plain_axes(axes, "error of gradients and of T, n layers")
+    chains = {layers: rows[f"chain_{layers}"].outcomes for layers in pixel_loop.CHAINS}
+    lengths = list(chains)
+    axes.plot(lengths, [layers * EPS for layers in lengths], color=report.INK, linewidth=1.0, linestyle="--")
+    report.label_point(axes, (lengths[-1], lengths[-1] * EPS), "n eps", (0, 5), "right")
+    modes = list(chains[lengths[0]])
+    colors = (report.BLUE, report.ORANGE, report.GREEN, report.INK)
+    for place, (mode, color, marker) in enumerate(zip(modes, colors, MARKERS, strict=False)):
+        # side by side, or equal errors would hide each other
+        shifted = [layers * 1.25 ** (place - 0.5 * (len(modes) - 1)) for layers in lengths]
+        errors = [chains[layers][mode].gradient_error for layers in lengths]
+        axes.plot(shifted, errors, color=color, marker=marker, markersize=5, linestyle="", label=mode)
+    recovered = [arithmetic.recovery_error(layers) for layers in lengths]
+    axes.plot(lengths, recovered, color="#999999", linewidth=1.2, label="T recovered")
+    axes.legend(frameon=False, fontsize=9, labelcolor=report.INK, loc="upper left")
+    axes.set_xlabel("n", fontsize=9, color=report.INK)
+
+
+def _plot_determinant(axes) -> None:
+    report.plain_axes(axes, "error of det, worst of all angles")
+    errors = arithmetic.determinant_errors()
+    ratios = arithmetic.RATIOS
+    axes.plot(ratios, errors["usual"], color=report.ORANGE, marker="s", markersize=4)
+    axes.plot(ratios, errors["ours"], color=report.BLUE, marker="o", markersize=4)
+    report.label_point(axes, (ratios[-5], errors["usual"][-5]), "a c - b²", (-8, 6), "right")
+    report.label_point(axes, (ratios[-1], errors["ours"][-1]), "sum of squares", (0, 7), "right")
+    axes.axhline(1.0, color=report.INK, linewidth=1.0, linestyle="--")
+    report.label_point(axes, (ratios[0], 1.0), "no digit right", (0, 4), "left")
+    axes.set_xlabel("scale ratio of the needle", fontsize=9, color=report.INK)

@@ -1,0 +1,233 @@
+"""Extremes of geometry: needles, pancakes, scales and quaternions at the ends of float32, odd depths and cameras."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import numpy as np
+
+from warp_splat.compare.stability.inputs import cloud, facing, look, tensors, to_world
+from warp_splat.compare.stability.verdict import Problem, rendered
+from warp_splat.config import NEAR, RasterOptions
+
+RATIOS = (2, 4, 6, 8)  # powers of ten
+COUNT = 48
+QUAT_NORMS = (1e-42, 1e-30, 1e-20, 1e18)
+
+
+def stretched(power: int, flat: bool, longest: float = 60.0, options: RasterOptions | None = None) -> Problem:
+    """Needles (or, if ``flat``, pancakes) at every angle in the image and to it.
+
+    Args:
+        power: of ten, the ratio of the long scale to the short one.
+        flat: two long axes instead of one.
+        longest: standard deviation along the long axis [px].
+        options: of the renderer.
+    """
+    camera = look()
+    arrays = cloud(20 + power, COUNT, camera, opacity=(0.2, 0.7))
+    depth = (arrays["means"] - camera.center) @ camera.forward
+    long = longest * depth / camera.fx
+    short = long * 10.0**-power
+    arrays["scales"] = np.stack([short, long, long] if flat else [long, short, short], 1)
+    tilts = np.where(np.arange(COUNT) % 2, np.linspace(0, 0.5 * np.pi, COUNT), 0.0)
+    arrays["quats"] = facing(camera, np.linspace(0, np.pi, COUNT, endpoint=False), tilts)
+    return Problem(tensors(arrays), camera, options or RasterOptions())
+
+
+def log_scales() -> Problem:
+    """Logarithms of scales of +100 (exp overflows) and -100 (a point) among ordinary ones."""
+    camera = look()
+    arrays = cloud(30, 40, camera)
+    logs = np.log(arrays["scales"])
+    logs[:4] = 100.0
+    logs[4, 1] = 100.0
+    logs[5:10] = -100.0
+    logs[10, 0] = -100.0
+    values = arrays | {"scales": logs, "opacities": np.log(arrays["opacities"] / (1 - arrays["opacities"]))}
+    return Problem(tensors(values), camera, raw=True, left_out=(0, 1, 2, 3, 4), invalid=5)
+
+
+def too_large() -> Problem:
+    """Scales that float32 holds but whose square it does not."""
+    camera = look()
+    arrays = cloud(31, 40, camera)
+    arrays["scales"][:3] = np.array([1e12, 1e20, 1e38])[:, None]
+    return Problem(tensors(arrays), camera, left_out=(0, 1, 2), invalid=3)
+
+
+def zero_quats() -> Problem:
+    """Quaternions without a direction."""
+    camera = look()
+    arrays = cloud(32, 40, camera)
+    arrays["quats"][[3, 17]] = 0.0
+    return Problem(tensors(arrays), camera, left_out=(3, 17), invalid=2)
+
+
+def quat_norms(norm: float) -> Problem:
+    """Every quaternion of that norm, down to denormal ones."""
+    camera = look()
+    arrays = cloud(33, 40, camera)
+    arrays["quats"] *= norm / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    return Problem(tensors(arrays), camera)
+
+
+def far_world() -> Problem:
+    """Means and camera a million units from the origin, where float32 steps by 1/16."""
+    camera = look(center=(1e6, -1e6, 1e6))
+    return Problem(tensors(cloud(34, 60, camera, depth=(50.0, 400.0))), camera)
+
+
+def at_depths(depth: np.ndarray, opacity: tuple[float, float] = (0.05, 0.5)) -> Problem:
+    """Gaussians at these depths, along the world's axes so that depths are exact; those up to ``NEAR`` are left out."""
+    camera = look(seed=None, center=(0, 0, 0))
+    gaussians = tensors(cloud(35, len(depth), camera, depth=depth, opacity=opacity))
+    near = gaussians["means"][:, 2].numpy() <= np.float32(NEAR)
+    return Problem(gaussians, camera, left_out=tuple(np.flatnonzero(near).tolist()))
+
+
+def all_depths() -> Problem:
+    """From 1e-6 to 1e6."""
+    return at_depths(np.random.default_rng(0).permutation(np.logspace(-6, 6, 60)))
+
+
+def near_plane() -> Problem:
+    """On the near plane, and float32's next numbers on either side of it."""
+    plane = np.float32(NEAR)
+    sides = [np.nextafter(plane, np.float32(side)) for side in (0, 1)]
+    return at_depths(np.tile([plane, *sides], 10).astype(np.float64), opacity=(0.01, 0.1))
+
+
+def behind() -> Problem:
+    """On both sides of the camera."""
+    return at_depths(np.random.default_rng(1).permutation(np.linspace(-30, 30, 60)))
+
+
+def equal_depths() -> Problem:
+    """One depth for all."""
+    return at_depths(np.full(60, 4.0))
+
+
+def not_finite() -> Problem:
+    """NaN and infinity in every parameter."""
+    camera = look()
+    arrays = cloud(41, 40, camera)
+    for row, (name, value) in enumerate(itertools.product(arrays, (np.nan, np.inf))):
+        arrays[name][row] = value
+    return Problem(tensors(arrays), camera, left_out=tuple(range(12)), invalid=12)
+
+
+def inside(options: RasterOptions) -> Problem:
+    """The camera within Gaussians of 0.3 to 5 units whose centers are nearer, farther and behind."""
+    camera = look(seed=None, center=(0, 0, 0))
+    rng = np.random.default_rng(36)
+    arrays = cloud(36, 24, camera, opacity=(0.1, 0.5))
+    depth = np.concatenate([np.linspace(-2, 0.19, 8), np.linspace(0.25, 3, 16)])
+    arrays["means"] = np.concatenate([rng.uniform(-0.1, 0.1, (24, 2)), depth[:, None]], 1)
+    arrays["scales"] = np.exp(rng.uniform(np.log(0.3), np.log(5), (24, 3)))
+    return Problem(tensors(arrays), camera, options, left_out=tuple(range(8)))
+
+
+def field_of_view(degrees: float, options: RasterOptions) -> Problem:
+    """A camera that sees this wide."""
+    camera = look(fov=degrees)
+    return Problem(tensors(cloud(37, 60, camera)), camera, options)
+
+
+def outside_principal() -> Problem:
+    """A principal point three image widths off the image."""
+    camera = look(cx=-70.0, cy=65.0)
+    return Problem(tensors(cloud(38, 60, camera)), camera)
+
+
+def size(width: int, height: int) -> Problem:
+    """An image of this size, seen at 50 degrees along its longer side."""
+    longest = max(width, height)
+    fov = 2 * np.degrees(np.arctan(width / longest * np.tan(np.radians(25))))
+    camera = look(width, height, fov)
+    opacity = (0.05, 0.5)
+    return Problem(
+        tensors(cloud(39, 20, camera, sigma=(1, 1 + longest / 20), opacity=opacity)), camera, conditioned=True
+    )
+
+
+def beside() -> Problem:
+    """Means far beside the image, where the Jacobian's slope is clamped, large enough to reach in."""
+    camera = look(fov=90)
+    arrays = cloud(40, 40, camera)
+    rng = np.random.default_rng(40)
+    z = rng.uniform(1, 4, 40)
+    slopes = rng.uniform(1.5, 6, (40, 2)) * rng.choice([-1, 1], (40, 2))
+    arrays["means"] = to_world(np.concatenate([slopes * z[:, None], z[:, None]], 1), camera)
+    arrays["scales"] = rng.uniform(1, 6, (40, 3)) * z[:, None]
+    return Problem(tensors(arrays), camera)
+
+
+AFFINE, ELLIPSOID, ANTIALIASED = (
+    RasterOptions(),
+    RasterOptions(projection="ellipsoid"),
+    RasterOptions(antialiasing=True),
+)
+CASES = (
+    *(
+        rendered(
+            f"{kind}_1e{power}",
+            "shape",
+            "scale ratio at every angle: as in float64",
+            functools.partial(stretched, power, kind == "pancake"),
+        )
+        for kind in ("needle", "pancake")
+        for power in RATIOS
+    ),
+    rendered(
+        "needle_10000px", "shape", "ratio 1e8, 10,000 px long", functools.partial(stretched, 8, False, longest=1e4)
+    ),
+    rendered(
+        "needle_antialiased",
+        "shape",
+        "ratio 1e4, 300 px long, antialiased: the ratio of determinants has no cancellation",
+        functools.partial(stretched, 4, False, 300.0, ANTIALIASED),
+    ),
+    rendered("log_scales_100", "shape", "+100: left out and counted; -100: a point, as in float64", log_scales),
+    rendered("scales_1e38", "shape", "too large to square: left out and counted", too_large),
+    rendered("quats_0", "shape", "no direction: left out and counted", zero_quats),
+    *(
+        rendered(
+            f"quats_{norm:g}",
+            "shape",
+            "normalized; gradients beyond 3.4e38 dropped and counted",
+            functools.partial(quat_norms, norm),
+        )
+        for norm in QUAT_NORMS
+    ),
+    rendered("not_finite", "shape", "NaN and infinity in any parameter: left out and counted", not_finite),
+    rendered("far_1e6", "camera", "means and camera 1e6 from the origin: as in float64", far_world),
+    rendered("depth_1e-6_1e6", "camera", "up to 0.2 left out, the rest as in float64", all_depths),
+    rendered("near_plane", "camera", "at 0.2 and before left out, after drawn", near_plane),
+    rendered("behind", "camera", "left out", behind),
+    rendered("equal_depths", "camera", "ordered by index", equal_depths),
+    rendered("inside", "camera", "drawn or left out by the center's depth alone", functools.partial(inside, AFFINE)),
+    rendered(
+        "inside_ellipsoid",
+        "camera",
+        "left out too where the ellipsoid of three sigma reaches the camera's plane: no outline",
+        functools.partial(inside, ELLIPSOID),
+    ),
+    *(
+        rendered(f"fov_{degrees}{kind}", "camera", "as in float64", functools.partial(field_of_view, degrees, options))
+        for kind, options, angles in (("", AFFINE, (1, 90, 150, 170)), ("_ellipsoid", ELLIPSOID, (1, 90, 150)))
+        for degrees in angles
+    ),
+    rendered("principal_outside", "camera", "as in float64", outside_principal),
+    rendered("beside", "camera", "the Jacobian's slope is clamped: as in float64", beside),
+    *(
+        rendered(
+            f"size_{width}x{height}",
+            "camera",
+            "as in float64, within the problem's condition",
+            functools.partial(size, width, height),
+        )
+        for width, height in ((1, 1), (1, 20_000), (20_000, 1))
+    ),
+)

@@ -1,0 +1,295 @@
+"""One extreme input, rendered and differentiated in float32 by the package and in float64 by the oracle, and compared.
+
+A verdict asks for: nothing but finite numbers where float64 has them; image and alpha within a limit; every gradient
+within a limit in relative L2; what is left out counted as stated. Pixels that hang on rounding
+(:attr:`warp_splat.compare.oracle.Render.fragile`) get no upstream gradient, and there an image may be off by what one
+Gaussian adds.
+
+A limit above the usual one is never chosen but measured, as the condition of the problem: how far the float64 truth
+itself moves when its inputs move by half a unit in the last place of float32 (Higham 2002, 1.6).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.compare import oracle
+from warp_splat.config import RasterOptions
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster import api
+
+EPS = 2.0**-24  # float32, half a unit in the last place of 1
+FLOAT_MAX = torch.finfo(torch.float32).max
+IMAGE_LIMIT = 1e-4  # largest error of image and alpha
+GRADIENT_LIMIT = 2e-4  # relative L2 of each gradient
+SHARE = 0.02  # at a fragile pixel: one decision moves a weight of at most about 1e-2
+FRAGILE_LIMIT = 0.5  # share of the pixels; above, too little of the image would be compared
+TRIALS = 16  # random perturbations, of which the worst counts
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An extreme input and what is stated of it.
+
+    Args:
+        gaussians: float32 tensors by the names of :class:`warp_splat.gaussians.GaussianModel`, N rows.
+        camera: what looks at them.
+        options: as for :func:`warp_splat.rasterize`.
+        raw: scales are logarithms and opacities logits, as a trainer keeps them.
+        left_out: indices of Gaussians that are not drawn although float64 could.
+        invalid: how many of those are counted in ``RenderOutput.invalid``.
+        gain: factor of the upstream gradients.
+        conditioned: limits are no less than the condition of the problem.
+        continuous: no decision of this input makes a step in the image, so that fragile pixels are compared, too.
+        gradient_limit: relative L2.
+    """
+
+    gaussians: dict[str, torch.Tensor]
+    camera: Camera
+    options: RasterOptions = field(default_factory=RasterOptions)
+    raw: bool = False
+    left_out: tuple[int, ...] = ()
+    invalid: int = 0
+    gain: float = 1.0
+    conditioned: bool = False
+    continuous: bool = False
+    gradient_limit: float = GRADIENT_LIMIT
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was measured, and every statement that did not hold."""
+
+    says: str  # float64
+    value_error: float
+    value_limit: float
+    gradient_error: float | None  # None where there is no gradient
+    gradient_limit: float
+    counted: str
+    failures: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A named extreme: ``run`` takes the adjoint mode, or "" where none is involved (not ``modal``)."""
+
+    name: str
+    group: str
+    claim: str  # the stated outcome
+    run: Callable[[str], Outcome]
+    modal: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Float64's answer, on all N rows: zero gradients for what is left out or overflows."""
+
+    problem: Problem
+    says: str
+    out: oracle.Render
+    upstream: tuple[torch.Tensor, torch.Tensor]  # of image and alpha
+    gradients: dict[str, torch.Tensor]
+    overflows: torch.Tensor  # [N] bool, a gradient leaves float32's range: all of that Gaussian's are dropped, counted
+    image_limit: float
+    gradient_limits: dict[str, float]
+
+
+def leaves_of(problem: Problem, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    """Leaves by name: the parameters and the background, which is light blue."""
+    leaves = {name: tensor.to(dtype, copy=True) for name, tensor in problem.gaussians.items()}
+    leaves["background"] = torch.tensor([0.25, 0.5, 0.75], dtype=dtype)
+    return {name: tensor.requires_grad_() for name, tensor in leaves.items()}
+
+
+def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+    """(means, quats, scales, opacities, sh_dc, sh_rest), through the trainer's activations if ``raw``."""
+    if not problem.raw:
+        return tuple(leaves[name] for name in ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest"))
+    model = GaussianModel({name: leaves[name] for name in GaussianModel.NAMES})
+    model.parameters = leaves
+    return model.activated()
+
+
+def draw(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> api.RenderOutput:
+    """The package's render; without the checks of arguments, as in training, where something is left out."""
+    gaussians = activated(problem, leaves)
+    if problem.invalid:
+        return api.render(gaussians, problem.camera, leaves["background"], problem.options, mode)
+    means, quats, scales, opacities, sh_dc, sh_rest = gaussians
+    return api.rasterize(
+        means, quats, scales, opacities, (sh_dc, sh_rest), problem.camera, leaves["background"], mode, problem.options
+    )
+
+
+def draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Render:
+    """The oracle's render of all rows given."""
+    *geometry, sh_dc, sh_rest = activated(problem, leaves)
+    options = problem.options
+    return oracle.render(
+        *geometry,
+        torch.cat([sh_dc, sh_rest], 1),
+        problem.camera,
+        leaves["background"],
+        sh_degree=options.sh_degree,
+        antialiasing=options.antialiasing,
+        projection=options.projection,
+        alpha_min=options.alpha_min,
+        t_min=options.t_min,
+    )
+
+
+def differentiate(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Gradients of all leaves and of means2d."""
+    wanted = leaves | {"means2d": out.means2d}
+    gradients = torch.autograd.grad([out.image, out.alpha], list(wanted.values()), list(upstream))
+    return dict(zip(wanted, gradients, strict=True))
+
+
+def upstream_of(problem: Problem, fragile: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random upstream gradients of image and alpha, float32, zero at fragile pixels."""
+    generator, shape = torch.Generator().manual_seed(1), fragile.shape
+    upstream = torch.randn(*shape, 3, generator=generator), torch.randn(*shape, generator=generator)
+    for weight in upstream:
+        weight.mul_(problem.gain)[fragile] = 0
+    return upstream
+
+
+@functools.cache
+def truth(build: Callable[[], Problem]) -> Truth:
+    """What float64 says of the input, and the limits; computed once per input."""
+    problem = build()
+    count = len(problem.gaussians["means"])
+    kept = torch.tensor(sorted(set(range(count)) - set(problem.left_out)), dtype=torch.int64)
+    drawn = replace(problem, gaussians={name: rows[kept] for name, rows in problem.gaussians.items()})
+    leaves = leaves_of(drawn, torch.float64)
+    out = draw_exactly(drawn, leaves)
+    upstream = upstream_of(problem, out.fragile)
+    gradients = differentiate(out, tuple(weight.double() for weight in upstream), leaves)
+    moved_image, moved = _condition(drawn, out, upstream, gradients) if problem.conditioned else (0.0, {})
+
+    overflows = torch.zeros(count, dtype=torch.bool)
+    for name, rows in gradients.items():
+        if name != "background":
+            gradients[name] = rows.new_zeros(count, *rows.shape[1:])
+            gradients[name][kept] = rows
+        if name in problem.gaussians:
+            overflows |= (gradients[name].abs() > FLOAT_MAX).view(count, -1).any(1)
+    says = _summary(out.image.detach(), gradients)
+    for name in problem.gaussians:
+        gradients[name][overflows] = 0
+    return Truth(
+        problem,
+        says,
+        replace(out, image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach()),
+        upstream,
+        gradients,
+        overflows,
+        max(IMAGE_LIMIT, moved_image),
+        {name: max(problem.gradient_limit, moved.get(name, 0.0)) for name in gradients},
+    )
+
+
+def _condition(problem: Problem, out, upstream, gradients) -> tuple[float, dict[str, float]]:
+    """How far image and gradients move in float64 when inputs, camera and 2D means move by half a unit of float32."""
+    camera = problem.camera
+    depth = (problem.gaussians["means"].double().numpy() - camera.center) @ camera.forward
+    means2d = out.means2d.detach().numpy()
+    image, moved = 0.0, dict.fromkeys(gradients, 0.0)
+    for trial in range(TRIALS):
+        rng = np.random.default_rng(trial)
+        leaves = leaves_of(problem, torch.float64)
+        with torch.no_grad():
+            for name in problem.gaussians:
+                leaves[name].copy_(torch.from_numpy(_nudge(leaves[name].numpy(), rng)))
+            pixels = (_nudge(means2d, rng) - means2d) / [camera.fx, camera.fy]
+            leaves["means"] += torch.from_numpy(depth[:, None] * pixels @ camera.rotation[:2])
+        lens = {key: float(_nudge(np.float64(getattr(camera, key)), rng)) for key in ("fx", "fy", "cx", "cy")}
+        rotation = _nudge(camera.rotation, rng)
+        nudged = replace(camera, rotation=rotation, translation=-rotation @ camera.center, **lens)
+        other = draw_exactly(replace(problem, camera=nudged), leaves)
+        image = max(image, _pixel_errors(other, out)[~out.fragile].max().item())
+        for name, value in differentiate(other, tuple(weight.double() for weight in upstream), leaves).items():
+            moved[name] = max(moved[name], relative_error(value, gradients[name], problem.gain))
+    return image, moved
+
+
+def _nudge(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Each value half a unit of its last place in float32 up or down."""
+    step = 0.5 * np.spacing(np.abs(values).astype(np.float32)).astype(np.float64)
+    return values + step * rng.choice([-1.0, 1.0], np.shape(values))
+
+
+def relative_error(value: torch.Tensor, exact: torch.Tensor, gain: float = 1.0) -> float:
+    """L2 of the difference over L2 of the truth (no less than 1e-6 of the upstream gradients' ``gain``); never NaN."""
+    error = ((value.double() - exact).norm() / exact.norm().clamp_min(1e-6 * gain)).item()
+    return error if error == error else float("inf")  # NaN would win no comparison
+
+
+def _pixel_errors(out, exact: oracle.Render) -> torch.Tensor:
+    """Largest error of color and alpha, [H, W]."""
+    return torch.maximum((out.image - exact.image).abs().amax(2), (out.alpha - exact.alpha).abs()).detach().double()
+
+
+def compare(expected: Truth, mode: str) -> Outcome:
+    """Render, differentiate and judge."""
+    problem, exact = expected.problem, expected.out
+    leaves = leaves_of(problem, torch.float32)
+    out = draw(problem, leaves, mode)
+    gradients = differentiate(out, expected.upstream, leaves)
+    failures = []
+
+    def demand(holds: bool, statement: str) -> None:
+        if not holds:
+            failures.append(statement)
+
+    demand(bool(out.image.isfinite().all() and out.alpha.isfinite().all()), "image not finite")
+    wrong = [name for name, value in gradients.items() if not value.isfinite().all()]
+    demand(not wrong, f"gradient not finite: {', '.join(wrong)}")
+    error = _pixel_errors(out, exact)
+    sure = torch.ones_like(exact.fragile) if problem.continuous else ~exact.fragile
+    demand(sure.double().mean().item() > 1 - FRAGILE_LIMIT, f"only {int(sure.sum())} pixels to compare")
+    value_error = error[sure].max().item() if sure.any() else 0.0
+    demand(value_error < expected.image_limit, f"image off by {value_error:.1e} > {expected.image_limit:.1e}")
+    share = SHARE * max(1.0, exact.image.max().item())
+    demand(not (error[~sure] > share).any(), "image off by more than one Gaussian at a fragile pixel")
+
+    errors = {name: relative_error(value, expected.gradients[name], problem.gain) for name, value in gradients.items()}
+    worst = max(errors, key=lambda name: errors[name] / expected.gradient_limits[name])
+    for name, limit in expected.gradient_limits.items():
+        demand(errors[name] < limit, f"gradient of {name} off by {errors[name]:.1e} > {limit:.1e}")
+    hidden = out.radii[list(problem.left_out)]
+    demand(not hidden.any(), "drawn although it should be left out")
+    demand(out.invalid == problem.invalid, f"counted {out.invalid} invalid, not {problem.invalid}")
+    dropped = int(expected.overflows.sum())
+    demand(out.dropped.gaussians == dropped, f"dropped gradients of {out.dropped.gaussians} Gaussians, not {dropped}")
+    demand(out.dropped.pixels == 0, f"dropped {out.dropped.pixels} pixels")
+    return Outcome(
+        expected.says,
+        value_error,
+        expected.image_limit,
+        errors[worst],
+        expected.gradient_limits[worst],
+        count_text(culled=int((out.radii == 0).sum()), invalid=out.invalid, dropped=out.dropped.gaussians),
+        tuple(failures),
+    )
+
+
+def count_text(**counts: int) -> str:
+    """What was counted, such as "culled 3, invalid 1"; "-" for nothing."""
+    return ", ".join(f"{name} {number}" for name, number in counts.items() if number) or "-"
+
+
+def _summary(image: torch.Tensor, gradients: dict[str, torch.Tensor]) -> str:
+    largest = max((value.abs().max().item() for value in gradients.values() if value.numel()), default=0.0)
+    return f"image {image.min().item():.2f}..{image.max().item():.2f}, gradient to {largest:.1e}"
+
+
+def rendered(name: str, group: str, claim: str, build: Callable[[], Problem]) -> Case:
+    """A case that compares a render and its gradients with the oracle's."""
+    return Case(name, group, claim, lambda mode: compare(truth(build), mode))

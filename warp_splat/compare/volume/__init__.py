@@ -1,0 +1,1 @@
+"""Splats against the emission-absorption equation, in float64."""

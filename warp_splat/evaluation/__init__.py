@@ -1,0 +1,1 @@
+"""How good a model is: metrics, pictures beside photographs, tables."""

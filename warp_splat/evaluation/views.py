@@ -1,0 +1,121 @@
+"""Renders beside photographs, in the reference's folders, and their metrics: as numbers, a table and a sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from warp_splat.camera import Camera
+from warp_splat.evaluation import report
+from warp_splat.evaluation.metrics import Metric, evaluate_folder, write_results
+from warp_splat.formats.atomic import write_text
+from warp_splat.formats.png import save_png
+from warp_splat.scene.types import View
+from warp_splat.text import format_table
+
+TOLD = 10  # views, at most, in the table that is printed
+
+
+def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
+    """Write ``renders/00000.png``, ``gt/00000.png`` and, of views with one, ``masks/00000.png`` ... in ``folder``.
+
+    Returns the renders. Surplus images of an earlier run are removed: metrics are taken over all that lie there.
+    """
+    renders = []
+    kept = set()
+    for index, view in enumerate(views):
+        renders.append(picture(view.camera))
+        pictures = {"renders": renders[-1], "gt": view.picture}
+        if view.mask is not None:
+            pictures["masks"] = np.repeat(255 * view.mask[..., None], 3, axis=2)
+        for name, pixels in pictures.items():
+            save_png(folder / name / f"{index:05d}.png", pixels)
+            kept.add(folder / name / f"{index:05d}.png")
+    for old in [path for name in ("renders", "gt", "masks") for path in folder.glob(f"{name}/*.png")]:
+        if old.stem.isdigit() and old not in kept:
+            old.unlink()
+    return renders
+
+
+class Comparison(NamedTuple):
+    """One view, seen and rendered."""
+
+    name: str
+    photo: np.ndarray  # [H, W, 3] uint8
+    render: np.ndarray  # of the same size
+    values: dict[str, float]  # of each metric
+
+
+def evaluate_views(
+    picture: Callable[[Camera], np.ndarray],
+    views: list[View],
+    model_folder: Path,
+    split: str,
+    iteration: int,
+    extra: dict,
+    metrics: Mapping[str, Metric],
+) -> tuple[dict[str, float], list[Comparison]]:
+    """Render ``views`` into ``<model>/<split>/ours_<iteration>``, then ``metrics`` of the saved 8-bit images.
+
+    Returns:
+        The mean of each metric, and each view with its values.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    folder = model_folder / split / f"ours_{iteration}"
+    renders = write_views(picture, views, folder)
+    means, per_view = evaluate_folder(folder, metrics)
+    write_results(model_folder, iteration, means, per_view, extra)
+    values = [
+        dict(zip(per_view, row, strict=True)) for row in zip(*(v.values() for v in per_view.values()), strict=True)
+    ]
+    return means, [Comparison(v.name, v.picture, r, row) for v, r, row in zip(views, renders, values, strict=True)]
+
+
+def show_views(
+    compared: list[Comparison], folder: Path, split: str, iteration: int, say: Callable[[str], None]
+) -> None:
+    """A sheet of the worst and the best views, and a table of all: ``contact_sheet.png``, ``per_view.md``.
+
+    ``say`` gets the table, or the worst of its lines where there are many.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    ranked = sorted(compared, key=lambda view: view.values["PSNR"])
+    portrait = compared[0].photo.shape[0] > compared[0].photo.shape[1]
+    columns, each = (2, 4) if portrait else (1, 3)  # whole lines
+    what = f"{len(compared)} {split} views after {iteration} iterations"
+    if len(ranked) <= 2 * each:
+        sections = {f"{what}, the worst first": ranked}
+    else:
+        sections = {f"the worst of {what}": ranked[:each], "the best": ranked[: -each - 1 : -1]}
+    rows = {
+        title: [(view.name, view.photo, view.render, describe(view.values)) for view in views]
+        for title, views in sections.items()
+    }
+    report.contact_sheet(folder / "contact_sheet.png", rows, columns)
+    write_text(folder / "per_view.md", f"{what}:\n\n{_table(compared)}\n")
+    if len(ranked) > TOLD:
+        say(f"The worst {TOLD} of {what} (all of them in {folder / 'per_view.md'}):")
+    say(_table(ranked[:TOLD]))
+
+
+def describe(values: Mapping[str, float]) -> str:
+    """PSNR 27.68 dB, SSIM 0.8514, ..."""
+    order = sorted(values, key=lambda name: name != "PSNR")
+    return ", ".join(f"{name} {_rounded(name, values[name])}{' dB' * (name == 'PSNR')}" for name in order)
+
+
+def _table(views: list[Comparison]) -> str:
+    names = list(views[0].values)
+    rows = [(view.name, *(_rounded(name, view.values[name]) for name in names)) for view in views]
+    return format_table(("view", *names), rows)
+
+
+def _rounded(metric: str, value: float) -> str:
+    return f"{value:.2f}" if metric == "PSNR" else f"{value:.4f}"

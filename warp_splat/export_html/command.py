@@ -1,0 +1,139 @@
+"""The command: one HTML file with the Gaussians, the cameras and the program that draws them; it needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+from warp_splat import config as constants
+from warp_splat.camera import Camera
+from warp_splat.color import TOE
+from warp_splat.config import ExportHtmlConfig
+from warp_splat.errors import InputError
+from warp_splat.export_html import pack
+from warp_splat.formats import model_folder
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.splats import SplatArrays
+from warp_splat.kernels import harmonics, splat
+
+SHADERS = ("screen.glsl", "project.glsl", "outline.glsl", "blend.glsl", "resolve.glsl")
+HARMONICS = ("C0", "C1", "C2A", "C2B", "C2C", "C3A", "C3B", "C3C", "C3D", "C3E")
+STEPS = ("LOG_STEPS", "ROTATION_STEPS", "COLOR_STEPS", "HARMONIC_STEPS")
+SCRIPTS = ("camera.js", "renderer.js", "viewer.js")
+LONGEST = 2**29 - 24  # characters in a browser's string (V8)
+LARGE = 100  # MB: a page above it is called large
+START_SIZE, START_FOV = (1200, 800), 0.9  # of the view of a file that comes without cameras: px, rad (vertical)
+
+
+def export_html(config: ExportHtmlConfig) -> int:
+    """Write the page as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the model cannot be read, is too large for browsers, or the page cannot be written.
+    """
+    path = Path(config.page)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
+    if config.max_gaussians < 0:
+        raise InputError(f"--max_gaussians: expected at least 0, got {config.max_gaussians}.")
+    _, (splats, _), trained = model_folder.open_model(config.model)
+    cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
+    kept = pack.shown(splats, config.max_gaussians)
+    options = {
+        "ANTIALIASED": bool(trained.get("antialiasing")),
+        "ELLIPSOID": trained.get("projection") == "ellipsoid",
+        "LINEAR": bool(trained.get("linear_light")),
+        "BACKGROUND": float(bool(trained.get("white_background"))),
+    }
+    page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
+    with atomic_write(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    size, total = len(page) / 1e6, len(splats.means)
+    print(
+        f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; open it in a browser"
+    )
+    if size > LARGE:
+        print(
+            "  This is a large page, for which phones lack the memory; --max_gaussians N keeps the N that matter most."
+        )
+    return 0
+
+
+def _start(splats: SplatArrays) -> Camera:
+    """A view of the middle of the Gaussians, along z with y down, from where most of them are in the image."""
+    means = splats.means.astype(np.float64) if len(splats.means) else np.zeros((1, 3))
+    middle = np.median(means, axis=0)
+    radius = np.percentile(np.linalg.norm(means - middle, axis=1), 80) or 1.0
+    width, height = START_SIZE
+    focal = 0.5 * height / np.tan(0.5 * START_FOV)
+    distance = radius / np.sin(0.5 * START_FOV)
+    return Camera(
+        width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(3), np.array([0, 0, distance]) - middle
+    )
+
+
+def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]], options: dict[str, object]) -> str:
+    """The page's text.
+
+    Args:
+        name: its title.
+        splats: finite Gaussians.
+        cameras: names and cameras, at least one; the first is where the page starts.
+        options: how to render: ANTIALIASED, ELLIPSOID, LINEAR (bool; the last: colors are in linear light), BACKGROUND
+            (float: 0.0 black, 1.0 white).
+
+    Raises:
+        InputError: if there are more Gaussians than browsers take.
+    """
+    origin = np.median(splats.means, axis=0).astype(np.float64) if len(splats.means) else np.zeros(3)
+    packed = base64.b64encode(pack.pack(splats, origin)).decode()
+    if len(packed) > LONGEST:
+        raise InputError(
+            f"{name}: {len(splats.means)} Gaussians make a page of {len(packed) / 1e6:.0f} MB, expected at most "
+            f"{LONGEST / 1e6:.0f} MB, which browsers can read; use --max_gaussians."
+        )
+    stride = pack.texels(splats.sh.shape[1])
+    up = -np.mean([camera.rotation[1] for _, camera in cameras], axis=0)
+    scene = {
+        "count": len(splats.means),
+        "stride": stride,
+        "near": constants.NEAR,
+        "origin": origin.tolist(),
+        "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
+        "cameras": [{"name": name, **model_folder.camera_entry(camera)} for name, camera in cameras],
+    }
+    blocks = {file: _source(file) for file in (*SHADERS, "sort.js")}
+    blocks["constants.glsl"] = _constants({"STRIDE": stride, **options})
+    blocks["scene"] = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
+    blocks["gaussians"] = packed
+    script = "\n".join(_source(file) for file in SCRIPTS)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return Template(_source("viewer.html")).substitute(
+        # whatever a name or a number of a stranger's file may hold: no other script runs, and nothing is fetched
+        policy=f"default-src 'none'; script-src 'sha256-{digest}'; worker-src blob:; style-src 'unsafe-inline'",
+        title=escape(name),
+        background="#fff" if options["BACKGROUND"] else "#000",
+        blocks="\n".join(f'<script type="text/plain" id="{id}">{text}</script>' for id, text in blocks.items()),
+        script=script,
+    )
+
+
+def _source(name: str) -> str:
+    return resources.files("warp_splat.export_html").joinpath(name).read_text(encoding="utf-8")
+
+
+def _constants(options: dict[str, object]) -> str:
+    """The renderer's constants and the options as declarations of GLSL."""
+    names = ("ALPHA_MIN", "ALPHA_MAX", "NEAR", "BLUR", "COMPENSATION_MIN", "FRUSTUM_MARGIN", "OUTLINE", "OUTLINE_REACH")
+    values = {name: getattr(constants, name) for name in names}
+    values |= {name: getattr(harmonics, name) for name in HARMONICS}
+    values |= {name: float(getattr(pack, name)) for name in STEPS}
+    values |= {"LOG2_E": float(splat.LOG2_E), "TOE": TOE, **options}
+    return "\n".join(f"const {type(value).__name__} {name} = {str(value).lower()};" for name, value in values.items())

@@ -1,0 +1,61 @@
+"""The command: all checks, a line for each finding, a page with pictures."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+from warp_splat.config import InspectConfig
+from warp_splat.errors import InputError
+from warp_splat.inspect import geometry, verdicts
+from warp_splat.inspect.html_page import write_page
+from warp_splat.inspect.pictures import draw
+from warp_splat.inspect.subject import Finding, read_subject
+from warp_splat.scene import has_cameras, read_photos
+
+LEVELS = ("error", "warning", "note", "ok")
+COLORS = {"error": 31, "warning": 33, "note": 34, "ok": 32}  # of a terminal
+
+
+def inspect(config: InspectConfig) -> int:
+    """Examine a scene as ``config`` says; returns the process's exit code: 1 if there is an error.
+
+    Raises:
+        InputError: if the folder is no scene at all, or the page cannot be written.
+    """
+    started = time.perf_counter()
+    source = Path(config.scene)
+    page = Path(config.out or Path("output") / "inspect" / f"{source.resolve().name}.html")
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"--out {page}: expected the name of a page, which ends in .html; found {page.suffix!r}.")
+    if not has_cameras(source):
+        read_photos(source, config.images, print)  # says what is missing
+    subject, findings = read_subject(source, config.images)
+    measured = geometry.Measured()
+    findings += verdicts.check_cameras(subject)
+    findings += geometry.check_reprojection(subject, measured)
+    findings += geometry.check_coverage(subject, measured)
+    findings += geometry.check_axes(subject)
+    findings += verdicts.check_names(subject) + verdicts.check_masks(subject)
+    findings += verdicts.check_loading(subject, config.images) + verdicts.check_cost(subject)
+    findings.sort(key=lambda finding: LEVELS.index(finding.level))
+    verdict = _verdict(findings)
+    write_page(page, f"Scene {source}", verdict, findings, draw(subject, measured))
+    for finding in findings:
+        print(f"{_colored(finding.level)}  {finding.check:13s} {finding.text}")
+    print(f"{source}: {verdict} ({time.perf_counter() - started:.1f} s)\n  page {page}")
+    return int(any(finding.level == "error" for finding in findings))
+
+
+def _verdict(findings: list[Finding]) -> str:
+    counts = Counter(finding.level for finding in findings)
+    parts = [f"{counts[level]} {level}{'s' * (counts[level] > 1)}" for level in ("error", "warning") if counts[level]]
+    if not parts:
+        return "nothing wrong was found."
+    return f"{' and '.join(parts)}; {'training would fail or be useless' if counts['error'] else 'training will work'}."
+
+
+def _colored(level: str) -> str:
+    return f"\033[{COLORS[level]}m{level:7s}\033[0m" if sys.stdout.isatty() else f"{level:7s}"

@@ -1,0 +1,175 @@
+"""Checks of cameras against points: reprojection, coverage, points that nobody sees, axes that are mixed up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from warp_splat.camera import Camera
+from warp_splat.inspect.subject import Finding, Subject, few
+from warp_splat.scene.images import Photo
+from warp_splat.scene.types import visible
+
+VIEWS = 60  # at most, in checks that take time for each
+POINTS = 20_000  # at most, likewise
+GOOD, BAD = 2e-3, 3e-2  # median reprojection error, as a share of the image's width: 2 and 30 px at 1000
+WORSE = 3.0  # times the median image's error is worth a warning
+FEW_POINTS = 50  # in an image
+UNSEEN = 0.05  # share of points outside all images that is worth a warning
+FAR = 1000.0  # times the median distance
+STILL = 1e-3  # spread of the cameras against their distance to the points: turning on the spot
+BETTER = 4.0  # times more points seen with other axes
+GAP = 120.0  # degrees
+
+
+@dataclass
+class Measured:
+    """Numbers for the pictures."""
+
+    errors: dict[str, np.ndarray] = field(default_factory=dict)  # px, of each observation of an image
+    pixels: dict[str, np.ndarray] = field(default_factory=dict)  # [n, 2] px in the model's image, of each observation
+    seen: dict[str, int] = field(default_factory=dict)  # points inside an image
+
+
+def sample(items: list, count: int) -> list:
+    """At most ``count`` of the items, evenly."""
+    return items[:: -(-len(items) // count)] if items else []
+
+
+def check_reprojection(subject: Subject, measured: Measured) -> list[Finding]:
+    """Points projected into images, against the keypoints from which they were triangulated."""
+    if subject.model is None:
+        return []
+    names = {photo.name for photo in subject.photos}
+    registered = [subject.model.image(i) for i in sorted(subject.model.reg_image_ids())]
+    chosen = sample([image for image in registered if image.name in names], VIEWS)
+    widths = {}
+    for image in chosen:
+        seen = [point for point in image.get_observation_points2D() if subject.model.exists_point3D(point.point3D_id)]
+        pairs = [(point.xy, subject.model.point3D(point.point3D_id).xyz) for point in seen]
+        if not pairs:
+            continue
+        keypoints, xyz = (np.array(column, np.float64) for column in zip(*pairs, strict=True))
+        pose = image.cam_from_world().matrix()
+        in_camera = xyz @ pose[:, :3].T + pose[:, 3]
+        front = in_camera[:, 2] > 0
+        errors = np.full(len(xyz), np.inf)  # a point behind the camera that observed it
+        errors[front] = np.linalg.norm(image.camera.img_from_cam(in_camera[front]) - keypoints[front], axis=1)
+        measured.errors[image.name], measured.pixels[image.name] = errors, keypoints
+        widths[image.name] = image.camera.width
+    if not measured.errors:
+        text = "the model keeps no observations to compare points with; look at the picture."
+        return [Finding("reprojection", "note", text)]
+    medians = {name: float(np.median(errors)) for name, errors in measured.errors.items()}
+    every = np.concatenate(list(measured.errors.values()))
+    typical, width = float(np.median(every)), float(np.median(list(widths.values())))
+    behind = np.count_nonzero(~np.isfinite(every))
+    text = f"median {typical:.2f} px over {len(every)} observations in {len(medians)} images of {width:.0f} px"
+    findings = []
+    if not typical <= BAD * width or behind > 0.2 * len(every):
+        text += f", {behind} of points behind their camera: poses and points do not belong together."
+        findings.append(Finding("reprojection", "error", text))
+    elif typical > max(GOOD * width, 1.0):
+        findings.append(Finding("reprojection", "warning", f"{text}: the cameras are imprecise and views will blur."))
+    else:
+        findings.append(Finding("reprojection", "ok", f"{text}."))
+    worst = [n for n in sorted(medians, key=lambda n: -medians[n]) if medians[n] > max(WORSE * typical, 1.0)]
+    if worst:
+        text = ", ".join(f"{name} ({medians[name]:.1f} px)" for name in worst[:3])
+        findings.append(
+            Finding("reprojection", "warning", f"{len(worst)} images are much worse than the others: {text}.")
+        )
+    return findings
+
+
+def check_coverage(subject: Subject, measured: Measured) -> list[Finding]:
+    """Points in each image, points in no image, cameras all at one place, sides that nobody photographed."""
+    if not subject.photos or not len(subject.points):
+        return []
+    points = np.array(sample(list(subject.points), POINTS))
+    counts = np.zeros(len(points), int)
+    scale = len(subject.points) / len(points)
+    for photo in subject.photos:
+        inside = visible(photo.camera, points)
+        counts += inside
+        measured.seen[photo.name] = round(scale * np.count_nonzero(inside))
+    findings = []
+    poor = [name for name, seen in measured.seen.items() if seen < FEW_POINTS]
+    text = f"{np.median(list(measured.seen.values())):.0f} points lie inside the median image"
+    if poor:
+        findings.append(Finding("coverage", "warning", f"{text}, but fewer than {FEW_POINTS} in {few(poor)}."))
+    else:
+        text += f", each point inside {np.median(counts):.0f} of {len(subject.photos)}"
+        findings.append(Finding("coverage", "ok", f"{text}."))
+    unseen = np.count_nonzero(counts == 0) / len(points)
+    level = "error" if unseen == 1 else "warning" if unseen > UNSEEN and not subject.random_points else "ok"
+    findings.append(Finding("unseen points", level, f"{100 * unseen:.1f} % of the points lie outside every image."))
+    return findings + _check_spread(subject, points)
+
+
+def _check_spread(subject: Subject, points: np.ndarray) -> list[Finding]:
+    centers = np.array([photo.camera.center for photo in subject.photos])
+    middle = np.median(points, axis=0)
+    distances = np.linalg.norm(points - middle, axis=1)
+    findings = []
+    if np.median(distances) > 0 and distances.max() > FAR * np.median(distances):
+        far = np.count_nonzero(distances > FAR * np.median(distances))
+        text = f"{far} of {len(points)} points are more than {FAR:.0f} times as far away as most."
+        findings.append(Finding("points", "warning", text))
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    reach = np.median(np.linalg.norm(points - centers.mean(axis=0), axis=1))
+    if len(centers) > 1 and spread < STILL * reach:
+        text = "all cameras stand at one place: depth cannot be seen, and new places cannot be shown."
+        findings.append(Finding("coverage", "warning", text))
+    elif len(centers) > 2:
+        _, _, axes = np.linalg.svd(centers - centers.mean(axis=0))
+        around = np.sort(np.arctan2(*(axes[:2] @ (centers - middle).T)))
+        gap = np.degrees(np.diff(np.append(around, around[0] + 2 * np.pi)).max())
+        if gap > GAP:
+            text = f"nobody photographed from {gap:.0f} of the 360 degrees around: views from there are guesses."
+            findings.append(Finding("coverage", "note", text))
+    return findings
+
+
+def check_axes(subject: Subject) -> list[Finding]:
+    """How many points the images would show if the poses were read in other conventions."""
+    if not subject.photos or not len(subject.points):
+        return []
+    points = np.array(sample(list(subject.points), 2000))
+    photos = sample(subject.photos, VIEWS)
+    seen = {
+        name: sum(np.count_nonzero(visible(turn(p.camera), points)) for p in photos) for name, turn in TURNS.items()
+    }
+    best = max(seen, key=lambda name: seen[name])
+    shares = ", ".join(f"{name} {100 * count / (len(points) * len(photos)):.0f} %" for name, count in seen.items())
+    if seen[best] > BETTER * seen["as stored"]:
+        text = (
+            f"with {best} the images would show more of the points ({shares}); the poses' axes are probably mixed up."
+        )
+        return [Finding("axes", "error", text)]
+    return [Finding("axes", "ok", f"the poses show as many points as in no other convention ({shares}).")]
+
+
+def _inverted(camera: Camera) -> Camera:
+    return replace(camera, rotation=camera.rotation.T, translation=camera.center)
+
+
+def _turned(camera: Camera) -> Camera:
+    flip = np.diag((1.0, -1.0, -1.0))
+    return replace(camera, rotation=flip @ camera.rotation, translation=flip @ camera.translation)
+
+
+TURNS = {
+    "as stored": lambda camera: camera,
+    "OpenGL axes": _turned,
+    "camera-to-world": _inverted,
+    "camera-to-world in OpenGL axes": lambda camera: _turned(_inverted(camera)),
+}
+
+
+def worst_and_best(measured: Measured, photos: list[Photo], count: int) -> list[Photo]:
+    """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
+    medians = {name: float(np.median(errors)) for name, errors in measured.errors.items()}
+    ranked = sorted(photos, key=lambda photo: -medians.get(photo.name, 0.0))
+    return ranked[: count // 2] + sample(ranked[count // 2 :], count - count // 2)

@@ -1,0 +1,138 @@
+"""Pictures of a scene for the page: thumbnails, points on photographs, a map of cameras and points."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, plain_axes
+from warp_splat.inspect.geometry import Measured, sample, worst_and_best
+from warp_splat.inspect.subject import THUMBNAIL, Subject
+from warp_splat.scene.types import visible
+
+SHEET, COLUMNS = 60, 10  # thumbnails, at most, and in a row
+ON_PHOTOS = 6
+DOTS = 1500  # points drawn on a photograph
+MOST = 3.0  # px; larger errors have the same colour
+MAPPED = 5000  # points drawn on the map
+PAGE_DPI = 110
+
+
+def draw(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:
+    """Captions and pictures, as addresses of data that a page holds itself."""
+    shown = [photo for photo in subject.photos if photo.name in subject.thumbnails]
+    if not shown:
+        return
+    yield "The photographs, evenly chosen", _encode(_sheet(subject, [photo.name for photo in sample(shown, SHEET)]))
+    if not len(subject.points):
+        return
+    if measured.errors:
+        caption = "Where points were seen, coloured by how far from there they project (the worst images first)"
+    else:
+        caption = "Points projected into photographs: they should lie on what is there"
+    yield caption, _encode(_on_photos(subject, measured))
+    yield "Cameras (with their viewing directions) and points, from two sides", _encode(_map(subject))
+    if measured.errors:
+        yield "Reprojection error and points of each image, by name", _encode(_bars(measured))
+
+
+def _encode(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="jpg", dpi=PAGE_DPI, pil_kwargs={"quality": 85})
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _grid(count: int, columns: int, aspect: float) -> tuple[Figure, list]:
+    """A figure with ``count`` cells of height / width ``aspect``, or of TALLEST."""
+    rows = math.ceil(count / columns)
+    height = WIDTH / columns * min(aspect, TALLEST) * 0.97 + 0.2
+    figure = new_figure(WIDTH, rows * height, layout="constrained")
+    cells = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in cells:
+        axes.set_axis_off()
+    return figure, list(cells[:count])
+
+
+def _sheet(subject: Subject, names: list[str]) -> Figure:
+    """Thumbnails in rows of COLUMNS with their names above: one picture, since each set of axes takes long."""
+    height, width = (max(subject.thumbnails[name].shape[side] for name in names) for side in (0, 1))
+    gap, rows = THUMBNAIL // 8, math.ceil(len(names) / COLUMNS)
+    sheet = np.full((rows * (height + gap), COLUMNS * (width + gap), 3), 255, np.uint8)
+    figure = new_figure(WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
+    axes = figure.add_axes((0, 0, 1, 1))
+    for index, name in enumerate(names):
+        top, left = index // COLUMNS * (height + gap) + gap, index % COLUMNS * (width + gap)
+        small = subject.thumbnails[name]
+        sheet[top : top + small.shape[0], left : left + small.shape[1]] = small
+        axes.text(left, top - 4, name[-14:], fontsize=5, color=INK)
+    axes.imshow(sheet)
+    axes.set_axis_off()
+    return figure
+
+
+def _on_photos(subject: Subject, measured: Measured) -> Figure:
+    photos = worst_and_best(measured, [p for p in subject.photos if p.name in subject.thumbnails], ON_PHOTOS)
+    height, width = subject.thumbnails[photos[0].name].shape[:2]
+    figure, cells = _grid(len(photos), 3 if height > width else 2, height / width)
+    dots = None
+    for axes, photo in zip(cells, photos, strict=True):
+        small = subject.thumbnails[photo.name]
+        axes.imshow(small, alpha=0.7)
+        if photo.name in measured.errors:
+            image = subject.model.find_image_with_name(photo.name)
+            pixels = measured.pixels[photo.name][:DOTS] * small.shape[1] / image.camera.width
+            errors = measured.errors[photo.name]
+            dots = axes.scatter(*pixels.T, c=errors[:DOTS], s=2, cmap="plasma", vmin=0, vmax=MOST)
+            title = f"{photo.name}: median {np.median(errors):.2f} px"
+        else:
+            points = np.array(sample(list(subject.points[visible(photo.camera, subject.points)]), DOTS)).reshape(-1, 3)
+            x, y, z = photo.camera.rotation @ points.T + photo.camera.translation[:, None]
+            scale = small.shape[1] / photo.camera.width
+            u, v = photo.camera.fx * x / z + photo.camera.cx, photo.camera.fy * y / z + photo.camera.cy
+            axes.scatter(u * scale, v * scale, c=ORANGE, s=1.5)
+            title = photo.name
+        axes.set_title(title, fontsize=7, color=INK, pad=2)
+        axes.set_xlim(0, small.shape[1])
+        axes.set_ylim(small.shape[0], 0)
+    if dots is not None:
+        bar = figure.colorbar(dots, ax=cells, shrink=0.4, aspect=40, location="bottom")
+        bar.set_label("reprojection error [px]", fontsize=7)
+    return figure
+
+
+def _map(subject: Subject) -> Figure:
+    """Across the plane in which the cameras spread most, and from its side."""
+    centers = np.array([photo.camera.center for photo in subject.photos])
+    forward = np.array([photo.camera.forward for photo in subject.photos])
+    points = np.array(sample(list(subject.points), MAPPED))
+    middle = np.median(points, axis=0)
+    _, _, axes_of_spread = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=True)
+    reach = 1.3 * np.percentile(np.linalg.norm(np.concatenate([centers, points]) - middle, axis=1), 95)
+    figure = new_figure(WIDTH, WIDTH / 2 + 0.3, layout="constrained")
+    sides = (("in the plane of the cameras", (0, 1)), ("across it", (0, 2)))
+    for axes, (title, chosen) in zip(figure.subplots(1, 2), sides, strict=True):
+        plane = axes_of_spread[list(chosen)].T
+        plain_axes(axes, title)
+        axes.scatter(*((points - middle) @ plane).T, s=0.5, color=BLUE, alpha=0.4)
+        axes.quiver(*((centers - middle) @ plane).T, *(forward @ plane).T, color=ORANGE, width=0.004, scale=25)
+        axes.set_xlim(-reach, reach)
+        axes.set_ylim(-reach, reach)
+        axes.set_aspect("equal")
+    return figure
+
+
+def _bars(measured: Measured) -> Figure:
+    figure = new_figure(WIDTH, 2.6, layout="constrained")
+    medians = [float(np.median(errors)) for errors in measured.errors.values()]
+    counts = [len(errors) for errors in measured.errors.values()]
+    panels = (("median reprojection error [px]", medians, ORANGE), ("observations", counts, BLUE))
+    for axes, (title, values, color) in zip(figure.subplots(1, 2), panels, strict=True):
+        plain_axes(axes, title)
+        axes.bar(range(len(values)), values, color=color)
+        axes.set_xlabel("image", fontsize=9, color=INK)
+    return figure

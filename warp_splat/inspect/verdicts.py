@@ -1,0 +1,138 @@
+"""Checks that need no pixels: cameras, names, masks, what the loader and the training will say."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.errors import InputError
+from warp_splat.inspect.cost import forecast
+from warp_splat.inspect.subject import Finding, Subject, few
+from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
+from warp_splat.scene.photos import READABLE, find_files
+
+FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
+ASPECT = 1.2  # fx / fy of a real camera is nearly 1
+OFF_CENTER = 0.1  # of the image's width or height
+AT_LEAST = 20  # images; fewer train, but show little from new sides
+
+
+def check_cameras(subject: Subject) -> list[Finding]:
+    """Lenses, how many, and whether their numbers are those of a real camera."""
+    findings, lenses = [], Counter()
+    if subject.model is not None:
+        cameras = [subject.model.image(i).camera for i in subject.model.reg_image_ids()]
+        lenses = Counter(f"{lens.model_name} {lens.width} x {lens.height}" for lens in cameras)
+    elif subject.photos:
+        lenses = Counter(f"PINHOLE {photo.camera.width} x {photo.camera.height}" for photo in subject.photos)
+    text = "; ".join(f"{name} px in {count} images" for name, count in lenses.most_common(5)) or "none"
+    distorted = sum(photo.sampling is not None for photo in subject.photos)
+    if distorted:
+        text += f"; {distorted} images are undistorted on loading"
+    findings.append(Finding("cameras", "ok" if lenses else "error", f"{text}."))
+    odd: dict[str, list[str]] = defaultdict(list)
+    for photo in subject.photos:
+        camera = photo.camera
+        angle = 2 * np.degrees(np.arctan(0.5 * camera.width / camera.fx))
+        if not FIELDS_OF_VIEW[0] <= angle <= FIELDS_OF_VIEW[1]:
+            odd[f"a field of view of {angle:.0f} degrees"].append(photo.name)
+        if not 1 / ASPECT <= camera.fx / camera.fy <= ASPECT:
+            odd[f"fx / fy = {camera.fx / camera.fy:.2f}"].append(photo.name)
+        off = abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)
+        if max(off) > OFF_CENTER:
+            odd[f"a principal point {100 * max(off):.0f} % of the image beside its middle"].append(photo.name)
+    for what, names in odd.items():
+        findings.append(Finding("intrinsics", "warning", f"{what} is unusual: {few(names)}."))
+    if not odd and subject.photos:
+        focal = sorted(photo.camera.fx / photo.camera.width for photo in subject.photos)
+        text = f"focal lengths of {focal[0]:.2f} to {focal[-1]:.2f} widths of the image, all plausible."
+        findings.append(Finding("intrinsics", "ok", text))
+    if 0 < len(subject.photos) < AT_LEAST:
+        text = f"{len(subject.photos)} images are few: new views will be poor where only one or two of them look."
+        findings.append(Finding("cameras", "warning", text))
+    return findings
+
+
+def check_names(subject: Subject) -> list[Finding]:
+    """Names that occur twice, images that are the same file, images that no camera belongs to."""
+    findings = []
+    stems: dict[str, list[str]] = defaultdict(list)
+    copies: dict[tuple[int, str], list[str]] = defaultdict(list)
+    for photo in subject.photos:
+        stems[str(Path(photo.name).with_suffix("")).lower()].append(photo.name)
+        copies[photo.path.stat().st_size, _digest(photo.path)].append(photo.name)
+    for what, groups in (("the same name but for ending or case", stems), ("the same bytes", copies)):
+        twice = [" = ".join(names) for names in groups.values() if len(names) > 1]
+        if twice:
+            text = f"{len(twice)} groups of images have {what}: {few(twice)}."
+            findings.append(Finding("duplicates", "warning", text))
+    if not findings and subject.photos:
+        findings.append(Finding("duplicates", "ok", "no image occurs twice."))
+    if subject.model is not None and subject.root.is_dir():
+        known = {subject.model.image(i).name for i in subject.model.reg_image_ids()}
+        extra = [name for name in find_files(subject.root, READABLE) if name not in known]
+        if extra:
+            text = f"{len(extra)} images in {subject.root} have no camera and are not used: {few(extra)}."
+            findings.append(Finding("unregistered", "note", text))
+    return findings
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def check_masks(subject: Subject) -> list[Finding]:
+    """Alpha channels and masks."""
+    findings, count = [], len(subject.photos)
+    if subject.alpha:
+        text = f"{len(subject.alpha)} of {count} images have alpha: black behind them, with -w white"
+        level = "warning" if 0 < len(subject.alpha) < count else "note"
+        findings.append(Finding("alpha", level, f"{text}."))
+    without = [photo.name for photo in subject.photos if photo.mask is None]
+    if len(without) < count or (subject.source / MASKS).is_dir():
+        text = f"there are masks for {count - len(without)} of {count} images"
+        if without:
+            findings.append(Finding("masks", "warning", f"{text}; none for {few(without)}."))
+        else:
+            findings.append(Finding("masks", "ok", f"{text}."))
+    if subject.black:
+        text = f"the masks of {len(subject.black)} images are black; these are left out: {few(subject.black)}."
+        findings.append(Finding("masks", "note", text))
+    return findings or [Finding("masks", "ok", "no alpha channels and no masks.")]
+
+
+def check_loading(subject: Subject, folder: str) -> list[Finding]:
+    """What training itself would say of this scene before its first step."""
+    notes: list[str] = []
+    missing: list[Finding] = []
+    try:
+        train, _, points, _ = read_photos(subject.source, folder, notes.append)
+        if len(points):
+            require_visible(train, points, subject.source)
+        else:
+            text = "there are none to start from; training takes random ones, which gives worse results."
+            missing = [Finding("points", "warning", text)]
+        if subject.thumbnails:
+            require_one_kind([(name, name in subject.linear) for name in subject.thumbnails], subject.source)
+            require_unmasked(len(subject.photos), len(subject.black), subject.source)
+    except InputError as error:
+        return [Finding("loading", "error", f"training would refuse this scene: {error}")]
+    unread = len(subject.photos) - len(subject.thumbnails)
+    if unread:
+        return [Finding("loading", "error", f"training would refuse this scene: {unread} images cannot be read.")]
+    accepted = Finding("loading", "ok", "training would accept this scene.")
+    return [accepted, *missing, *(Finding("loading", "note", note) for note in notes)]
+
+
+def check_cost(subject: Subject) -> list[Finding]:
+    """Memory and time of a training, against what this machine has."""
+    if not subject.photos:
+        return []
+    sizes = [(photo.camera.width, photo.camera.height) for photo in subject.photos]
+    kinds = bool(subject.linear), any(photo.mask for photo in subject.photos), bool(subject.alpha)
+    text, fits = forecast(sizes, len(subject.points), *kinds)
+    return [Finding("forecast", "note" if fits else "warning", text)]

@@ -1,0 +1,1 @@
+"""The blend and its adjoints in lanes: sixteen pixels at once."""

@@ -1,0 +1,246 @@
+"""The adjoint of the blend on the CPU, its reverse loop by hand: ``manual`` and ``stepwise`` differ in the step.
+
+Both recover T by division, both sum over the pixels of a tile in lanes and write one row per tile instance.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
+from warp_splat.kernels.lanes import LANES, times, vec16
+from warp_splat.kernels.splat import Splat2D, exponent
+from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
+
+vec5 = wp.types.vector(length=5, dtype=float)
+vec8 = wp.types.vector(length=8, dtype=float)
+
+
+@wp.func
+def folded(halves: wp.array[vec8], quarters: wp.array[wp.vec4], row: int):
+    """Sum of a row of lanes, two and four of which make it up; the row is spent.
+
+    Folded in memory, because LLVM makes vectors of what is stored (Tried: a sum of 16 numbers, which stays scalar: 15 %
+    of the loop).
+    """
+    halves[2 * row] = halves[2 * row] + halves[2 * row + 1]
+    quarters[4 * row] = quarters[4 * row] + quarters[4 * row + 1]
+    four = quarters[4 * row]
+    return (four[0] + four[2]) + (four[1] + four[3])
+
+
+@functools.cache
+def _make_manual_body(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.Function]:
+    """What the loop does with a Gaussian and a block, and how its sums become gradients."""
+    adj_step = make_manual(exp_degree, vec16)
+    mat_grads = _mat_grads(depth)
+
+    @wp.func
+    def body(
+        splat: Splat2D,
+        dx: vec16,
+        dy: vec16,
+        t: vec16,  # transmittance behind
+        adj_t: vec16,  # T dL/dT behind
+        alpha_min: float,
+        here: vec16,
+        walked: vec16,
+        red: vec16,  # upstream gradients
+        green: vec16,
+        blue: vec16,
+        far: vec16,
+    ):
+        """Both in front, and what to sum over pixels: d, d d', 1 times dL/dopacity, and the channels' gradients."""
+        lit = red * splat.color[0] + green * splat.color[1] + blue * splat.color[2]
+        if wp.static(depth):
+            lit = lit + far * splat.depth
+        z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
+        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
+        part = mat_grads()
+        adj_x = times(adj_opacity, dx)
+        adj_y = times(adj_opacity, dy)
+        part[0] = adj_x
+        part[1] = adj_y
+        part[2] = times(adj_x, dx)
+        part[3] = times(adj_x, dy)
+        part[4] = times(adj_y, dy)
+        part[5] = adj_opacity
+        part[6] = times(w, red)
+        part[7] = times(w, green)
+        part[8] = times(w, blue)
+        if wp.static(depth):
+            part[9] = times(w, far)
+        return front, adj_front, part
+
+    @wp.func
+    def adj_geometry(sums: vec5, splat: Splat2D):
+        """dL/d(mean, conic)."""
+        s = wp.vec2(sums[0], sums[1])
+        return geometry_from_moments(s, sums[2], sums[3], sums[4], splat.root, splat.opacity)
+
+    return body, adj_geometry
+
+
+@functools.cache
+def _make_stepwise_body(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.Function]:
+    """What the loop does with a Gaussian and a block, and how its sums become gradients."""
+    Parcel, undo, step = make_stepwise(depth, exp_degree, vec16)
+    mat_grads = _mat_grads(depth)
+
+    @wp.func
+    def body(
+        splat: Splat2D,
+        dx: vec16,
+        dy: vec16,
+        t: vec16,  # transmittance behind
+        adj_t: vec16,  # dL/dT behind
+        alpha_min: float,
+        here: vec16,
+        walked: vec16,
+        red: vec16,  # upstream gradients
+        green: vec16,
+        blue: vec16,
+        far: vec16,
+    ):
+        """Both in front, and what to sum over pixels: the gradients of a Parcel's members."""
+        parcel = Parcel()
+        parcel.dx = dx
+        parcel.dy = dy
+        parcel.xx = vec16(splat.root[0])
+        parcel.xy = vec16(splat.root[1])
+        parcel.yy = vec16(splat.root[2])
+        parcel.opacity = vec16(splat.opacity)
+        parcel.red = vec16(splat.color[0])
+        parcel.green = vec16(splat.color[1])
+        parcel.blue = vec16(splat.color[2])
+        parcel.depth = vec16(splat.depth)
+        fall, front = undo(parcel, t, alpha_min, here, walked)
+        adj, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
+            parcel, fall, front, adj_t, alpha_min, here, walked, red, green, blue, far
+        )
+        part = mat_grads()
+        part[0] = adj.dx
+        part[1] = adj.dy
+        part[2] = adj.xx
+        part[3] = adj.xy
+        part[4] = adj.yy
+        part[5] = adj.opacity
+        part[6] = adj.red
+        part[7] = adj.green
+        part[8] = adj.blue
+        if wp.static(depth):
+            part[9] = adj.depth
+        return front, adj_front, part
+
+    @wp.func
+    def adj_geometry(sums: vec5, splat: Splat2D):
+        """dL/d(mean, conic)."""
+        adj_root = wp.vec3(sums[2], sums[3], sums[4])
+        return wp.vec2(sums[0], sums[1]), conic_from_root(adj_root, splat.root)
+
+    return body, adj_geometry
+
+
+@functools.cache
+def _mat_grads(depth: bool) -> type:
+    """A row in lanes for each gradient of a tile instance: mean 2, conic 3, opacity 1, channels."""
+    return wp.types.matrix(shape=(10 if depth else 9, LANES), dtype=float)
+
+
+@functools.cache
+def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
+    """The reverse loop with the body of ``mode``."""
+    CHANNELS = 4 if depth else 3
+    GRADS = 6 + CHANNELS
+    # all in one matrix: a matrix of which only rows of known numbers are used would be taken apart into scalars
+    ADJ_T, WALKED, UP, SUMS = BLOCKS, 2 * BLOCKS, 3 * BLOCKS, (3 + CHANNELS) * BLOCKS
+    mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
+    vec_grads = wp.types.vector(length=GRADS, dtype=float)
+    make_body = {"manual": _make_manual_body, "stepwise": _make_stepwise_body}[mode]
+    body, adj_geometry = make_body(depth, exp_degree)
+
+    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def adj_blend(
+        first: int,
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],
+        instances: wp.array[int],
+        splats: wp.array[Splat2D],
+        alpha_min: float,
+        final: wp.array2d[vec16],
+        count: wp.array2d[vec16],
+        steps: wp.array[int],
+        up: wp.array2d[vec16],
+        adj_final: wp.array2d[vec16],
+        # out
+        slots_out: wp.array2d[float],  # [M, GRADS]
+    ):
+        tile = first + wp.tid()
+        start = ranges[tile][0]
+        x0 = float((tile % tiles_x) * TILE) + 0.5
+        y0 = float((tile // tiles_x) * TILE) + 0.5
+        room = mat_room()
+        # T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
+        s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
+        near = wp.array(ptr=s.ptr + wp.uint64(64 * (SUMS + GRADS)), shape=(AHEAD,), dtype=Splat2D)
+        for block in range(BLOCKS):
+            s[block] = final[tile, block]
+            s[ADJ_T + block] = adj_final[tile, block]
+            if wp.static(mode == "manual"):
+                s[ADJ_T + block] = times(final[tile, block], adj_final[tile, block])
+            s[WALKED + block] = count[tile, block]
+            for channel in range(CHANNELS):
+                s[UP + channel * BLOCKS + block] = up[tile, block * CHANNELS + channel]
+        far = vec16(0.0)
+        boxes = mat_boxes()
+        sums = vec_grads()
+        halves = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(2 * GRADS,), dtype=vec8)
+        quarters = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(4 * GRADS,), dtype=wp.vec4)
+        for back in range(steps[tile]):
+            k = start + steps[tile] - 1 - back
+            ahead = back & (AHEAD - 1)
+            if ahead == 0:
+                for j in range(wp.min(AHEAD, steps[tile] - back)):
+                    near[j] = splats[instances[k - j]]
+                for j in range(wp.min(AHEAD, steps[tile] - back)):
+                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
+            splat = near[ahead]
+            box = boxes[ahead]
+            here = vec16(float(k - start))
+            for grad in range(GRADS):
+                s[SUMS + grad] = vec16(0.0)
+            by = box[2]
+            while by <= box[3]:
+                dy = offset_y(splat.mean, y0, by)
+                bx = box[0]
+                while bx <= box[1]:
+                    block = (4 * by + bx) & (BLOCKS - 1)
+                    dx = offset_x(splat.mean, x0, bx)
+                    if wp.static(depth):
+                        far = s[UP + 3 * BLOCKS + block]
+                    front, adj_front, part = body(
+                        splat, dx, dy, s[block], s[ADJ_T + block], alpha_min, here, s[WALKED + block],
+                        s[UP + block], s[UP + BLOCKS + block], s[UP + 2 * BLOCKS + block], far,
+                    )  # fmt: skip
+                    s[block] = front
+                    s[ADJ_T + block] = adj_front
+                    for grad in range(GRADS):
+                        s[SUMS + grad] = s[SUMS + grad] + part[grad]
+                    bx += 1
+                by += 1
+            grad = int(0)
+            while grad < GRADS:  # as a range, which Warp unrolls, 10 % of the loop slower
+                sums[grad] = folded(halves, quarters, grad)
+                grad += 1
+            adj_mean, adj_conic = adj_geometry(vec5(sums[0], sums[1], sums[2], sums[3], sums[4]), splat)
+            slots_out[k, 0] = adj_mean[0]
+            slots_out[k, 1] = adj_mean[1]
+            slots_out[k, 2] = adj_conic[0]
+            slots_out[k, 3] = adj_conic[1]
+            slots_out[k, 4] = adj_conic[2]
+            for grad in range(5, GRADS):
+                slots_out[k, grad] = sums[grad]
+
+    return adj_blend

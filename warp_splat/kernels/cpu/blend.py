@@ -1,0 +1,247 @@
+"""The CPU driver of the blend: one launch index per 16 x 16 tile, sixteen 4 x 4 blocks of pixels, a block in lanes.
+
+What keeps LLVM vectorising (measured in benchmarks/blend.py; against one scalar thread per pixel more than 20 times):
+state that lives across Gaussians stays in memory, a row of lanes each (phi nodes of 16 scalars defeat the SLP
+vectoriser, loads and stores of 64 bytes do not); no branch per lane; sums over pixels stay in lanes until the end. What
+keeps the loop over blocks short (each measured): that memory is an array made in the kernel over a local matrix, whose
+strides are known (those of other arrays are not, and a local array reloads its own), and begins at a multiple of 64
+bytes, as the matrix does not: by the luck of where the stack lies, rows that cross two lines cost 15 %, and one that
+crosses two pages up to 25 %; ``block & 15``, since an index that may be negative is wrapped; ``while``, since Warp's
+range keeps more state; boxes found for 32 Gaussians at a time, so that their reads overlap and the processor knows how
+many blocks there are before it gets there.
+Tried: rows of 16 pixels instead of blocks, 22 % slower, because fewer blocks can be skipped; a jump over blocks where
+no lane sees the Gaussian, 5 % slower in both directions, because the test costs as much as it saves; one loop over the
+blocks of a box instead of two nested ones, 5 and 20 % slower (adjoint, forward). The ellipse's own end in each row of
+blocks instead of its box: 21 % fewer blocks, but 3 and 7 % slower (forward, adjoint), because the ends cost as much and
+rows of different lengths are not foreseen; the same as a list of blocks without a branch, 40 % slower.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
+from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
+from warp_splat.kernels.splat import Splat2D, advance, alpha_of, exponent, make_exp, weight
+
+BLOCKS = TILE * TILE // LANES  # per tile
+AHEAD = 32  # instances that are copied, and their boxes found, together; then, whether the whole tile has stopped
+
+ROWS_AHEAD = AHEAD * wp.types.type_size_in_bytes(Splat2D) // (4 * LANES)  # of lanes, in which that many splats fit
+vec4i = wp.types.vector(length=4, dtype=int)
+mat_boxes = wp.types.matrix(shape=(AHEAD, 4), dtype=int)
+
+
+@wp.func
+def reach(mean: wp.vec2, extent: wp.vec2, x0: float, y0: float):
+    """Blocks of the tile whose pixels the Gaussian's box touches: (first x, last x, first y, last y)."""
+    x = (mean[0] - x0) * 0.25
+    y = (mean[1] - y0) * 0.25
+    rx = extent[0] * 0.25
+    ry = extent[1] * 0.25
+    # block b holds pixel centres x0 + 4 b .. x0 + 4 b + 3; clamp as float: a huge extent has no int
+    return vec4i(
+        int(wp.clamp(wp.ceil(x - rx - 0.75), 0.0, 4.0)),
+        int(wp.clamp(wp.floor(x + rx), -1.0, 3.0)),
+        int(wp.clamp(wp.ceil(y - ry - 0.75), 0.0, 4.0)),
+        int(wp.clamp(wp.floor(y + ry), -1.0, 3.0)),
+    )
+
+
+@wp.func
+def offset_x(mean: wp.vec2, x0: float, bx: int):
+    """From the pixel centres of block column ``bx`` to the mean [px]."""
+    return (vec16(mean[0] - x0) - LANE_X) - vec16(float(4 * bx))
+
+
+@wp.func
+def offset_y(mean: wp.vec2, y0: float, by: int):
+    return (vec16(mean[1] - y0) - LANE_Y) - vec16(float(4 * by))
+
+
+@wp.func
+def aligned(address: wp.uint64):
+    """The first multiple of 64 from ``address`` on."""
+    return (address + wp.uint64(63)) & wp.uint64(0xFFFFFFFFFFFFFFC0)
+
+
+@functools.cache
+def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
+    """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
+    WALKED, RGB, DEPTH = BLOCKS, 2 * BLOCKS, 5 * BLOCKS
+    STATE = DEPTH + BLOCKS if depth else DEPTH
+    mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
+    exp2_minus = make_exp(exp_degree)
+
+    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def blend(
+        first: int,  # tile of this slice
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
+        instances: wp.array[int],  # [M] splats, by tile, front to back
+        splats: wp.array[Splat2D],  # [V]
+        alpha_min: float,
+        t_min: float,
+        max_steps: int,
+        background: wp.array[float],  # [3]
+        # out
+        image_out: wp.array3d[float],  # [H, W, 3]
+        alpha_out: wp.array2d[float],  # [H, W]
+        depth_out: wp.array2d[float],  # [H, W] sum of w z
+        final_out: wp.array2d[vec16],  # [T, BLOCKS] transmittance behind the last Gaussian
+        count_out: wp.array2d[vec16],  # [T, BLOCKS] where the adjoint starts: instances walked before the pixel stopped
+        kept_out: wp.array2d[vec16],  # [M, BLOCKS] transmittance in front of each Gaussian
+    ):
+        tile = first + wp.tid()
+        span = ranges[tile]
+        column = (tile % tiles_x) * TILE
+        line = (tile // tiles_x) * TILE
+        x0 = float(column) + 0.5
+        y0 = float(line) + 0.5
+        room = mat_room()
+        # T, instances walked, sums of w color and w z
+        s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
+        near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
+        for block in range(BLOCKS):
+            s[block] = vec16(1.0)
+        for row in range(WALKED, s.shape[0]):  # as a constant, a blend that takes half as long again
+            s[row] = vec16(0.0)
+        end = span[0] + wp.min(span[1] - span[0], max_steps)
+        boxes = mat_boxes()
+        for k in range(span[0], end):
+            ahead = (k - span[0]) & (AHEAD - 1)
+            if ahead == 0:
+                for j in range(wp.min(AHEAD, end - k)):  # alone, many reads are under way at a time
+                    near[j] = splats[instances[k + j]]
+                for j in range(wp.min(AHEAD, end - k)):
+                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
+            splat = near[ahead]
+            box = boxes[ahead]
+            walked = vec16(float(k - span[0] + 1))
+            by = box[2]
+            while by <= box[3]:
+                dy = offset_y(splat.mean, y0, by)
+                bx = box[0]
+                while bx <= box[1]:
+                    block = (4 * by + bx) & (BLOCKS - 1)
+                    dx = offset_x(splat.mean, x0, bx)
+                    fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+                    alpha = alpha_of(fall * splat.opacity, alpha_min)
+                    behind = advance(s[block], alpha, t_min)
+                    w = weight(s[block], alpha, behind)
+                    if wp.static(keep):
+                        kept_out[k, block] = s[block]
+                    for channel in range(3):
+                        s[RGB + channel * BLOCKS + block] = s[RGB + channel * BLOCKS + block] + w * splat.color[channel]
+                    if wp.static(depth):
+                        s[DEPTH + block] = s[DEPTH + block] + w * splat.depth
+                    s[block] = behind
+                    s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
+                    bx += 1
+                by += 1
+            if ahead == AHEAD - 1:
+                alive = vec16(0.0)
+                for block in range(BLOCKS):
+                    alive = alive + where_less(s[block], vec16(0.0), vec16(0.0), s[block])
+                if total(alive) == 0.0:
+                    break
+        for block in range(BLOCKS):
+            s[block] = wp.max(s[block], -s[block])
+            final_out[tile, block] = s[block]
+            count_out[tile, block] = s[WALKED + block]
+        block = int(0)
+        while block < BLOCKS:
+            left = column + 4 * (block & 3)
+            top = line + 4 * (block >> 2)
+            for lane in range(LANES):
+                x = left + lane % 4
+                y = top + lane // 4
+                if y < image_out.shape[0] and x < image_out.shape[1]:
+                    final = s[block][lane]
+                    for channel in range(3):
+                        light = s[RGB + channel * BLOCKS + block][lane] + final * background[channel]
+                        image_out[y, x, channel] = light
+                    alpha_out[y, x] = 1.0 - final
+                    if wp.static(depth):
+                        depth_out[y, x] = s[DEPTH + block][lane]
+            block += 1
+
+    return blend
+
+
+@functools.cache
+def make_upstream(depth: bool) -> wp.Kernel:
+    """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
+    CHANNELS = 4 if depth else 3
+    vec_grads = wp.types.vector(length=CHANNELS + 6, dtype=float)
+    mat_background = wp.types.matrix(shape=(3, LANES), dtype=float)
+    mat_up = wp.types.matrix(shape=(CHANNELS + 1, LANES), dtype=float)
+
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
+    def upstream(
+        first: int,
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],  # [T]
+        background: wp.array[float],  # [3]
+        final: wp.array2d[vec16],  # [T, BLOCKS]
+        count: wp.array2d[vec16],  # [T, BLOCKS]
+        adj_image: wp.array3d[float],  # [H, W, 3]
+        adj_alpha: wp.array2d[float],  # [H, W]
+        adj_depth: wp.array2d[float],  # [H, W]
+        # out
+        up_out: wp.array2d[vec16],  # [T, BLOCKS CHANNELS] dL/d(sum of w color, and of w z)
+        adj_final_out: wp.array2d[vec16],  # [T, BLOCKS] dL/d(final), through alpha and background
+        adj_background_out: wp.array2d[float],  # [T, 3]
+        dropped_out: wp.array[int],  # [T] pixels whose upstream gradient is not finite
+        steps_out: wp.array[int],  # [T] instances that the adjoint walks
+        slots_out: wp.array[vec_grads],  # [M] zeros for those that it does not
+    ):
+        tile = first + wp.tid()
+        column = (tile % tiles_x) * TILE
+        line = (tile // tiles_x) * TILE
+        zero = vec16(0.0)
+        adj_background = mat_background()
+        dropped = zero
+        height = adj_image.shape[0]
+        width = adj_image.shape[1]
+        block = int(0)
+        while block < BLOCKS:
+            left = column + 4 * (block & 3)
+            top = line + 4 * (block >> 2)
+            u = mat_up()  # the channels, and dL/dalpha
+            for lane in range(LANES):
+                y = wp.min(top + lane // 4, height - 1)
+                x = wp.min(left + lane % 4, width - 1)
+                for channel in range(3):
+                    u[channel, lane] = adj_image[y, x, channel]
+                u[CHANNELS, lane] = adj_alpha[y, x]
+                if wp.static(depth):
+                    u[3, lane] = adj_depth[y, x]
+            inside = where_less(LANE_X, vec16(float(width - left)), vec16(1.0), zero)
+            inside = where_less(LANE_Y, vec16(float(height - top)), inside, zero)
+            finite = inside
+            for row in range(CHANNELS + 1):
+                finite = where_less(wp.abs(u[row]), vec16(wp.inf), finite, zero)  # not where it is NaN, either
+            dropped = dropped + inside - finite
+            adj_t = -where_less(zero, finite, u[CHANNELS], zero)
+            for channel in range(CHANNELS):
+                known = where_less(zero, finite, u[channel], zero)
+                up_out[tile, block * CHANNELS + channel] = known
+                if channel < 3:
+                    adj_t = adj_t + known * background[channel]
+                    adj_background[channel] = adj_background[channel] + times(known, final[tile, block])
+            adj_final_out[tile, block] = adj_t
+            block += 1
+        stopped = vec16(0.0)
+        for block in range(BLOCKS):
+            stopped = wp.max(stopped, count[tile, block])
+        longest = wp.max(stopped)
+        for channel in range(3):
+            adj_background_out[tile, channel] = total(adj_background[channel])
+        dropped_out[tile] = int(total(dropped))
+        steps_out[tile] = int(longest)
+        for k in range(ranges[tile][0] + int(longest), ranges[tile][1]):
+            slots_out[k] = vec_grads(0.0)
+
+    return upstream

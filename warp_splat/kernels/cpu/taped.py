@@ -1,0 +1,233 @@
+"""The adjoint of the blend by differentiating its whole loop with Warp: ``reversible`` and ``stored``.
+
+In the reverse pass Warp replays the body of a dynamic loop, last iteration first, from whatever the variables that the
+loop carries hold at that moment. Recorded plainly (``plain``) that is silently wrong: stores are not replayed, so that
+T is 0 in every step, and with it every gradient. Two cures:
+
+    reversible  the replay of ``front_of`` undoes the step, T = T / (1 - alpha): no memory
+    stored      the replay of ``front_of_kept`` reads the T that the forward pass wrote
+
+A replay cannot follow a break; the loop runs over the instances that some pixel of the tile blended, and ``opaque``
+skips those that a pixel did not. What a loop carries has to be an element of a kernel-local array changed by += and -=
+(whose adjoint is right; that of a[i] = a[i] + x is not).
+
+Pieces with a gradient by hand: the clamp (``opaque``), the exponential (``exp2_known``), and the reading of a Gaussian
+(``spread`` into lanes, ``collect`` into its row). ``generated`` does without them: it reads a copy of the Gaussian per
+tile instance, because Warp adds the adjoint of a read to the Gaussian's own, a race between threads.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.cpu.blend import BLOCKS, reach
+from warp_splat.kernels.lanes import LANE_X, LANE_Y, times, total, vec16, where_less
+from warp_splat.kernels.splat import Splat2D, alpha_of, exponent, make_exp, odds_of
+from warp_splat.kernels.step import conic_from_root, exp2_known, opaque
+
+
+@wp.func
+def begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
+    for block in range(BLOCKS):
+        t[block] = vec16(1.0)
+
+
+@wp.func_replay(begin)
+def replay_begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
+    for block in range(BLOCKS):
+        t[block] = final[tile, block]
+
+
+@wp.func_grad(begin)
+def adj_begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
+    pass
+
+
+@wp.func
+def front_of(t: wp.array[vec16], block: int, alpha: vec16):
+    """Transmittance in front of the Gaussian."""
+    return t[block]
+
+
+@wp.func_replay(front_of)
+def replay_front_of(t: wp.array[vec16], block: int, alpha: vec16):
+    t[block] = t[block] + times(t[block], odds_of(alpha))
+    return t[block]
+
+
+@wp.func_grad(front_of)
+def adj_front_of(t: wp.array[vec16], block: int, alpha: vec16, adj_ret: vec16):
+    wp.adjoint[t][block] += adj_ret
+
+
+@wp.func
+def front_of_kept(t: wp.array[vec16], block: int, kept: wp.array2d[vec16], k: int):
+    """Transmittance in front of the Gaussian."""
+    return t[block]
+
+
+@wp.func_replay(front_of_kept)
+def replay_front_of_kept(t: wp.array[vec16], block: int, kept: wp.array2d[vec16], k: int):
+    return kept[k, block]
+
+
+@wp.func_grad(front_of_kept)
+def adj_front_of_kept(t: wp.array[vec16], block: int, kept: wp.array2d[vec16], k: int, adj_ret: vec16):
+    wp.adjoint[t][block] += adj_ret
+
+
+@wp.func
+def spread(m: wp.array[vec16], field: int, value: float):
+    """``value`` in all lanes; its gradient stays in lanes, in the adjoint of ``m``, until it is collected."""
+    return vec16(value)
+
+
+@wp.func_grad(spread)
+def adj_spread(m: wp.array[vec16], field: int, value: float, adj_ret: vec16):
+    wp.adjoint[m][field] += adj_ret
+
+
+@wp.func
+def collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slot: int):
+    """Nothing; in reverse, where all blocks have come before, the sums become the row of the instance."""
+    pass
+
+
+@wp.func_grad(collect)
+def adj_collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slot: int):
+    adj_root = wp.vec3(total(wp.adjoint[m][2]), total(wp.adjoint[m][3]), total(wp.adjoint[m][4]))
+    adj_conic = conic_from_root(adj_root, root)
+    slots[slot, 0] = total(wp.adjoint[m][0])
+    slots[slot, 1] = total(wp.adjoint[m][1])
+    slots[slot, 2] = adj_conic[0]
+    slots[slot, 3] = adj_conic[1]
+    slots[slot, 4] = adj_conic[2]
+    for grad in range(5, slots.shape[1]):
+        slots[slot, grad] = total(wp.adjoint[m][grad])
+    for grad in range(slots.shape[1]):
+        wp.adjoint[m][grad] = vec16(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def rows_of_copies(
+    first: int,
+    copies: wp.array[Splat2D],  # [M] a Gaussian per tile instance
+    adj_copies: wp.array[Splat2D],  # [M]
+    # out
+    slots_out: wp.array2d[float],  # [M, GRADS]
+):
+    """The rows of ``generated``, from the gradients of its copies."""
+    k = first + wp.tid()
+    adj = adj_copies[k]
+    conic = conic_from_root(adj.root, copies[k].root)
+    slots_out[k, 0] = adj.mean[0]
+    slots_out[k, 1] = adj.mean[1]
+    for i in range(3):
+        slots_out[k, 2 + i] = conic[i]
+        slots_out[k, 6 + i] = adj.color[i]
+    slots_out[k, 5] = adj.opacity
+    if slots_out.shape[1] > 9:
+        slots_out[k, 9] = adj.depth
+
+
+@functools.cache
+def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
+    """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
+    CHANNELS = 4 if depth else 3
+    GRADS = 6 + CHANNELS
+    STATE = BLOCKS * CHANNELS
+    exp2_minus = make_exp(exp_degree)
+
+    @wp.func
+    def exp2_value(z: vec16):
+        """2^-z without its gradient, which :func:`exp2_known` supplies."""
+        return exp2_minus(z)
+
+    @wp.func_grad(exp2_value)
+    def adj_exp2_value(z: vec16, adj_ret: vec16):
+        pass
+
+    @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
+    def walk(
+        first: int,
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],
+        instances: wp.array[int],
+        splats: wp.array[Splat2D],  # [V]; a copy per instance for ``generated``, [M]
+        alpha_min: float,
+        final: wp.array2d[vec16],
+        count: wp.array2d[vec16],
+        kept: wp.array2d[vec16],
+        steps: wp.array[int],
+        slots: wp.array2d[float],  # [M, GRADS], written by the adjoint
+        # out
+        color_out: wp.array2d[vec16],  # [T, STATE]
+        final_out: wp.array2d[vec16],  # [T, BLOCKS]
+    ):
+        tile = first + wp.tid()
+        start = ranges[tile][0]
+        x0 = float((tile % tiles_x) * TILE) + 0.5
+        y0 = float((tile // tiles_x) * TILE) + 0.5
+        t = wp.zeros(shape=(BLOCKS,), dtype=vec16)
+        c = wp.zeros(shape=(STATE,), dtype=vec16)
+        m = wp.zeros(shape=(GRADS,), dtype=vec16)
+        if wp.static(mode == "plain"):
+            for block in range(BLOCKS):
+                t[block] = vec16(1.0)
+        else:
+            begin(t, final, tile)
+        for k in range(start, start + steps[tile]):
+            if wp.static(mode == "generated"):
+                splat = splats[k]
+            else:
+                splat = splats[instances[k]]
+                collect(m, splat.root, slots, k)
+            box = reach(splat.mean, splat.extent, x0, y0)
+            here = vec16(float(k - start))
+            for by in range(box[2], box[3] + 1):
+                for bx in range(box[0], box[1] + 1):
+                    block = 4 * by + bx
+                    x = splat.mean[0] - x0
+                    y = splat.mean[1] - y0
+                    column = vec16(float(4 * bx))
+                    row = vec16(float(4 * by))
+                    if wp.static(mode == "generated"):
+                        dx = vec16(x) - LANE_X - column
+                        dy = vec16(y) - LANE_Y - row
+                        z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
+                        raw = exp2_minus(z) * splat.opacity
+                        alpha = alpha_of(where_less(here, count[tile, block], raw, vec16(-1.0)), alpha_min)
+                    else:
+                        dx = spread(m, 0, x) - LANE_X - column
+                        dy = spread(m, 1, y) - LANE_Y - row
+                        xx = spread(m, 2, splat.root[0])
+                        xy = spread(m, 3, splat.root[1])
+                        z = exponent(dx, dy, xx, xy, spread(m, 4, splat.root[2]))
+                        raw = times(exp2_known(z, exp2_value(z)), spread(m, 5, splat.opacity))
+                        alpha = opaque(raw, alpha_min, here, count[tile, block])
+                    if wp.static(mode == "stored"):
+                        front = front_of_kept(t, block, kept, k)
+                    elif wp.static(mode == "plain"):
+                        front = t[block]
+                    else:
+                        front = front_of(t, block, alpha)
+                    w = times(alpha, front)
+                    if wp.static(mode == "generated"):
+                        for channel in range(3):
+                            c[block * CHANNELS + channel] += w * splat.color[channel]
+                        if wp.static(depth):
+                            c[block * CHANNELS + 3] += w * splat.depth
+                    else:
+                        for channel in range(3):
+                            c[block * CHANNELS + channel] += times(w, spread(m, 6 + channel, splat.color[channel]))
+                        if wp.static(depth):
+                            c[block * CHANNELS + 3] += times(w, spread(m, 9, splat.depth))
+                    t[block] -= w
+        for i in range(STATE):
+            color_out[tile, i] = c[i]
+        for block in range(BLOCKS):
+            final_out[tile, block] = t[block]
+
+    return walk

@@ -1,0 +1,191 @@
+"""The adjoint of the blend on CUDA, in all modes of the CPU's: a block walks its tile's list back to front.
+
+The gradients of a Gaussian are summed over the block's pixels before anything is written, into one row per tile
+instance: no atomics, the same bits in every run. ``manual`` and ``stepwise`` are a reverse loop by hand; ``reversible``
+and ``stored`` (:mod:`warp_splat.kernels.cuda.taped`) are the loop that Warp differentiates.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
+from warp_splat.kernels.splat import Splat2D, exponent
+from warp_splat.kernels.step import (
+    conic_from_root,
+    geometry_from_moments,
+    make_manual,
+    make_stepwise,
+)
+
+
+@wp.func
+def row_of(mean: wp.vec2, conic: wp.vec3, rest: vec10):
+    """A row of gradients: mean 2, conic 3, then opacity and channels as they are."""
+    return vec10(mean[0], mean[1], conic[0], conic[1], conic[2], rest[5], rest[6], rest[7], rest[8], rest[9])
+
+
+@wp.func
+def row_from_moments(sums: vec10, g: vec10):
+    """From sums of d, d d', 1 (weighted by dL/dopacity) and of the channels' gradients."""
+    root = wp.vec3(g[2], g[3], g[4])
+    mean, conic = geometry_from_moments(wp.vec2(sums[0], sums[1]), sums[2], sums[3], sums[4], root, g[5])
+    return row_of(mean, conic, sums)
+
+
+@wp.func
+def row_from_root(sums: vec10, root: wp.vec3):
+    """From sums of the gradients of mean, root, opacity and channels."""
+    conic = conic_from_root(wp.vec3(sums[2], sums[3], sums[4]), root)
+    return row_of(wp.vec2(sums[0], sums[1]), conic, sums)
+
+
+@functools.cache
+def make_upstream_block(depth: bool) -> wp.Kernel:
+    """The start of every adjoint: upstream gradients by tile and thread, those that are not finite dropped."""
+
+    @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
+    def upstream(
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],  # [T]
+        background: wp.array[float],  # [3]
+        final: wp.array2d[float],  # [T, THREADS]
+        count: wp.array2d[int],  # [T, THREADS]
+        adj_image: wp.array3d[float],  # [H, W, 3]
+        adj_alpha: wp.array2d[float],  # [H, W]
+        adj_depth: wp.array2d[float],  # [H, W]
+        # out
+        up_out: wp.array2d[wp.vec4],  # [T, THREADS] dL/d(sum of w color, and of w z)
+        adj_final_out: wp.array2d[float],  # [T, THREADS] dL/d(final), through alpha and background
+        adj_background_out: wp.array2d[float],  # [T, 3]
+        dropped_out: wp.array[int],  # [T] pixels whose upstream gradient is not finite
+        steps_out: wp.array[int],  # [T] instances that the adjoint walks
+        slots_out: wp.array2d[float],  # [M, GRADS] zeros for those that it does not
+    ):
+        tile, thread = wp.tid()
+        column = (tile % tiles_x) * TILE + thread % TILE
+        line = (tile // tiles_x) * TILE + thread // TILE
+        up = wp.vec4(0.0)
+        adj_t = float(0.0)
+        lit = wp.vec3(0.0)  # of the background
+        dropped = int(0)
+        if line < adj_image.shape[0] and column < adj_image.shape[1]:
+            u = wp.vec4(adj_image[line, column, 0], adj_image[line, column, 1], adj_image[line, column, 2], 0.0)
+            if wp.static(depth):
+                u[3] = adj_depth[line, column]
+            if wp.isfinite(u) and wp.isfinite(adj_alpha[line, column]):
+                up = u
+                color = wp.vec3(u[0], u[1], u[2])
+                adj_t = wp.dot(color, wp.vec3(background[0], background[1], background[2])) - adj_alpha[line, column]
+                lit = color * final[tile, thread]
+            else:
+                dropped = 1
+        up_out[tile, thread] = up
+        adj_final_out[tile, thread] = adj_t
+        sums = wp.tile_sum(wp.tile(lit, preserve_type=True))[0]
+        bad = wp.tile_sum(wp.tile(dropped))[0]
+        walked = count[tile, thread]
+        steps = wp.tile_max(wp.tile(walked))[0]
+        if thread == 0:
+            for channel in range(3):
+                adj_background_out[tile, channel] = sums[channel]
+            dropped_out[tile] = bad
+            steps_out[tile] = steps
+        first = ranges[tile][0] + steps
+        for batch in range((ranges[tile][1] - first + THREADS - 1) // THREADS):
+            k = first + batch * THREADS + thread
+            if k < ranges[tile][1]:
+                for grad in range(slots_out.shape[1]):
+                    slots_out[k, grad] = 0.0
+
+    return upstream
+
+
+@wp.func
+def put(slots: wp.array2d[float], instance: int, splat: int, column: int, value: float):
+    """Write a gradient to its place, which is nobody else's."""
+    slots[instance, column] = value
+
+
+@functools.cache
+def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp.Function = put) -> wp.Kernel:
+    """The reverse loop by hand, its step by hand (``manual``) or by Warp (``stepwise``)."""
+    GRADS = 10 if depth else 9
+    adj_step = make_manual(exp_degree, float)
+    Parcel, undo, step = make_stepwise(depth, exp_degree, float)
+
+    @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
+    def adj_blend(
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],
+        instances: wp.array[int],
+        splats: wp.array[Splat2D],
+        alpha_min: float,
+        final: wp.array2d[float],
+        count: wp.array2d[int],
+        steps: wp.array[int],
+        up: wp.array2d[wp.vec4],
+        adj_final: wp.array2d[float],
+        # out
+        slots_out: wp.array2d[float],  # [M, GRADS] mean 2, conic 3, opacity 1, channels: one row per tile instance
+    ):
+        tile, thread = wp.tid()
+        x = float((tile % tiles_x) * TILE + thread % TILE) + 0.5
+        y = float((tile // tiles_x) * TILE + thread // TILE) + 0.5
+        start = ranges[tile][0]
+        u = up[tile, thread]
+        t = final[tile, thread]
+        walked = float(count[tile, thread])
+        adj_t = adj_final[tile, thread]
+        if wp.static(mode == "manual"):
+            adj_t = adj_t * t
+        for batch in range((steps[tile] + THREADS - 1) // THREADS):
+            last = steps[tile] - 1 - batch * THREADS
+            mine = vec10(0.0)
+            if last - thread >= 0:
+                mine = staged_of(splats[instances[start + last - thread]])
+            staged = wp.tile(mine, preserve_type=True)
+            for j in range(wp.min(THREADS, last + 1)):
+                g = staged[j]
+                dx = g[0] - x
+                dy = g[1] - y
+                here = float(last - j)
+                if wp.static(mode == "manual"):
+                    lit = u[0] * g[6] + u[1] * g[7] + u[2] * g[8] + u[3] * g[9]
+                    z = exponent(dx, dy, g[2], g[3], g[4])
+                    front, beyond, w, s = adj_step(z, g[5], t, adj_t, alpha_min, here, walked, lit)
+                    sx = s * dx
+                    sy = s * dy
+                    grads = vec10(sx, sy, sx * dx, sx * dy, sy * dy, s, w * u[0], w * u[1], w * u[2], w * u[3])
+                    adj_t = beyond
+                else:
+                    parcel = Parcel()
+                    parcel.dx = dx
+                    parcel.dy = dy
+                    parcel.xx = g[2]
+                    parcel.xy = g[3]
+                    parcel.yy = g[4]
+                    parcel.opacity = g[5]
+                    parcel.red = g[6]
+                    parcel.green = g[7]
+                    parcel.blue = g[8]
+                    parcel.depth = g[9]
+                    fall, front = undo(parcel, t, alpha_min, here, walked)
+                    p, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
+                        parcel, fall, front, adj_t, alpha_min, here, walked, u[0], u[1], u[2], u[3]
+                    )
+                    grads = vec10(p.dx, p.dy, p.xx, p.xy, p.yy, p.opacity, p.red, p.green, p.blue, p.depth)
+                    adj_t = adj_front
+                t = front
+                sums = wp.tile_sum(wp.tile(grads, preserve_type=True))[0]
+                if thread == 0:
+                    if wp.static(mode == "manual"):
+                        row = row_from_moments(sums, g)
+                    else:
+                        row = row_from_root(sums, wp.vec3(g[2], g[3], g[4]))
+                    k = start + last - j
+                    for grad in range(GRADS):
+                        write(slots_out, k, instances[k], grad, row[grad])
+
+    return adj_blend

@@ -1,0 +1,99 @@
+"""The CUDA driver of the blend: one block of 256 threads per 16 x 16 tile, one pixel per thread.
+
+Each thread stages one Gaussian of a batch of 256 in shared memory; all threads blend the batch; the block votes whether
+every pixel has stopped. The mathematics is that of the CPU's lanes (:mod:`warp_splat.kernels.splat`), for one pixel.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.splat import Splat2D, advance, alpha_of, exponent, make_exp, weight
+
+THREADS = wp.constant(TILE * TILE)  # per block
+vec10 = wp.types.vector(length=10, dtype=float)
+
+#: Of modules whose kernels run in blocks. No regrouping of sums: it would change what CPU fibers check.
+BLOCK_OPTIONS = {"enable_backward": False, "block_dim": TILE * TILE}
+
+
+@wp.func
+def staged_of(splat: Splat2D):
+    """What the loops read of a Gaussian, as one element of a tile: mean 2, root 3, opacity, color 3, depth."""
+    return vec10(
+        splat.mean[0], splat.mean[1], splat.root[0], splat.root[1], splat.root[2], splat.opacity,
+        splat.color[0], splat.color[1], splat.color[2], splat.depth,
+    )  # fmt: skip
+
+
+@functools.cache
+def make_blend_block(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
+    """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
+    exp2_minus = make_exp(exp_degree)
+
+    @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
+    def blend(
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
+        instances: wp.array[int],  # [M] splats, by tile, front to back
+        splats: wp.array[Splat2D],  # [V]
+        alpha_min: float,
+        t_min: float,
+        max_steps: int,
+        background: wp.array[float],  # [3]
+        # out
+        image_out: wp.array3d[float],  # [H, W, 3]
+        alpha_out: wp.array2d[float],  # [H, W]
+        depth_out: wp.array2d[float],  # [H, W] sum of w z
+        final_out: wp.array2d[float],  # [T, THREADS] transmittance behind the last Gaussian
+        count_out: wp.array2d[int],  # [T, THREADS] where the adjoint starts: instances walked before the pixel stopped
+        kept_out: wp.array2d[float],  # [M, THREADS] transmittance in front of each Gaussian
+    ):
+        tile, thread = wp.tid()
+        column = (tile % tiles_x) * TILE + thread % TILE
+        line = (tile // tiles_x) * TILE + thread // TILE
+        x = float(column) + 0.5
+        y = float(line) + 0.5
+        start = ranges[tile][0]
+        length = wp.min(ranges[tile][1] - start, max_steps)
+        inside = line < image_out.shape[0] and column < image_out.shape[1]
+        t = float(1.0)
+        if not inside:
+            t = -1.0  # stopped from the beginning
+        count = int(0)
+        color = wp.vec3(0.0)
+        far = float(0.0)
+        for batch in range((length + THREADS - 1) // THREADS):
+            first = batch * THREADS
+            mine = vec10(0.0)
+            if first + thread < length:
+                mine = staged_of(splats[instances[start + first + thread]])
+            staged = wp.tile(mine, preserve_type=True)
+            for j in range(wp.min(THREADS, length - first)):
+                g = staged[j]
+                fall = exp2_minus(exponent(g[0] - x, g[1] - y, g[2], g[3], g[4]))
+                alpha = alpha_of(fall * g[5], alpha_min)
+                behind = advance(t, alpha, t_min)
+                w = weight(t, alpha, behind)
+                if wp.static(keep):
+                    kept_out[start + first + j, thread] = t
+                color += wp.vec3(g[6], g[7], g[8]) * w
+                if wp.static(depth):
+                    far += g[9] * w
+                t = behind
+                if behind >= 0.0:
+                    count = first + j + 1
+            if wp.tile_max(wp.tile(t))[0] < 0.0:
+                break
+        t = wp.abs(t)
+        final_out[tile, thread] = t
+        count_out[tile, thread] = count
+        if inside:
+            for channel in range(3):
+                image_out[line, column, channel] = color[channel] + t * background[channel]
+            alpha_out[line, column] = 1.0 - t
+            if wp.static(depth):
+                depth_out[line, column] = far
+
+    return blend

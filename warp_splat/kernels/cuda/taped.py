@@ -1,0 +1,152 @@
+"""The adjoint of the blend on CUDA by differentiating its whole loop with Warp: ``reversible`` and ``stored``.
+
+As on the CPU (:mod:`warp_splat.kernels.cpu.taped`), but T is a variable of the thread, and a Gaussian is read as one
+vector whose custom gradient sums over the block's pixels and writes the instance's row. It is read from global memory
+by all threads alike: the adjoint of a staged element would be added to by all of them.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.cuda.adjoint import row_from_root
+from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of, vec10
+from warp_splat.kernels.splat import Splat2D, exponent, make_exp, odds_of
+from warp_splat.kernels.step import exp2_known, opaque
+
+
+@wp.func
+def begin(final: float):
+    return 1.0
+
+
+@wp.func_replay(begin)
+def replay_begin(final: float):
+    return final
+
+
+@wp.func_grad(begin)
+def adj_begin(final: float, adj_ret: float):
+    pass
+
+
+@wp.func
+def front_of(t: float, alpha: float):
+    """Transmittance in front of the Gaussian."""
+    return t
+
+
+@wp.func_replay(front_of)
+def replay_front_of(t: float, alpha: float):
+    return t + t * odds_of(alpha)
+
+
+@wp.func_grad(front_of)
+def adj_front_of(t: float, alpha: float, adj_ret: float):
+    wp.adjoint[t] += adj_ret
+
+
+@wp.func
+def front_of_kept(t: float, kept: wp.array2d[float], k: int, thread: int):
+    """Transmittance in front of the Gaussian."""
+    return t
+
+
+@wp.func_replay(front_of_kept)
+def replay_front_of_kept(t: float, kept: wp.array2d[float], k: int, thread: int):
+    return kept[k, thread]
+
+
+@wp.func_grad(front_of_kept)
+def adj_front_of_kept(t: float, kept: wp.array2d[float], k: int, thread: int, adj_ret: float):
+    wp.adjoint[t] += adj_ret
+
+
+@wp.func
+def behind_of(front: float, w: float):
+    """Transmittance behind the Gaussian."""
+    return front - w
+
+
+@wp.func_replay(behind_of)
+def replay_behind_of(front: float, w: float):
+    return front  # undone already
+
+
+@wp.func_grad(behind_of)
+def adj_behind_of(front: float, w: float, adj_ret: float):
+    wp.adjoint[front] += adj_ret
+    wp.adjoint[w] -= adj_ret
+
+
+@functools.cache
+def make_walk_block(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
+    """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
+    GRADS = 10 if depth else 9
+    exp2_minus = make_exp(exp_degree)
+
+    @wp.func
+    def read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int):
+        """The Gaussian as one vector; its gradient, summed over the block's pixels, becomes the instance's row."""
+        return staged_of(splat)
+
+    @wp.func_grad(read)
+    def adj_read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int, adj_ret: vec10):
+        sums = wp.tile_sum(wp.tile(adj_ret, preserve_type=True))[0]
+        if thread == 0:
+            row = row_from_root(sums, splat.root)
+            for grad in range(GRADS):
+                slots[slot, grad] = row[grad]
+
+    @wp.func
+    def exp2_value(z: float):
+        """2^-z without its gradient, which :func:`exp2_known` supplies."""
+        return exp2_minus(z)
+
+    @wp.func_grad(exp2_value)
+    def adj_exp2_value(z: float, adj_ret: float):
+        pass
+
+    @wp.kernel(module="unique", module_options={**BLOCK_OPTIONS, "enable_backward": True})
+    def walk(
+        tiles_x: int,
+        ranges: wp.array[wp.vec2i],
+        instances: wp.array[int],
+        splats: wp.array[Splat2D],
+        alpha_min: float,
+        final: wp.array2d[float],
+        count: wp.array2d[int],
+        kept: wp.array2d[float],
+        steps: wp.array[int],
+        slots: wp.array2d[float],  # [M, GRADS], written by the adjoint
+        # out
+        color_out: wp.array2d[wp.vec4],  # [T, THREADS]
+        final_out: wp.array2d[float],  # [T, THREADS]
+    ):
+        tile, thread = wp.tid()
+        start = ranges[tile][0]
+        x = float((tile % tiles_x) * TILE + thread % TILE) + 0.5
+        y = float((tile // tiles_x) * TILE + thread // TILE) + 0.5
+        walked = float(count[tile, thread])
+        t = begin(final[tile, thread])
+        color = wp.vec4(0.0)
+        for k in range(start, start + steps[tile]):
+            g = read(splats[instances[k]], slots, k, thread)
+            z = exponent(g[0] - x, g[1] - y, g[2], g[3], g[4])
+            raw = exp2_known(z, exp2_value(z)) * g[5]
+            alpha = opaque(raw, alpha_min, float(k - start), walked)
+            if wp.static(mode == "stored"):
+                front = front_of_kept(t, kept, k, thread)
+            else:
+                front = front_of(t, alpha)
+            w = alpha * front
+            if wp.static(depth):
+                color += wp.vec4(g[6], g[7], g[8], g[9]) * w
+            else:
+                color += wp.vec4(g[6], g[7], g[8], 0.0) * w
+            t = behind_of(front, w)
+        color_out[tile, thread] = color
+        final_out[tile, thread] = t
+
+    return walk

@@ -1,0 +1,1 @@
+"""From 3D Gaussians to an image and back to their gradients, for torch."""

@@ -1,0 +1,220 @@
+"""From 3D Gaussians to an image, differentiable in torch: project, bin, blend, and the adjoints of the first and last.
+
+Two autograd functions, so that what lies between them (the 2D means above all, whose gradient steers densification)
+are torch tensors with gradients of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.raster.adjoints import gather
+from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
+from warp_splat.raster.cpu import adjoint_of_lanes, blend_lanes
+from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
+from warp_splat.raster.project import Project, camera_view
+from warp_splat.runtime.launch import stage
+
+
+@dataclass
+class Dropped:
+    """What the adjoint refused to spread: counted during ``backward``, where that ran, and read when asked for."""
+
+    pixel_count: int | torch.Tensor = 0
+    gaussian_count: int | torch.Tensor = 0
+
+    @property
+    def pixels(self) -> int:
+        """Pixels whose upstream gradient was not finite."""
+        return int(self.pixel_count)
+
+    @property
+    def gaussians(self) -> int:
+        """Gaussians whose own gradient was not finite."""
+        return int(self.gaussian_count)
+
+
+@dataclass
+class RenderOutput:
+    """What :func:`rasterize` returns; H x W pixels, N Gaussians."""
+
+    image: torch.Tensor  # [H, W, 3]
+    alpha: torch.Tensor  # [H, W], 1 - transmittance
+    depth: torch.Tensor | None  # [H, W] world units, expected z (0 where alpha is 0), if asked for
+    means2d: torch.Tensor  # [N, 2] px; 0 if culled
+    radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
+    conics: torch.Tensor  # [N, 3] 1/px^2, (xx, xy, yy) of the inverse 2D covariance; 0 if culled, as all that follow
+    colors: torch.Tensor  # [N, 3]
+    depths: torch.Tensor  # [N] world units, z in the camera
+    opacities2d: torch.Tensor  # [N] after antialiasing
+    invalid_count: int | torch.Tensor  # see `invalid`; on a GPU, reading it waits for the image
+    dropped: Dropped = field(default_factory=Dropped)
+
+    @property
+    def invalid(self) -> int:
+        """Gaussians left out because an input was not finite or a quaternion was zero."""
+        return int(self.invalid_count)
+
+
+def rasterize(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    camera: Camera,
+    background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    adjoint: str = "manual",
+    options: RasterOptions | None = None,
+) -> RenderOutput:
+    """Render Gaussians through a camera (Kerbl et al. 2023), differentiable in every tensor given.
+
+    Args:
+        means: centres, [N, 3] float32, world units.
+        quats: rotations (w, x, y, z), [N, 4], any norm; a Gaussian whose quaternion is zero is left out.
+        scales: standard deviations along the axes, [N, 3], positive, world units.
+        opacities: [N], in 0..1.
+        sh: spherical-harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16; or the pair ([N, 1, 3], [N, K-1, 3])
+            as trainers keep them, which saves a copy. Color = max(0, 0.5 + sum of coefficients times basis).
+        camera: pinhole camera, world to camera in COLMAP's axes.
+        background: RGB behind everything; a tensor [3] receives a gradient.
+        adjoint: how the pixel loop is differentiated; one image, one gradient up to rounding. "manual": by hand.
+            "stepwise": reverse loop by hand, its body by Warp. "reversible": the whole loop by Warp, transmittance
+            recovered by division, as in the two before. "stored": likewise, every transmittance kept in memory.
+        options: what to compute; see :class:`RasterOptions`.
+
+    Returns:
+        A :class:`RenderOutput`. ``image``, ``alpha``, ``depth`` and all that lies on the way to them (``means2d``,
+        ``conics``, ``colors``, ``depths``, ``opacities2d``) carry gradients. A pixel whose
+        upstream gradient is not finite is dropped, as is a Gaussian's gradient that is not finite; both are counted
+        in ``dropped``.
+
+    Raises:
+        InputError: if a shape, dtype, device or value is not as stated (the message names the argument), or if the
+            memory does not suffice for "stored".
+    """
+    return _checked(means, quats, scales, opacities, sh, [camera], background, adjoint, options)[0]
+
+
+def rasterize_views(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
+    cameras: Sequence[Camera],
+    background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    adjoint: str = "manual",
+    options: RasterOptions | None = None,
+) -> list[RenderOutput]:
+    """:func:`rasterize` through each of ``cameras``, which may differ in size; the Gaussians are checked but once.
+
+    Outputs and gradients are those of separate calls, bit for bit. Without gradients an output keeps 56 bytes per
+    Gaussian besides its image; with gradients it keeps what its adjoint reads, until that has run.
+
+    Args:
+        means: as in :func:`rasterize`, like all but ``cameras``.
+        quats: [N, 4].
+        scales: [N, 3].
+        opacities: [N].
+        sh: [N, K, 3], or the pair.
+        cameras: any number.
+        background: RGB, the same in all images.
+        adjoint: how the pixel loop is differentiated.
+        options: what to compute.
+
+    Returns:
+        A :class:`RenderOutput` for each camera, in their order.
+
+    Raises:
+        InputError: as :func:`rasterize` does.
+    """
+    if isinstance(cameras, Camera) or not isinstance(cameras, Sequence):
+        raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
+    return _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options)
+
+
+def _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options) -> list[RenderOutput]:
+    """See :func:`rasterize_views`."""
+    for camera in cameras:
+        check_camera(camera)
+    options = check_options(adjoint, options)
+    gaussians = check_gaussians(means, quats, scales, opacities, sh)
+    background = check_background(background, means.device)
+    outputs = []
+    for camera in cameras:
+        outputs.append(render(gaussians, camera, background, options, adjoint))
+        if outputs[-1].invalid:
+            explain_invalid(outputs[-1].invalid, gaussians[1])
+    return outputs
+
+
+def render(
+    gaussians: tuple[torch.Tensor, ...],
+    camera: Camera,
+    background: torch.Tensor,
+    options: RasterOptions,
+    adjoint: str = "manual",
+) -> RenderOutput:
+    """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted."""
+    dropped = Dropped()
+    with stage("project"):
+        means2d, conics, opacities2d, colors, depths, extents, radii = Project.apply(
+            *gaussians, camera_view(camera, gaussians[5].shape[1], options), dropped
+        )
+    with stage("bin"):
+        bins = bin_tiles(means2d, conics, opacities2d, colors, depths, extents, radii, camera, options)
+    with stage("blend"):
+        image, alpha, depth = Blend.apply(
+            means2d, conics, opacities2d, colors, depths, background, bins, camera, options, adjoint, dropped
+        )
+    if options.depth:
+        depth = depth / alpha.clamp_min(1e-10)
+    return RenderOutput(
+        image=image,
+        alpha=alpha,
+        depth=depth if options.depth else None,
+        means2d=means2d,
+        radii=radii.clamp_min(0),
+        conics=conics,
+        colors=colors,
+        depths=depths,
+        opacities2d=opacities2d,
+        invalid_count=bins.invalid,
+        dropped=dropped,
+    )
+
+
+class Blend(torch.autograd.Function):
+    """2D Gaussians to pixels, in lanes on the CPU and in blocks on a GPU; the adjoint walks the lists back to front."""
+
+    @staticmethod
+    def forward(ctx, means2d, conics, opacities, colors, depths, background, bins, camera, options, adjoint, dropped):
+        blend = blend_blocks if means2d.is_cuda else blend_lanes
+        keep = adjoint == "stored" and any(ctx.needs_input_grad)
+        background = background.contiguous()
+        image, alpha, depth, saved = blend(bins, camera, background, options, keep)
+        ctx.save_for_backward(background, *saved)
+        ctx.bins, ctx.options, ctx.adjoint, ctx.dropped = bins, options, adjoint, dropped
+        ctx.gaussian_count = len(means2d)
+        return image, alpha, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_image, adj_alpha, adj_depth):
+        with stage("adjoint of blend"):
+            background, *saved = ctx.saved_tensors
+            bins, adj_pixels = ctx.bins, [adj.contiguous() for adj in (adj_image, adj_alpha, adj_depth)]
+            adjoint = adjoint_of_blocks if adj_image.is_cuda else adjoint_of_lanes
+            slots, adj_background, bad = adjoint(ctx.adjoint, bins, ctx.options, background, saved, *adj_pixels)
+            ctx.dropped.pixel_count += bad.sum()
+            grads = gather(bins, slots, ctx.gaussian_count)
+        return *grads, adj_background, None, None, None, None, None

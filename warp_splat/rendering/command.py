@@ -1,0 +1,243 @@
+"""Pictures of a trained model: its views with their metrics, or frames along a way, as a video or timed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from warp_splat.camera import Camera
+from warp_splat.color import to_bytes
+from warp_splat.config import RasterOptions, RenderConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluation.perceptual import choose_metrics
+from warp_splat.evaluation.views import describe, evaluate_views, show_views, write_views
+from warp_splat.formats import model_folder
+from warp_splat.formats.png import save_png, save_video
+from warp_splat.formats.splats import SplatFile
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import render as render_gaussians
+from warp_splat.raster.selftest import settle_device
+from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
+from warp_splat.runtime import launch
+from warp_splat.runtime.devices import memory_explained
+from warp_splat.scene import load_scene
+from warp_splat.scene.types import Scene
+
+OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}
+WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
+
+
+def render(config: RenderConfig) -> int:
+    """Render as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the model, its scene or an option is not usable.
+    """
+    say = (lambda *_: None) if config.quiet else print
+    _check(config)
+    metrics, absent = choose_metrics(config.lpips_weights)
+    device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
+    folder, iteration, gaussians, trained = _open(config)
+    model = GaussianModel.from_splats(gaussians.splats).arranged()
+    scene = None
+    if _needs_scene(config):
+        scene = load_trained_scene(config.model_path, config.source_path, trained, say)
+    options, linear = options_of(trained), is_linear(scene, trained)
+    say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
+    with _memory_explained(device, model, None if config.orbit else scene):
+        picture = make_picture(model.to(device), bool(trained.get("white_background")), options, linear)
+        if config.orbit or config.video:
+            output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
+            _film(picture, _cameras(config, scene), output, config)
+        elif scene:
+            evaluate = partial(evaluate_views, extra={"split": "test", "gaussians": len(model)}, metrics=metrics)
+            for sentence in absent:
+                say(sentence)
+            _write_splits(picture, scene, config, folder, iteration, evaluate, say)
+    return 0
+
+
+def _check(config: RenderConfig) -> None:
+    if config.orbit and config.video:
+        raise InputError(f"--orbit, --video {config.video}: expected one of them; leave the other out.")
+    if config.video_output and not (config.orbit or config.video):
+        raise InputError(f"--video_output {config.video_output}: expected --video or --orbit beside it.")
+    if config.frames < 1:
+        raise InputError(f"--frames: expected at least 1, got {config.frames}.")
+    if config.frames != RenderConfig.frames and not config.video:
+        raise InputError(f"--frames {config.frames}: expected --video beside it.")
+    suffix = Path(config.video_output).suffix.lower()
+    if suffix in OTHER_VIDEOS:
+        raise InputError(f"--video_output {config.video_output}: expected .mp4 or a folder, found {suffix}; rename it.")
+
+
+def _needs_scene(config: RenderConfig) -> bool:
+    """Whether cameras of a scene are looked at: all but the timed orbit around the world's origin does."""
+    return not config.orbit or config.orbit_center == "focus"
+
+
+def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene | None):
+    """See :func:`memory_explained`; without a scene, the images are those of an orbit."""
+    views = [*scene.train, *scene.test] if scene else []
+    sizes = [(view.camera.width, view.camera.height) for view in views] or [ORBIT_SIZE]
+    fewer = ["trained with fewer Gaussians (--max_gaussians)", *(["on smaller images (-r)"] if scene else [])]
+    elsewhere = ", or use --device cpu" if device.type == "cuda" else ""
+    return memory_explained(device, model, sizes, f"render a model {' or '.join(fewer)}{elsewhere}")
+
+
+def _write_splits(
+    picture: Callable[[Camera], np.ndarray],
+    scene: Scene,
+    config: RenderConfig,
+    folder: Path,
+    iteration: int,
+    evaluate: Callable,
+    say: Callable[[str], None],
+) -> None:
+    """The views of both splits, and what ``evaluate`` finds of those held out."""
+    if scene.train and not config.skip_train:
+        write_views(picture, scene.train, folder / "train" / f"ours_{iteration}")
+        print(f"  train  {len(scene.train)} views in {folder / 'train' / f'ours_{iteration}'}")
+    if scene.test and not config.skip_test:
+        means, compared = evaluate(picture, scene.test, folder, "test", iteration)
+        show_views(compared, folder, "test", iteration, say)
+        print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
+        print(f"  {describe(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
+
+
+def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
+    """The folder for the images, the iteration, the Gaussians and the options of the training.
+
+    A file of Gaussians has no folder and no training: its images go beside it, every 8th view is held out.
+    """
+    if not config.model_path:
+        raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
+    path = Path(config.model_path)
+    is_file = model_folder.is_file_of_gaussians(path)
+    if is_file and not config.source_path and _needs_scene(config):
+        raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
+    return Path(f"{path}.renders") if is_file else path, *model_folder.open_model(path, config.iteration)
+
+
+def options_of(trained: dict) -> RasterOptions:
+    """How a model is rendered that was trained with these options."""
+    return RasterOptions(
+        antialiasing=bool(trained.get("antialiasing")),
+        projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
+    )
+
+
+def is_linear(scene: Scene | None, trained: dict) -> bool:
+    """Whether the colors of a model are in linear light: those of its scene, or else what its training says."""
+    return scene.linear if scene else bool(trained.get("linear_light"))
+
+
+def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Callable[[str], object]) -> Scene:
+    """The scene that a model was trained on, as it was loaded then.
+
+    Args:
+        model_path: the model, for messages.
+        source_path: where the scene is now; empty: where it was.
+        trained: options of the training.
+        say: receives what there is to say.
+
+    Raises:
+        InputError: as :func:`load_scene`, or if it is not known which scene that is.
+    """
+    trained_on = str(trained.get("source_path", ""))
+    source = source_path or trained_on
+    if not source:
+        raise InputError(f"{model_path}: it does not say what it was trained on; name the scene with -s.")
+    if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):
+        say(f"The scene is {source}; the model was trained on {trained_on}.")
+    resolution = trained.get("resolution", -1)
+    if not isinstance(resolution, int):
+        raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
+    return load_scene(
+        source,
+        images=str(trained.get("images", "images")),
+        resolution=resolution,
+        white_background=bool(trained.get("white_background")),
+        eval=bool(trained.get("eval")),
+        invert_masks=bool(trained.get("invert_masks")),
+        report=say,
+    )
+
+
+def make_picture(
+    model: GaussianModel, white_background: bool, options: RasterOptions, linear: bool = False
+) -> Callable[[Camera], np.ndarray]:
+    """A function from a camera to the model's image, [H, W, 3] uint8; ``linear``: its colors are in linear light."""
+    background = torch.full((3,), float(white_background), device=model.device)
+    with torch.no_grad():
+        gaussians = model.activated()
+
+    def picture(camera: Camera) -> np.ndarray:
+        with torch.no_grad():
+            return to_bytes(render_gaussians(gaussians, camera, background, options).image, linear)
+
+    return picture
+
+
+def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:
+    """Those of ``--orbit`` or of ``--video``; a video has the size and the focal lengths of the first photograph."""
+    if scene is None:
+        return origin_orbit(TIMED)
+    if config.orbit:
+        return focus_orbit(scene, TIMED)
+    lens = scene.train[0].camera
+    if config.video == "spiral":
+        return spiral_cameras(scene, config.frames, lens)
+    if config.video == "path":
+        return path_cameras(scene, config.frames, lens)
+    return (
+        origin_orbit(config.frames, lens)
+        if config.orbit_center == "origin"
+        else focus_orbit(scene, config.frames, lens)
+    )
+
+
+def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output: str, config: RenderConfig) -> None:
+    """Render a frame from each camera and keep it, if ``output`` says where; ``--orbit`` times them before."""
+    if config.orbit:
+        for camera in cameras[:WARM_UP]:
+            picture(camera)
+        start = time.perf_counter()
+        rendered = [picture(camera) for camera in cameras]
+        seconds = time.perf_counter() - start
+        size = f"{cameras[0].width} x {cameras[0].height}"
+        print(f"{len(rendered)} frames at {size} in {seconds:.2f} s: {len(rendered) / seconds:.1f} frames per second")
+    else:
+        rendered = map(picture, tqdm(cameras, disable=config.quiet, unit="frame"))
+    frames = _watched(rendered)
+    if Path(output).suffix.lower() == ".mp4":
+        save_video(output, frames, FPS)
+    elif output:
+        folder = model_folder.prepare(output)
+        for index, frame in enumerate(frames):
+            save_png(folder / f"{index:05d}.png", frame)
+        older = len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)
+        if older > 0:
+            print(f"Warning: {older} older frames are in {folder}, too.")
+    else:
+        for _ in frames:
+            pass
+    if output:
+        print(f"  frames in {output}")
+
+
+def _watched(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The same frames; says so if all of them were empty."""
+    contrast = 0
+    for frame in frames:
+        contrast = max(contrast, int(frame.max()) - int(frame.min()))
+        yield frame
+    if contrast == 0:
+        print("Every frame is empty: no Gaussian lies on the way; try --orbit_center focus.")

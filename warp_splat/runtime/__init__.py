@@ -1,0 +1,1 @@
+"""Threads, devices, processes and signals: what every computation runs on."""

@@ -1,0 +1,184 @@
+"""Processes that train one model together, as ``torchrun`` starts them: what they exchange, and how they end.
+
+Data parallelism: each process holds the whole model and differentiates another view; the mean of the gradients makes
+the same step everywhere. Nothing is sent afterwards: the models stay the same bytes because every decision is made
+from numbers that are, and :meth:`Processes.check_identical` proves it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+
+import torch
+import torch.distributed as dist
+
+from warp_splat.errors import InputError
+from warp_splat.runtime.devices import is_out_of_memory
+from warp_splat.runtime.launch import stage
+
+PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
+
+
+class GroupError(InputError):
+    """The processes cannot go on together: one has ended, or their models differ."""
+
+
+class Processes:
+    """A process that trains alone: nothing is exchanged.
+
+    Attributes:
+        rank: number of this process; 0 prints, evaluates and saves.
+        count: of all processes; images in a step, by which an iteration number grows.
+        local_count: of those on this machine.
+        lost: whether another process went away, so that this one saves whatever its rank.
+    """
+
+    rank, count, local_count, lost = 0, 1, 1, False
+
+    def reaches(self, iteration: int, marks: Iterable[int]) -> bool:
+        """Whether one of ``marks`` is among the iterations of the step that ends with ``iteration``."""
+        return any(0 <= iteration - mark < self.count for mark in marks)
+
+    def average(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Replace the tensors by their means over the processes."""
+
+    def sum(self, tensor: torch.Tensor) -> None:
+        """Replace ``tensor`` by its sum over the processes."""
+
+    def maximum(self, tensor: torch.Tensor) -> None:
+        """Replace each element of ``tensor`` by its largest value in any process."""
+
+    def largest(self, value: int) -> int:
+        """The largest ``value`` of all processes."""
+        return value
+
+    def gather(self, tensor: torch.Tensor) -> torch.Tensor:
+        """The tensors of all processes, stacked: [count, ...]."""
+        return tensor[None]
+
+    def first(self, text: str) -> str:
+        """What process 0 calls ``text``."""
+        return text
+
+    def check_identical(self, tensors: Iterable[torch.Tensor], iteration: int) -> None:
+        """Compare the bytes of ``tensors`` over the processes. Raises GroupError if they differ."""
+
+
+ALONE = Processes()
+
+
+class ProcessGroup(Processes):
+    """One of several processes, all of which call the same methods in the same order.
+
+    Raises:
+        GroupError: from every method, if another process has ended or is silent for longer than PATIENCE.
+    """
+
+    def __init__(self, rank: int, count: int, local_count: int):
+        self.rank, self.count, self.local_count = rank, count, local_count
+
+    def average(self, tensors: Sequence[torch.Tensor]) -> None:
+        with stage("all-reduce"):
+            flat = torch.cat([tensor.reshape(-1) for tensor in tensors])  # one exchange: each waits for all processes
+            self.sum(flat)
+            flat /= self.count
+            for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
+                tensor.copy_(mean.view(tensor.shape))
+
+    def sum(self, tensor: torch.Tensor) -> None:
+        self._exchange(dist.all_reduce, tensor, dist.ReduceOp.SUM)
+
+    def maximum(self, tensor: torch.Tensor) -> None:
+        self._exchange(dist.all_reduce, tensor, dist.ReduceOp.MAX)
+
+    def largest(self, value: int) -> int:
+        found = torch.tensor([value], dtype=torch.int32)
+        self.maximum(found)
+        return int(found)
+
+    def gather(self, tensor: torch.Tensor) -> torch.Tensor:
+        found = [torch.empty_like(tensor) for _ in range(self.count)]
+        self._exchange(dist.all_gather, found, tensor)
+        return torch.stack(found)
+
+    def first(self, text: str) -> str:
+        box = [text]
+        self._exchange(dist.broadcast_object_list, box, 0)
+        return box[0]
+
+    def check_identical(self, tensors: Iterable[torch.Tensor], iteration: int) -> None:
+        digest = hashlib.sha256()
+        for tensor in tensors:
+            digest.update(tensor.detach().cpu().contiguous().numpy().data)
+        own = torch.tensor(list(digest.digest()), dtype=torch.uint8)
+        names = [bytes(other.tolist()).hex()[:8] for other in self.gather(own)]
+        if len(set(names)) > 1:
+            raise GroupError(
+                f"Process {self.rank}: expected the same model in all {self.count} processes after {iteration} "
+                f"iterations, found SHA-256 {', '.join(names)} (rank 0, 1, ...); give all the same scene, processors "
+                "or GPUs of one kind, and the same versions of torch and Warp."
+            )
+
+    def _exchange(self, collective: Callable, *arguments) -> None:
+        try:
+            collective(*arguments)
+        except RuntimeError as error:
+            if is_out_of_memory(error):
+                raise
+            self.lost = True
+            silent = any(words in str(error).lower() for words in ("timed out", "timeout"))
+            what = f"was silent for {PATIENCE.seconds // 60} minutes" if silent else "has ended"
+            raise GroupError(
+                f"Process {self.rank}: expected an answer from all {self.count} processes, but one {what}; see which "
+                "one, and why, in its own message or in torchrun's report."
+            ) from error
+
+
+@contextmanager
+def join(device: str) -> Iterator[Processes]:
+    """The processes that ``torchrun`` started, for as long as the block runs; without it, this one alone.
+
+    Args:
+        device: "auto", "cpu" or "cuda"; on GPUs, each process of a machine takes another one.
+
+    Raises:
+        InputError: if a machine has fewer GPUs than processes, or the processes do not find each other.
+    """
+    if os.environ.get("WORLD_SIZE", "1") == "1":
+        yield ALONE
+        return
+    try:
+        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+        rank, count, local_rank, local_count = (int(os.environ[name]) for name in names)
+    except (KeyError, ValueError) as error:
+        raise InputError(
+            f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
+            f"({error}); start several processes with torchrun, or unset it."
+        ) from error
+    # torch loads this later anyhow, and functions of it have the group that there is then as a default: nothing would
+    # end it, nor the threads of gloo, which abort a process that shuts down around them
+    import torch.distributed.nn  # noqa: PLC0415 - only of use here
+
+    backend = "gloo"
+    if device != "cpu" and torch.cuda.is_available():
+        if local_count > torch.cuda.device_count():
+            raise InputError(
+                f"--nproc-per-node {local_count}: expected at most as many processes as GPUs, found "
+                f"{torch.cuda.device_count()}; start fewer, or use --device cpu."
+            )
+        torch.cuda.set_device(local_rank)
+        backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() else backend
+    try:
+        dist.init_process_group(backend, timeout=PATIENCE)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges ({str(error).splitlines()[0]})."
+        ) from error
+    try:
+        yield ProcessGroup(rank, count, local_count)
+    finally:
+        dist.destroy_process_group()

@@ -1,0 +1,359 @@
+"""The only place that calls ``wp.launch``: threads, slices, streams, timers, and views of torch tensors.
+
+A Warp launch on the CPU runs on the thread that makes it and releases the interpreter's lock. Every kernel here takes
+the first index of its slice, so that a pool of threads can share a launch. A kernel writes each element from one
+index only; hence the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on torch's
+current stream: kernels of Warp and of torch follow each other in the order of the calls.
+
+All memory is torch's, on either device: what a stage frees, its caching allocator gives to the next.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import functools
+import itertools
+import os
+import queue
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from numbers import Integral
+
+import psutil
+import torch
+import warp as wp
+
+from warp_splat.config import CORES
+from warp_splat.errors import InputError
+from warp_splat.runtime.devices import choose_device
+
+BLOCK = 256  # threads of a block: one per pixel of a tile
+MOST_THREADS = 1024
+SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
+SMALLEST_OF_TORCH = 2**16  # likewise, of rows for torch, which takes less time and more of the interpreter's lock
+WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
+
+_threads = CORES
+_helpers: list[threading.Thread] = []
+_jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+_seconds: dict[str, float] | None = None
+
+
+class _Job:
+    """Slices of one launch, or of other work, shared by the threads: whoever is free takes the next one.
+
+    A launch takes tenths of a millisecond, so what a thread costs counts: the caller waits for helpers that are at
+    work, but not for those that have not woken yet (Tried: an executor's futures, 0.1 ms per launch, 2 ms a step;
+    arguments packed once for all slices, no difference).
+    """
+
+    def __init__(self, slices: list[Callable[[], None]]):
+        self.slices = slices[::-1]
+        self.lock, self.idle = threading.Lock(), threading.Event()
+        self.idle.set()
+        self.helping = 0
+        self.error: BaseException | None = None
+
+    def share(self, helpers: int) -> None:
+        """The caller's part: call ``helpers``, run slices until there are no more, wait for those that are at work.
+
+        An error or Ctrl-C is raised only then: nobody may still write into tensors that the caller is about to free.
+        """
+        error = None
+        while True:
+            try:
+                for _ in range(helpers):
+                    _jobs.put(self)
+                self._run_slices()
+                self.idle.wait()
+                break
+            except BaseException as raised:  # Ctrl-C comes at any of these lines, mostly while waiting
+                error, helpers = raised, 0
+                self.slices.clear()
+        if error or self.error:
+            try:
+                raise error or self.error
+            finally:  # or its traceback, which knows this frame, would keep the callers' tensors in a cycle
+                error = self.error = None
+
+    def _run_slices(self) -> None:
+        while True:
+            try:
+                run = self.slices.pop()  # one step, hence safe without the lock
+            except IndexError:
+                return
+            run()
+
+    def help(self) -> None:
+        """A helper's part."""
+        with self.lock:
+            if not self.slices:
+                return
+            self.helping += 1
+            self.idle.clear()
+        try:
+            self._run_slices()
+        except BaseException as error:
+            self.error = error
+        finally:
+            with self.lock:
+                self.helping -= 1
+                if not self.helping:
+                    self.idle.set()
+
+
+@torch.no_grad()
+def _help() -> None:
+    """What a helper thread does: job after job."""
+    while (job := _jobs.get()) is not None:
+        job.help()
+
+
+@atexit.register
+def _end_helpers() -> None:
+    """Before the interpreter ends: a thread that wakes in its last moments aborts the process."""
+    for _ in _helpers:
+        _jobs.put(None)
+    for helper in _helpers:
+        helper.join(1.0)
+
+
+def _forget_helpers() -> None:
+    """A forked child inherits the list but not the threads."""
+    global _jobs
+    _helpers.clear()
+    _jobs = queue.SimpleQueue()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_helpers)
+
+
+def get_threads() -> int:
+    """Number of threads that work on the CPU may use."""
+    return _threads
+
+
+def set_threads(count: int) -> None:
+    """Use ``count`` threads (1 to 1024) on the CPU. Results do not depend on it.
+
+    Raises:
+        InputError: if ``count`` is not a whole number, or out of that range.
+    """
+    global _threads
+    if isinstance(count, bool) or not isinstance(count, Integral) or not 1 <= count <= MOST_THREADS:
+        raise InputError(f"threads: expected a whole number, 1 to {MOST_THREADS}, got {count!r}.")
+    _threads = int(count)
+
+
+def prepare(device: str, threads: int) -> torch.device:
+    """Set up the process for a run: Warp's messages, torch's threads, number of threads (0: all cores), memory.
+
+    Args:
+        device: "auto", "cpu" or "cuda".
+        threads: of CPU launches.
+
+    Returns:
+        The device to work on.
+
+    Raises:
+        InputError: if that device cannot be used here; the message says why.
+    """
+    wp.config.log_level = wp.LOG_ERROR  # no list of devices and modules
+    chosen = choose_device(device)
+    # torch: one thread. Its sums would depend on the number of threads, and its idle threads would spin beside ours,
+    # which call torch as well and share its work on many rows (torch_slices)
+    torch.set_num_threads(1)
+    if threads:
+        set_threads(threads)
+    _keep_freed_memory()
+    return chosen
+
+
+def _keep_freed_memory() -> None:
+    """Let glibc reuse what a step frees instead of returning it to the system and faulting it in again.
+
+    A step allocates tens of megabytes; first touches of fresh pages cost 1 to 5 us each on virtual machines, up to
+    half of a step. Elsewhere than on glibc nothing happens.
+    """
+    try:
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+    except (OSError, AttributeError):
+        return
+    m_trim_threshold, m_mmap_max = -1, -4  # of malloc.h
+    mallopt(m_mmap_max, 0)
+    mallopt(m_trim_threshold, 2**31 - 1)
+
+
+def available_memory(device: torch.device) -> int:
+    """Bytes that can be had on ``device``: without swapping, or with what torch holds in reserve."""
+    if device.type == "cpu":
+        return psutil.virtual_memory().available
+    reserve = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + reserve
+
+
+def even_slices(dim: int, smallest: int = SMALLEST_SLICE) -> list[int]:
+    """Bounds of one slice per thread of ``dim`` equal pieces of work, none much below ``smallest``."""
+    parts = max(1, min(_threads, dim // smallest))
+    return [dim * part // parts for part in range(parts + 1)]
+
+
+def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
+    """:func:`even_slices` of work that torch does; a single one where it has threads of its own, or works on a GPU.
+
+    In multiples of WIDTH: what is left over at the end of a slice, torch may round in another way.
+    """
+    if torch.get_num_threads() > 1 or torch.device(device).type == "cuda":
+        return [0, dim]
+    return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_OF_TORCH // WIDTH)]
+
+
+def launch(
+    kernel: wp.Kernel,
+    dim: int,
+    inputs: Sequence,
+    outputs: Sequence = (),
+    *,
+    bounds: list[int] | None = None,
+    beside: Callable[[], None] | None = None,
+    device: torch.device | str = "cpu",
+    **adjoint,
+) -> None:
+    """Launch ``kernel`` on ``dim`` indices, sliced over the threads of the CPU, or at once on a GPU.
+
+    Args:
+        kernel: takes the first index of its slice before ``inputs``.
+        dim: number of indices; nothing happens for 0.
+        inputs: Warp arrays, :func:`view` results, structs or scalars.
+        outputs: likewise.
+        bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
+        beside: other work, done at the same time where threads share the launch, else before it.
+        device: of the tensors behind ``inputs`` and ``outputs``.
+        adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
+    """
+    on_gpu, bounds = torch.device(device).type == "cuda", bounds or even_slices(dim)
+    if beside and (on_gpu or len(bounds) <= 2):  # nothing to share
+        beside()
+        beside = None
+    if dim == 0:
+        return
+    if adjoint:
+        adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
+    if on_gpu:
+        wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, stream=_stream(device), **adjoint)
+        return
+
+    def run(low: int, high: int) -> None:
+        wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
+
+    if len(bounds) > 2:
+        wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
+    in_slices(run, bounds, beside)
+
+
+def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callable[[], None] | None = None) -> None:
+    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU, and ``beside`` first.
+
+    Slices must write different elements. Helpers record no gradients.
+    """
+    if torch.is_inference_mode_enabled():  # which is each thread's own
+        run = torch.inference_mode()(run)
+    # each with its function: a helper that sleeps or comes late knows its job, which must not keep tensors alive
+    slices = [partial(run, low, high) for low, high in itertools.pairwise(bounds) if high > low]
+    if beside:
+        slices.insert(0, beside)
+    helpers = min(_threads, len(slices)) - 1
+    if helpers <= 0:
+        for call in slices:
+            call()
+        return
+    while len(_helpers) < helpers:
+        _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
+        _helpers[-1].start()
+    _Job(slices).share(helpers)
+
+
+def load(kernel: wp.Kernel, device: torch.device) -> None:
+    """Compile and load ``kernel``, and what else is in its module."""
+    wp.load_module(kernel.module, device=wp.device_from_torch(device))
+
+
+def launch_blocks(
+    kernel: wp.Kernel, blocks: int, inputs: Sequence, outputs: Sequence, device: torch.device | str, **adjoint
+) -> None:
+    """Launch ``kernel``, which uses tiles of Warp, on ``blocks`` blocks of BLOCK threads; nothing happens for 0.
+
+    With ``adj_inputs`` and ``adj_outputs``, the generated adjoint instead.
+    On the CPU that is a check of the kernels and no way to work: only ``wp.config.enable_cpu_blocks`` makes a block of
+    more than one thread there, out of slow fibers.
+    """
+    if blocks == 0:
+        return
+    where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
+    if adjoint:
+        where["adjoint"] = True
+    wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, block_dim=BLOCK, **where, **adjoint)
+
+
+def _stream(device: torch.device | str) -> wp.Stream:
+    """Torch's current stream as one of Warp's."""
+    return _wrap(torch.cuda.current_stream(device))
+
+
+@functools.cache  # one per stream in use, mostly one: wrapping costs tens of microseconds
+def _wrap(stream: torch.cuda.Stream) -> wp.Stream:
+    return wp.stream_from_torch(stream)
+
+
+def view(tensor: torch.Tensor, dtype):
+    """``tensor`` as a kernel argument of element type ``dtype``, without a copy. The caller keeps the tensor alive."""
+    return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+
+
+def empty(count: int, dtype, device: torch.device | str) -> wp.array:
+    """A Warp array of ``count`` elements in memory of torch's that lives as long as the array."""
+    memory = torch.empty(count * wp.types.type_size_in_bytes(dtype), dtype=torch.uint8, device=device)
+    array = wp.array(
+        ptr=memory.data_ptr(), dtype=dtype, shape=count, device=wp.device_from_torch(memory.device), copy=False
+    )
+    array._tensor = memory  # pyright: ignore[reportAttributeAccessIssue] - as wp.from_torch does
+    return array
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Name the block for whoever reads its errors; add its time to stage ``name``, if :func:`profile` is on."""
+    start, table = _now(), _seconds
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:  # of what ran out of memory, one wants to know where
+        error.add_note(f"in stage '{name}'")
+        raise
+    finally:
+        if table is not None:
+            table[name] += _now() - start
+
+
+def _now() -> float:
+    """Seconds on the clock of :func:`profile`; while that is on, once the GPU has done what it was given."""
+    if _seconds is not None and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+@contextmanager
+def profile(active: bool = True) -> Iterator[dict[str, float]]:
+    """Collect the seconds spent in each :func:`stage` while the block runs (unless not ``active``)."""
+    global _seconds
+    before, collected = _seconds, defaultdict(float)
+    _seconds = collected if active else None
+    try:
+        yield collected
+    finally:
+        _seconds = before

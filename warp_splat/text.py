@@ -1,0 +1,39 @@
+"""Tables as text."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from warp_splat.errors import InputError
+
+NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
+
+
+def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table that reads well in a terminal and is Markdown: columns padded, columns of numbers to the right.
+
+    Args:
+        headers: one for each column.
+        rows: cells, written by ``str``; the first column is always text.
+
+    Raises:
+        InputError: if a row has another length than the headers.
+    """
+    table = [[str(cell).replace("|", "\\|") for cell in row] for row in (headers, *rows)]
+    if any(len(row) != len(headers) for row in table):
+        raise InputError(f"rows: expected {len(headers)} cells each, got {sorted({len(row) for row in table})}.")
+    widths = [max(3, *(len(cell) for cell in column)) for column in zip(*table, strict=True)]
+    right = [
+        index > 0 and all(NUMBER.fullmatch(cell) for cell in column[1:])
+        for index, column in enumerate(zip(*table, strict=True))
+    ]
+    rule = ["-" * (width - 1) + (":" if to_right else "-") for width, to_right in zip(widths, right, strict=True)]
+    lines = [
+        [
+            f"{cell:>{width}}" if to_right else f"{cell:<{width}}"
+            for cell, width, to_right in zip(row, widths, right, strict=True)
+        ]
+        for row in (table[0], rule, *table[1:])
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

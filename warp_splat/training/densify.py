@@ -1,0 +1,164 @@
+"""Growing and pruning the set (Kerbl et al. 2023, section 5.2), as the reference does it. Index logic, no kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from warp_splat.config import TrainConfig
+from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.gaussians import GaussianModel, along_curve
+from warp_splat.raster.api import RenderOutput
+from warp_splat.runtime.distributed import ALONE, Processes
+from warp_splat.runtime.launch import in_slices, torch_slices
+from warp_splat.training.optimizer import Optimizer
+
+PRUNE_OPACITY = 0.005
+RESET_OPACITY = 0.01
+PRUNE_EXTENT = 0.1  # share of the scene's extent above which a Gaussian is pruned, once opacities have been reset
+SPLIT_SHRINK = 1.6  # the children's scales are the parent's divided by this
+
+
+@dataclass
+class Change:
+    """What one densification did, in Gaussians."""
+
+    cloned: int
+    split: int
+    pruned: int
+    refused: bool = False  # pruning would have left nothing, so nothing was pruned
+
+
+class Densifier:
+    """Statistics of the gradients of the 2D means, and what follows from them: the same in all ``processes``."""
+
+    def __init__(
+        self,
+        model: GaussianModel,
+        optimizer: Optimizer,
+        config: TrainConfig,
+        extent: float,
+        processes: Processes = ALONE,
+    ):
+        self.model, self.optimizer, self.config, self.extent = model, optimizer, config, extent
+        self.processes = processes
+        self.random = torch.Generator().manual_seed(config.seed)
+        self._clear()
+
+    def _clear(self) -> None:
+        new = self.model.parameters["means"].new_zeros
+        self.gradient = new(len(self.model))  # sum over views of |dL/dmean2d|, NDC units
+        self.views = new(len(self.model))  # in which the Gaussian was drawn
+        self.radius = new(len(self.model), dtype=torch.int32)  # px, largest in any view
+
+    def observe(self, out: RenderOutput, width: int, height: int) -> None:
+        """Take in the gradient of one view's 2D means."""
+        grad = out.means2d.grad
+        if grad is None:
+            return
+
+        def run(low: int, high: int) -> None:
+            rows = slice(low, high)
+            x, y = (0.5 * size * grad[rows, axis] for axis, size in enumerate((width, height)))
+            self.gradient[rows] += torch.nan_to_num(torch.hypot(x, y), 0.0, 0.0, 0.0)
+            self.views[rows] += out.radii[rows] > 0
+
+        in_slices(run, torch_slices(len(grad), grad.device))
+        if self.config.prune_screen_size:
+            self.radius = torch.maximum(self.radius, out.radii)
+
+    def update(self, iteration: int) -> Change | None:
+        """Densify, prune and reset opacities if it is time; None if the set did not change."""
+        config, change, step = self.config, None, self.processes.count  # iterations in a step
+        if iteration >= config.densify_until_iter:
+            return None
+        if iteration > config.densify_from_iter and iteration % config.densification_interval < step:
+            change = self._densify(prune_large=iteration > config.opacity_reset_interval)
+        at_start = config.white_background and self.processes.reaches(iteration, [config.densify_from_iter])
+        if iteration % config.opacity_reset_interval < step or at_start:
+            self.optimizer.reset_opacities(RESET_OPACITY)
+        return change
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Statistics since the last densification, [R, N] with a row for each process, and the random state."""
+        gather = self.processes.gather
+        statistics = {"gradient": gather(self.gradient), "views": gather(self.views), "radius": gather(self.radius)}
+        found = {f"statistics.{name}": rows for name, rows in statistics.items()}
+        return {**found, "random.densification": self.random.get_state()}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Take what :meth:`state` gave from a checkpoint, for the present set; of any number of processes."""
+        rank, count = self.processes.rank, len(self.model)
+
+        def statistic(name: str, dtype: type) -> torch.Tensor:
+            rows = torch.from_numpy(checkpoint.array(f"statistics.{name}", (-1, count), dtype))
+            if len(rows) != self.processes.count:  # the first takes all
+                rows = rows.amax(0, keepdim=True) if name == "radius" else rows.sum(0, keepdim=True)
+                rows = torch.nn.functional.pad(rows, (0, 0, 0, self.processes.count - 1))
+            return rows[rank].to(self.model.device, copy=True)
+
+        self.gradient, self.views = statistic("gradient", np.float32), statistic("views", np.float32)
+        self.radius = statistic("radius", np.int32)
+        self.random.set_state(torch.from_numpy(checkpoint.generator("random.densification")))
+
+    def _densify(self, prune_large: bool) -> Change:
+        self.processes.sum(self.gradient)
+        self.processes.sum(self.views)
+        self.processes.maximum(self.radius)
+        raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
+        chosen = self._choose()
+        widest = torch.exp(raw["scales"]).amax(1)
+        splits = widest > self.config.percent_dense * self.extent
+        clone, split = chosen[~splits[chosen]], chosen[splits[chosen]]
+        added = self._children(raw, split)
+        added = {name: torch.cat([raw[name][clone], added[name]]) for name in raw}
+        keep, keep_added = self._survivors(raw, prune_large), self._survivors(added, prune_large)
+        if self.config.prune_screen_size and prune_large:
+            keep &= self.radius <= self.config.prune_screen_size
+        keep[split] = False
+        pruned = len(keep) + len(keep_added) - int(keep.sum()) - int(keep_added.sum()) - len(split)
+        if not bool(keep.any()) and not bool(keep_added.any()):  # an empty scene could never recover
+            self._clear()
+            return Change(0, 0, 0, refused=True)
+        self.optimizer.replace(keep.nonzero()[:, 0], {name: rows[keep_added] for name, rows in added.items()})
+        self.optimizer.arrange(along_curve(self.model.parameters["means"]))
+        self._clear()
+        return Change(len(clone), len(split), pruned)
+
+    def _choose(self) -> torch.Tensor:
+        """Gaussians whose mean gradient is over the threshold, ascending; the largest first where room is short."""
+        mean = self.gradient / self.views.clamp_min(1.0)
+        over = (mean >= self.config.densify_grad_threshold).nonzero()[:, 0]
+        room = max(self.config.max_gaussians - len(self.model), 0)
+        if self.config.max_gaussians and len(over) > room:
+            largest = torch.sort(mean[over], descending=True, stable=True).indices[:room]
+            over = torch.sort(over[largest]).values
+        return over
+
+    def _children(self, raw: dict[str, torch.Tensor], split: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Two samples of each Gaussian in ``split``, smaller than it."""
+        twice = split.repeat(2)
+        rows = {name: tensor[twice] for name, tensor in raw.items()}
+        sample = torch.randn(len(twice), 3, generator=self.random)  # on the host: one seed, one result on any device
+        offsets = torch.exp(rows["scales"]) * sample.to(rows["scales"].device)
+        rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
+        rows["scales"] = rows["scales"] - float(torch.tensor(SPLIT_SHRINK).log())
+        return rows
+
+    def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
+        keep = torch.sigmoid(raw["opacities"]) >= PRUNE_OPACITY
+        for tensor in raw.values():  # one that is not finite is left out of every image and would never be pruned else
+            keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
+        if prune_large:
+            keep &= torch.exp(raw["scales"]).amax(1) <= PRUNE_EXTENT * self.extent
+        return keep
+
+
+def rotate(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+    """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any norm but 0."""
+    unit = torch.nn.functional.normalize(quats, dim=1)
+    w, axis = unit[:, :1], unit[:, 1:]
+    twist = 2.0 * torch.linalg.cross(axis, vectors)
+    return vectors + w * twist + torch.linalg.cross(axis, twist)

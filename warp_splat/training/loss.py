@@ -1,0 +1,262 @@
+"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM); on the CPU, one pass over the rows of two images."""
+
+from __future__ import annotations
+
+import functools
+import math
+from numbers import Real
+
+import numpy as np
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from warp_splat.errors import InputError
+from warp_splat.kernels import ssim
+from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.runtime.launch import even_slices, launch, stage, view
+
+SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbours'
+FAR_APART = 10.0  # in units of an image's usual range
+
+
+def image_loss(
+    image: torch.Tensor,
+    target: torch.Tensor,
+    lambda_dssim: float = 0.2,
+    mask: torch.Tensor | None = None,
+    clamped: bool = False,
+) -> torch.Tensor:
+    """(1 - lambda) mean |image - target| + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), a scalar.
+
+    With a mask, both images are black where it is 0: nothing there has an influence or a gradient, and windows of SSIM
+    across its border compare what counts alone. The means stay those over all pixels, so that a pixel weighs the same
+    however many are masked, and thresholds of gradients keep their meaning.
+
+    Args:
+        image: [H, W, 3] float32, differentiable.
+        target: [H, W, 3] float32, or uint8 to be divided by 255.
+        lambda_dssim: share of the structural term, 0..1.
+        mask: [H, W, 1] uint8, 0 for pixels that do not count.
+        clamped: compare the image within 0..1, without a gradient where it lies outside.
+
+    Raises:
+        InputError: if the shapes differ, are not [H, W, 3] or hold no pixel, a type is another, or ``lambda_dssim``
+            lies outside 0..1.
+    """
+    if not isinstance(image, torch.Tensor) or not isinstance(target, torch.Tensor):
+        raise InputError(
+            f"image_loss: expected two tensors, got {type(image).__name__} and {type(target).__name__}; convert them."
+        )
+    for tensor in (image, target, mask):
+        if isinstance(tensor, torch.Tensor) and (tensor.layout, tensor.device) != (torch.strided, image.device):
+            raise InputError(
+                f"image_loss: expected dense tensors on one device, got one of {tensor.layout} on {tensor.device} "
+                f"beside an image on {image.device}; convert it."
+            )
+    if image.device.type not in ("cpu", "cuda"):
+        raise InputError(
+            f"image_loss: expected tensors on the CPU or an NVIDIA GPU, got one on {image.device}; convert it."
+        )
+    if not isinstance(lambda_dssim, Real) or not 0.0 <= lambda_dssim <= 1.0:
+        raise InputError(f"image_loss: expected lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}.")
+    if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
+        raise InputError(
+            f"image_loss: expected an image of float32 and a target of float32 or uint8, got {image.dtype} and "
+            f"{target.dtype}; convert them."
+        )
+    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS or not image.numel():
+        raise InputError(
+            f"image_loss: expected two images [H, W, 3] of one size, 1 x 1 or more, got {list(image.shape)} and "
+            f"{list(target.shape)}."
+        )
+    if mask is not None:
+        is_tensor = isinstance(mask, torch.Tensor)
+        if not is_tensor or mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1):
+            found = f"{list(mask.shape)} of {mask.dtype}" if is_tensor else type(mask).__name__
+            raise InputError(
+                f"image_loss: expected a mask, a tensor {[*image.shape[:2], 1]} of uint8, 0 for pixels that do not "
+                f"count, got {found}."
+            )
+        counts = mask != 0
+        image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))
+    if image.is_cuda:
+        return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
+    return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
+
+
+def loss_by_convolution(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float) -> torch.Tensor:
+    """:func:`image_loss` for a GPU: the formula of ``kernels.ssim`` in torch's convolutions, which derives it."""
+    with stage("loss"):
+        p, q = _centers(image, target)
+        # planes [3, H, W], dense: then grouped convolutions are torch's own, which do not round to TF32 as cuDNN's do
+        x, y = (
+            (picture / 255.0 if picture.dtype == torch.uint8 else picture).permute(2, 0, 1).contiguous() - center
+            for picture, center in ((image, p), (target, q))
+        )
+        m1, m2, e11, e22, e12 = _blur(torch.stack([x, y, x * x, y * y, x * y]))
+        s = _inside(image.shape[0], image.shape[1], image.device)
+        mu1, mu2 = m1 + p * s, m2 + q * s
+        var1 = e11 - m1 * m1 + (1.0 - s) * (2.0 * p * m1 + p * p * s)
+        var2 = e22 - m2 * m2 + (1.0 - s) * (2.0 * q * m2 + q * q * s)
+        covariance = e12 - m1 * m2 + (1.0 - s) * (p * m2 + q * m1 + p * q * s)
+        above = (2.0 * mu1 * mu2 + ssim.C1) * (2.0 * covariance + ssim.C2)
+        below = (mu1 * mu1 + mu2 * mu2 + ssim.C1) * (var1 + var2 + ssim.C2)
+        l1 = (x - y + (p - q)).abs().mean()
+        return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - (above / below).mean())
+
+
+def _blur(planes: torch.Tensor) -> torch.Tensor:
+    """Weighted mean over the window around each pixel, [B, 3, H, W], with zeros outside the image."""
+    window = _window(planes.device)
+    rows = functional.conv2d(planes, window, padding=(0, ssim.RADIUS), groups=ssim.CHANNELS)
+    return functional.conv2d(rows, window.mT, padding=(ssim.RADIUS, 0), groups=ssim.CHANNELS)
+
+
+@functools.cache  # copied once: a copy from the host would wait for the GPU in every step
+def _window(device: torch.device) -> torch.Tensor:
+    """The window's weights for each channel, [3, 1, 1, 11]."""
+    return torch.tensor(list(ssim.WEIGHTS), dtype=torch.float32, device=device).repeat(ssim.CHANNELS, 1, 1, 1)
+
+
+@functools.lru_cache(16)
+def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
+    """The share of the window inside the image around each pixel, [1, H, W]."""
+    return _blur(torch.ones(1, ssim.CHANNELS, height, width, dtype=torch.float32, device=device))[0, :1]
+
+
+class LossByConvolution(torch.autograd.Function):
+    """:func:`loss_by_convolution` with its adjoint as a stage of its own."""
+
+    @staticmethod
+    def forward(ctx, image, target, lambda_dssim):
+        with torch.set_grad_enabled(ctx.needs_input_grad[0]):
+            ctx.image = image.detach().requires_grad_(ctx.needs_input_grad[0])
+            ctx.loss = loss_by_convolution(ctx.image, target, lambda_dssim)
+        return ctx.loss.detach()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_loss):
+        with stage("adjoint of loss"):
+            return *torch.autograd.grad(ctx.loss, ctx.image, adj_loss), None, None
+
+
+class ImageLoss(torch.autograd.Function):
+    """See :func:`image_loss`."""
+
+    @staticmethod
+    def forward(ctx, image, target, lambda_dssim, limits):
+        with stage("loss"):
+            height, length = image.shape[0], image.shape[1] * image.shape[2]
+            groups, centers = -(-length // LANES), _centers(image, target)
+            if target.is_inference():  # which autograd does not keep
+                target = target.clone()
+            image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
+            bounds, bands = _bands(height)
+            padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, ssim.RING, groups, ssim.MOMENTS)
+            blurred, slopes = _lanes(bands, ssim.ROWS, groups, ssim.MOMENTS), _lanes(height, ssim.SLOPES, groups + 2)
+            sums = image.new_empty(height, 2)
+            launch(
+                ssim.compare,
+                bands,
+                [
+                    view(bounds, wp.int32),
+                    *_pictures(image, limits, target),
+                    wp.vec2(*centers),
+                    view(_missing(groups, length), vec16),
+                ],
+                [
+                    *(view(lanes, vec16) for lanes in (padded, ring, blurred)),
+                    view(sums, wp.float32),
+                    view(slopes, vec16),
+                ],
+                bounds=list(range(bands + 1)),
+            )
+            l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
+            ctx.save_for_backward(image, target, slopes)
+            ctx.lambda_dssim, ctx.limits, ctx.centers = lambda_dssim, limits, centers
+            return image.new_tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_loss):
+        with stage("adjoint of loss"):
+            image, target, slopes = ctx.saved_tensors
+            height, groups = len(image), slopes.shape[2] - 2
+            bounds, bands = _bands(height)
+            ring, blurred = (_lanes(bands, rows, groups, ssim.SLOPES) for rows in (ssim.RING, ssim.ROWS))
+            adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
+            weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
+            launch(
+                ssim.adj_compare,
+                bands,
+                [
+                    *(view(bounds, wp.int32), *_pictures(image, ctx.limits, target)),
+                    *(wp.vec2(*ctx.centers), view(slopes, vec16), *weights),
+                ],
+                [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)],
+                bounds=list(range(bands + 1)),
+            )
+            return adj.view(height, -1, ssim.CHANNELS), None, None, None
+
+
+def _lanes(*shape: int) -> torch.Tensor:
+    return torch.empty(*shape, LANES, dtype=torch.float32, device="cpu")
+
+
+def _bands(height: int) -> tuple[torch.Tensor, int]:
+    """Bounds of bands of rows, one for each thread [B + 1], and their number.
+
+    Rows that are blurred together are the same in any number of bands: what is not finite has an influence on both.
+    """
+    bounds = even_slices(height, SMALLEST_SLICE)
+    bounds[1:-1] = [bound - bound % ssim.ROWS for bound in bounds[1:-1]]
+    return torch.tensor(bounds, dtype=torch.int32, device="cpu"), len(bounds) - 1
+
+
+def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor) -> list:
+    """What both kernels read of [H, L]: the image and its limits; the target as floats, and as bytes: one of them."""
+    types = (torch.float32, torch.uint8)
+    floats, levels = (target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype) for dtype in types)
+    return [
+        *(view(image, wp.float32), _taps(image), wp.vec2(*limits)),
+        *(view(floats, wp.float32), _taps(floats), view(levels, wp.uint8), _taps(levels, ssim.vec16b)),
+    ]
+
+
+def _centers(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
+    """What to subtract from the two images: any numbers are right, the middles of their ranges keep most digits.
+
+    One number for both unless they lie far apart, so that equal pixels stay equal.
+    """
+    if target.dtype == torch.uint8 or not target.numel():
+        return 0.5, 0.5
+    center = _middle(target)
+    own = _middle(image.detach())
+    return (own, center) if abs(own - center) > FAR_APART else (center, center)
+
+
+def _middle(image: torch.Tensor) -> float:
+    low, high = image.aminmax()
+    middle = 0.5 * low.item() + 0.5 * high.item()
+    return float(np.float32(middle)) if math.isfinite(middle) else 0.5
+
+
+@functools.cache
+def _missing(groups: int, length: int) -> torch.Tensor:
+    """The share of the window beyond the ends of a row, by place in the row, [G, LANES]."""
+    columns = length // ssim.CHANNELS
+    tap = np.arange(columns)[:, None] + np.arange(ssim.WINDOW) - ssim.RADIUS
+    share = ((tap < 0) | (tap >= columns)) @ np.array(list(ssim.WEIGHTS))
+    missing = torch.zeros(groups * LANES, dtype=torch.float32, device="cpu")
+    missing[:length] = torch.from_numpy(np.repeat(share, ssim.CHANNELS))
+    return missing.view(groups, LANES)
+
+
+def _taps(rows: torch.Tensor, dtype=vec16) -> wp.array:
+    """[..., P] numbers as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbours."""
+    shape = (*rows.shape[:-1], max(rows.shape[-1] - LANES + 1, 0))
+    strides = tuple(rows.element_size() * stride for stride in rows.stride())
+    return wp.array(ptr=rows.data_ptr(), dtype=dtype, shape=shape, strides=strides, device="cpu", copy=False)

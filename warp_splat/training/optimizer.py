@@ -1,0 +1,195 @@
+"""Adam over the Gaussians' parameters, and its moments through every change of the set."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import warp as wp
+from torch.optim.adam import adam
+
+from warp_splat.config import TrainConfig
+from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.gaussians import GaussianModel
+from warp_splat.kernels.adam import make_adam
+from warp_splat.kernels.lanes import LANES
+from warp_splat.runtime.launch import in_slices, launch, torch_slices, view
+
+BETAS = (0.9, 0.999)
+EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
+MOMENTS = ("exp_avg", "exp_avg_sq")
+SETTINGS = {"fused": True, "amsgrad": False, "weight_decay": 0.0, "maximize": False}
+
+
+class Optimizer:
+    """Adam with one group per parameter, or its sparse variant, whose moments torch's optimizer keeps.
+
+    Args:
+        model: whose parameters are updated in place.
+        config: rates and ``optimizer_type``.
+        extent: size of the scene, world units; the means' rate is relative to it.
+        batch: images whose mean gradient makes a step. Rates are multiplied by its square root, epsilon is divided by
+            that, and the betas are raised to its power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting
+            Training"): if gradients of different images are independent, a step then moves the parameters as far,
+            and forgets as much, as ``batch`` steps of one image.
+    """
+
+    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float, batch: int = 1):
+        self.model, self.config, self.extent, self.scale = model, config, extent, math.sqrt(batch)
+        self.batch = batch
+        names = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
+        groups = [{"name": name, "params": [model.parameters[name]]} for name in names]
+        betas = (BETAS[0] ** batch, BETAS[1] ** batch)
+        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale)
+        self._groups = {group["name"]: group for group in self.adam.param_groups}
+        self.set_iteration(0)
+
+    def set_iteration(self, iteration: int) -> None:
+        """Set the rates for this step: the means' fall log-linearly from init to final over position_lr_max_steps.
+
+        In the last ``cooldown`` steps all fall to a tenth as well, which settles what constant rates keep in motion.
+        """
+        config = self.config
+        share = min(iteration / config.position_lr_max_steps, 1.0)
+        rate = math.exp((1 - share) * math.log(config.position_lr_init) + share * math.log(config.position_lr_final))
+        rates = {
+            "means": rate * self.extent,
+            "sh_dc": config.feature_lr,
+            "sh_rest": config.feature_lr / 20.0,
+            "opacities": config.opacity_lr,
+            "scales": config.scaling_lr,
+            "quats": config.rotation_lr,
+        }
+        cooldown = min(config.cooldown, config.iterations)
+        late = max(iteration - config.iterations + cooldown, 0) / max(cooldown, 1)
+        for name, rate in rates.items():
+            self._groups[name]["lr"] = rate * self.scale * 0.1**late
+
+    def step(self, radii: torch.Tensor) -> None:
+        """Update from the gradients and clear them; ``radii`` [N] int32 tells what the image showed (0: not)."""
+        if self.config.optimizer_type == "sparse_adam":
+            for group in self.adam.param_groups:
+                self._sparse_step(group, radii)
+        else:
+            self._dense_step()
+        self.adam.zero_grad(set_to_none=True)
+
+    def _dense_step(self) -> None:
+        """The fused Adam of torch, the rows shared among the threads of the CPU."""
+        jobs, steps = [], []
+        for group in self.adam.param_groups:
+            parameter, (beta1, beta2) = group["params"][0], group["betas"]
+            state = self._state(parameter)
+            steps.append(state["step"])
+            if parameter.grad is not None:  # degree 0: zeros would change nothing but the count of the steps
+                tables = [parameter.detach(), parameter.grad, *(state[name] for name in MOMENTS)]
+                rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
+                jobs.append((tables, state["step"], rates))
+
+        def run(low: int, high: int) -> None:
+            for tables, step, rates in jobs:
+                adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
+
+        in_slices(run, torch_slices(len(self.model), self.model.device))
+        for step in steps:
+            step.add_(1)
+
+    def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
+        """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
+        parameter = group["params"][0]
+        if parameter.grad is None or parameter.numel() == 0:
+            return
+        state = self._state(parameter)
+        numbers = parameter.numel() // len(radii)
+        pieces = -(-numbers // LANES)
+        columns = numbers // pieces  # of 1, 3, 4, 9, 24 or 45: these divide
+        tables = [tensor.detach().view(-1, columns) for tensor in (parameter, *(state[name] for name in MOMENTS))]
+        grad, row = parameter.grad.reshape(-1, columns), wp.types.vector(length=columns, dtype=float)
+        launch(
+            make_adam(columns, pieces),
+            len(grad),
+            [view(radii, wp.int32), view(grad, row), group["lr"], *group["betas"], group["eps"]],
+            [view(table, row) for table in tables],
+            device=radii.device,
+        )
+
+    def _state(self, parameter: torch.Tensor) -> dict:
+        """Moments and number of steps, as torch's Adam keeps them."""
+        state = self.adam.state[parameter]
+        if not state:
+            step = torch.zeros((), dtype=torch.float32, device=parameter.device)
+            state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=step)
+        return state
+
+    def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
+        """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""
+        for name in self.model.NAMES:
+            old = self.model.parameters[name]
+            self._swap(name, torch.cat([old.detach()[kept], added[name]]))
+            state = self.adam.state.get(self.model.parameters[name], {})
+            for moment in MOMENTS:
+                if moment in state:
+                    state[moment] = torch.cat([state[moment][kept], torch.zeros_like(added[name])])
+
+    def arrange(self, order: torch.Tensor) -> None:
+        """Put the rows in ``order`` (indices), moments and all."""
+        for name in self.model.NAMES:
+            self._swap(name, self.model.parameters[name].detach()[order])
+            state = self.adam.state.get(self.model.parameters[name], {})
+            for moment in MOMENTS:
+                if moment in state:
+                    state[moment] = state[moment][order]
+
+    def reset_opacities(self, ceiling: float) -> None:
+        """Lower every opacity to at most ``ceiling`` and forget its moments."""
+        logits = self.model.parameters["opacities"].detach()
+        self._swap("opacities", logits.clamp_max(math.log(ceiling / (1.0 - ceiling))))
+        state = self.adam.state.get(self.model.parameters["opacities"], {})
+        for moment in MOMENTS:
+            if moment in state:
+                state[moment] = torch.zeros_like(state[moment])
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """The parameters and all that belongs to them, as ``kind.name``: gradients, moments, and images learned from.
+
+        Those are steps times ``batch``: bias correction then goes on as it should for any other ``batch``.
+        """
+        found: dict[str, torch.Tensor] = {}
+        for name, leaf in self.model.parameters.items():
+            found[f"parameters.{name}"] = leaf.detach()
+            if leaf.grad is not None:
+                found[f"gradients.{name}"] = leaf.grad
+            if state := self.adam.state.get(leaf):
+                found |= {f"{moment}.{name}": state[moment] for moment in MOMENTS}
+                found[f"images.{name}"] = state["step"].double() * self.batch
+        return found
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Take what :meth:`state` gave from a checkpoint. Raises InputError if something does not fit."""
+        arrays, count = checkpoint.arrays, len(checkpoint.array("parameters.means", (-1, 3)))
+        for name, old in self.model.parameters.items():
+            shape = (count, *old.shape[1:])
+            moments = MOMENTS if any(f"{moment}.{name}" in arrays for moment in MOMENTS) else ()
+            gradients = ("gradients",) if f"gradients.{name}" in arrays else ()
+            tables = {
+                kind: torch.empty(shape, device=old.device).copy_(
+                    torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape))
+                )
+                for kind in ("parameters", *gradients, *moments)
+            }
+            self._swap(name, tables["parameters"])
+            leaf = self.model.parameters[name]
+            leaf.grad = tables.get("gradients")
+            if moments:
+                images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
+                step = torch.tensor(float(images / self.batch), dtype=torch.float32, device=leaf.device)
+                self.adam.state[leaf] = {"step": step, **{moment: tables[moment] for moment in MOMENTS}}
+
+    def _swap(self, name: str, values: torch.Tensor) -> None:
+        """Put a new leaf, without a gradient, in the place of a parameter; its state moves along."""
+        old, new = self.model.parameters[name], values.requires_grad_()
+        self.model.parameters[name] = new
+        self._groups[name]["params"][0] = new
+        if old in self.adam.state:
+            self.adam.state[new] = self.adam.state.pop(old)

@@ -1,0 +1,184 @@
+"""A run of training: what has happened so far, and what of it is kept: models, checkpoints, the summary."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from warp_splat.errors import InputError
+from warp_splat.evaluation import report
+from warp_splat.evaluation.perceptual import choose_metrics
+from warp_splat.evaluation.views import describe, evaluate_views, show_views
+from warp_splat.formats import model_folder
+from warp_splat.formats.atomic import write_json
+from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
+from warp_splat.formats.config_file import OF_ONE_RUN
+from warp_splat.runtime.devices import peak_memory
+from warp_splat.runtime.distributed import Processes
+from warp_splat.text import format_table
+from warp_splat.training.tensorboard import EventLog
+from warp_splat.training.trainer import Trainer
+
+RECORD = {"iteration": int, "loss": float, "psnr": float, "gaussians": int, "seconds": float}
+
+
+@dataclass
+class Run:
+    """What has happened so far."""
+
+    folder: Path
+    start: float  # of the work, on time.perf_counter; what was done before a checkpoint is behind it
+    history: list[dict[str, float]] = field(default_factory=list)
+    losses: list[torch.Tensor] = field(default_factory=list)  # since the last record, scalars on the device
+    iteration: int = 0
+    seconds: float = 0.0  # of training steps alone, without evaluations and pictures
+    preview: float = 0.0  # when last drawn
+    kept: int | None = None  # iteration of the last checkpoint
+    kept_at: float = 0.0  # when that was written, on time.perf_counter
+    stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
+    dropped: dict[str, int] = field(default_factory=dict)  # see Quarantine
+    events: EventLog = field(default_factory=EventLog)
+
+
+def warn(error: Exception) -> None:
+    """Say what went wrong; training goes on."""
+    tqdm.write(f"warning: {error}", file=sys.stderr)
+
+
+def save_model(trainer: Trainer, run: Run) -> Path:
+    """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
+    path = model_folder.ply_path(run.folder, run.iteration)
+    antialiased = trainer.config.antialiasing
+    try:
+        trainer.model.save(path, antialiased)
+    except InputError as error:
+        warn(error)
+        path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
+        trainer.model.save(path, antialiased)
+        tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
+    return path
+
+
+def save_or_warn(trainer: Trainer, run: Run) -> None:
+    """Save on the way: training goes on if that fails."""
+    if trainer.processes.rank > 0:
+        return
+    try:
+        save_model(trainer, run)
+    except (InputError, OSError) as error:
+        warn(error)
+
+
+def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
+    """Write a checkpoint, in the place of the last one; ``named``: and one that stays. Training goes on if that fails.
+
+    All processes call this, where :meth:`Trainer.state` says; the first one writes.
+    """
+    tensors, facts = trainer.state()
+    if trainer.processes.rank == 0:
+        if run.losses:
+            tensors["losses"] = torch.stack(run.losses)
+        options = asdict(trainer.config)
+        for name in OF_ONE_RUN:
+            del options[name]
+        facts |= {"options": options, "iteration": run.iteration, "history": run.history}
+        facts |= {"seconds": run.seconds, "wall": time.perf_counter() - run.start}
+        arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+        try:
+            for name in [LAST, f"chkpnt{run.iteration}.safetensors"][: 1 + named]:
+                save_checkpoint(run.folder / name, arrays, facts)
+            run.kept = run.iteration
+        except InputError as error:
+            warn(error)
+    run.kept_at = time.perf_counter()
+
+
+def restore(trainer: Trainer, run: Run, checkpoint: Checkpoint) -> None:
+    """Let the run be where it was when :func:`keep` wrote this checkpoint.
+
+    Raises:
+        InputError: if it was written for another scene, or something in it does not fit.
+    """
+    trainer.restore(checkpoint)
+    run.iteration = run.kept = checkpoint.count("iteration")
+    run.seconds = checkpoint.fact("seconds", float)
+    run.start -= checkpoint.fact("wall", float)
+    run.history = checkpoint.fact("history", list)
+    for record in run.history:
+        if not isinstance(record, dict) or {name: type(value) for name, value in record.items()} != RECORD:
+            raise InputError(
+                f"{checkpoint.path}: expected records of {', '.join(RECORD)}, found others in its history."
+            )
+    if "losses" in checkpoint.arrays:
+        run.losses = list(torch.from_numpy(checkpoint.array("losses", (-1,))).to(trainer.device))
+    run.kept_at = time.perf_counter()
+
+
+def how_to_continue(folder: Path, processes: Processes) -> str:
+    """The command that continues a training, in the manner in which this program was started."""
+    program = sys.orig_argv[: len(sys.orig_argv) - len(sys.argv[1:])]
+    if sys.argv[1:2] == ["train"]:
+        program = [*program, "train"]
+    elif Path(sys.argv[0]).name != "train.py":  # called from Python
+        program = ["warp-splat", "train"]
+    if processes.count > 1:
+        script = [word for word in program[1:] if word != "-u"]
+        program = [sys.executable, "-m", "torch.distributed.run", f"--nproc-per-node={processes.local_count}", *script]
+    return shlex.join([*program, "--resume", str(folder)])
+
+
+def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
+    """Pictures, curves and numbers of the saved model, and where they lie."""
+    wall = time.perf_counter() - run.start
+    split, views = trainer.scene.evaluated
+    extra = {
+        "split": split,
+        "iterations": run.iteration,
+        "gaussians": len(trainer.model),
+        "seconds": round(wall, 2),
+        "iterations_per_second": round(run.iteration / run.seconds, 2),
+        "processes": trainer.processes.count,
+        "peak_memory_mb": peak_memory(),
+        "dropped": run.dropped,
+    }
+    metrics, absent = choose_metrics(trainer.config.lpips_weights)
+    for sentence in absent:
+        say(sentence)
+    means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics)
+    show_views(compared, run.folder, split, run.iteration, say)
+    run.events.write_means(run.iteration, split, means)
+    plot = run.folder / "training.png"
+    if run.history:  # none, if it was stopped before the first evaluation and goes no further
+        report.plot_training(plot, run.history, split)
+    write_json(run.folder / "history.json", run.history)
+    names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
+    lines = [(what, run.folder / name) for what, name in names.items() if run.history or name != plot.name]
+    if run.stages:
+        report.plot_profile(run.folder / "profile.png", run.stages)
+        lines += [("profile", run.folder / "profile.png")]
+        total = sum(run.stages.values())
+        rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
+        say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
+    state = "Interrupted" if run.iteration < trainer.config.iterations else "Done"
+    print(
+        f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
+        f"{split} {describe(means)}, {len(trainer.model)} Gaussians"
+    )
+    for name, where in lines:
+        print(f"  {name:9s} {where}")
+    dropped = run.dropped
+    if dropped["prunings"]:
+        print(f"  warning   {dropped['prunings']} prunings would have removed every Gaussian and were refused")
+    if dropped["pixels"] or dropped["gradients"] or dropped["gaussians"]:
+        print(
+            f"  kept from spreading: {dropped['pixels']} pixels and {dropped['gradients']} Gaussians with gradients, "
+            f"and {dropped['gaussians']} Gaussians with parameters, that were not finite"
+        )

@@ -1,0 +1,293 @@
+"""One training step after another: sample a view, render, compare, adapt. No files, no printing."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from warp_splat.camera import Camera
+from warp_splat.color import to_bytes, to_srgb
+from warp_splat.config import TILE, RasterOptions, TrainConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluation.metrics import psnr
+from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.gaussians import GaussianModel
+from warp_splat.kernels.project import quarantine
+from warp_splat.raster.api import RenderOutput, render
+from warp_splat.runtime.devices import choose_device
+from warp_splat.runtime.distributed import ALONE, Processes
+from warp_splat.runtime.launch import load, stage
+from warp_splat.scene.types import Scene, View
+from warp_splat.training.densify import Densifier
+from warp_splat.training.loss import image_loss
+from warp_splat.training.optimizer import Optimizer
+
+LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
+
+
+@dataclass
+class Quarantine:
+    """What was kept from spreading, counted over the run on the device."""
+
+    pixels: int | torch.Tensor = 0  # with an upstream gradient that was not finite
+    gradients: int | torch.Tensor = 0  # of Gaussians, not finite: no update in that step
+    gaussians: int | torch.Tensor = 0  # left out of an image because a parameter was not finite (once per image)
+    prunings: int = 0  # refused, because they would have emptied the scene
+
+    def read(self, processes: Processes = ALONE) -> dict[str, int]:
+        """The counts by name, over all processes."""
+        counts = torch.tensor([int(self.pixels), int(self.gradients), int(self.gaussians)])
+        processes.sum(counts)  # but a refused pruning is the same one everywhere
+        names = (item.name for item in fields(self))
+        return dict(zip(names, [*counts.tolist(), self.prunings], strict=True))
+
+
+class Photograph(NamedTuple):
+    """A photograph on a device, at the size of this iteration."""
+
+    image: torch.Tensor  # [H, W, 3], as in View
+    alpha: torch.Tensor | None  # [H, W, 1] uint8, if it is needed
+    mask: torch.Tensor | None  # [H, W, 1] uint8
+
+
+class Trainer:
+    """The reference's training (Kerbl et al. 2023) on one scene.
+
+    Args:
+        scene: views and points.
+        config: options.
+        processes: those that train together; each takes a view of its own in every step.
+
+    Raises:
+        InputError: if the device cannot be used, there are more processes than training views, or options do not fit
+            the scene.
+    """
+
+    def __init__(self, scene: Scene, config: TrainConfig, processes: Processes = ALONE):
+        if processes.count > len(scene.train):
+            raise InputError(
+                f"--nproc-per-node: expected at most one process for each of {len(scene.train)} training views, got "
+                f"{processes.count}; start fewer."
+            )
+        if config.loss_space != "srgb" and not scene.linear:
+            raise InputError(
+                f"--loss_space {config.loss_space}: expected photographs in linear light (EXR, HDR, TIFF of floats), "
+                f"found {scene.train[0].name}, which is as a screen shows it; leave this flag out."
+            )
+        self.scene, self.config, self.device = scene, config, choose_device(config.device)
+        self.processes = processes
+        extent = scene.extent
+        if scene.start:
+            model = GaussianModel.from_splats(scene.start.splats, config.sh_degree)
+        else:
+            model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
+        self.model = model.arranged().to(self.device)
+        self.optimizer = Optimizer(self.model, config, extent, processes.count)
+        self.densifier = Densifier(self.model, self.optimizer, config, extent, processes)
+        self.quarantine = Quarantine()
+        self.options = RasterOptions(antialiasing=config.antialiasing, projection=config.projection)
+        self.background = torch.full((3,), float(config.white_background), device=self.device)
+        self.degree = 0
+        self._views_random = random.Random(config.seed)
+        self._background_random = torch.Generator().manual_seed(config.seed)
+        self._deck: list[View] = []
+        self._shrink = 1  # of the images in this step
+        self._photographs: dict[View, Photograph] = {}  # those that were used, at that size
+        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
+
+    def differentiate(self, iteration: int) -> torch.Tensor:
+        """Gradients of the loss of one view; returns the loss, a scalar. Means over the processes, if there are more.
+
+        Iterations count images from 1; with n processes a step is n of them, and ``iteration`` the last one's.
+
+        The reference evaluates and saves between this and :meth:`update`: a set that was densified a moment ago is
+        unsettled and renders several dB worse.
+        """
+        config = self.config
+        self._set_iteration(iteration)
+        view = self._next_view()
+        camera, photograph = self._at_size(view, iteration)
+        background = self.background
+        if config.random_background:
+            drawn = torch.rand(self.processes.count, 3, generator=self._background_random)
+            background = drawn[self.processes.rank].to(self.device)
+        out = self._render(camera, background)
+        out.means2d.retain_grad()
+        image, target = out.image, photograph.image
+        if photograph.alpha is not None:  # put there what it was not loaded with
+            values = target / 255.0 if target.dtype == torch.uint8 else target
+            target = values + (1.0 - photograph.alpha / 255.0) * (background - self.background)
+        if self.scene.linear:
+            image, target = (LOSS_CURVES[config.loss_space](picture) for picture in (image, target))
+        # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
+        loss = image_loss(image, target, config.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
+        loss.backward()
+        if iteration < config.densify_until_iter:
+            with stage("densify"):
+                self.densifier.observe(out, camera.width, camera.height)
+        self.quarantine.pixels += out.dropped.pixel_count
+        self.quarantine.gradients += out.dropped.gaussian_count
+        self.quarantine.gaussians += out.invalid_count
+        self._radii, loss = out.radii, loss.detach()
+        if config.optimizer_type == "sparse_adam":
+            self.processes.maximum(self._radii)
+        self.processes.average([*self.model.gradients(self.degree), loss])
+        return loss
+
+    def update(self, iteration: int) -> None:
+        """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
+        with stage("densify"):
+            changed = self.densifier.update(iteration)
+        if changed is not None:
+            self.check_identical(iteration)
+            self.quarantine.prunings += changed.refused
+        with stage("Adam"):
+            if changed is None or changed.refused:
+                self.optimizer.step(self._radii)
+
+    def warm_up(self) -> None:
+        """Compile and load every kernel of a step, changing nothing."""
+        camera = self.scene.train[0].camera.resized(TILE, TILE)
+        out = self._render(camera, self.background)
+        image_loss(out.image, torch.zeros_like(out.image), self.config.lambda_dssim).backward()
+        self.optimizer.adam.zero_grad(set_to_none=True)
+        load(quarantine, self.device)  # launched only where a gradient is not finite
+
+    def check_identical(self, iteration: int) -> None:
+        """Raise GroupError if the model is not the same, byte for byte, in all processes."""
+        self.processes.check_identical(self.model.parameters.values(), iteration)
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        """Tensors by name and values of JSON: all that :meth:`restore` needs to go on as if nothing had happened.
+
+        To be called by all processes before the first step, or between :meth:`differentiate` and :meth:`update`, where
+        models are saved: a checkpoint holds the same parameters as the model of its iteration, and their gradients.
+        """
+        places = {view: place for place, view in enumerate(self.scene.train)}
+        tensors = {
+            **self.optimizer.state(),
+            **self.densifier.state(),
+            "radii": self._radii,
+            "random.background": self._background_random.get_state(),
+        }
+        return tensors, {
+            "views": [view.name for view in self.scene.train],
+            "extent": self.scene.extent,
+            "deck": [places[view] for view in self._deck],
+            "random.views": list(self._views_random.getstate()[1]),
+            **{f"dropped.{name}": count for name, count in self.quarantine.read(self.processes).items()},
+        }
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint, by :meth:`update` of its iteration. Other options and devices may be at work.
+
+        Raises:
+            InputError: if its training views are not those of the scene, or something in it does not fit.
+        """
+        names, extent = [view.name for view in self.scene.train], self.scene.extent
+        if checkpoint.fact("views", list) != names or not math.isclose(
+            checkpoint.fact("extent", float), extent, rel_tol=1e-6
+        ):
+            raise InputError(
+                f"{checkpoint.path}: expected training views of the same names and positions as in this checkpoint, "
+                "found other ones in the scene; name the scene that it was trained on (-s, -i, --eval)."
+            )
+        deck, words = checkpoint.fact("deck", list), checkpoint.fact("random.views", list)
+        try:
+            self._deck = list(dict.fromkeys(self.scene.train[place] for place in deck))
+            self._views_random.setstate((3, tuple(words), None))
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
+            raise InputError(
+                f"{checkpoint.path}: expected a deck of views and a random state, found other values ({error!s:.100})."
+            ) from error
+        dropped = {item.name: checkpoint.count(f"dropped.{item.name}") for item in fields(Quarantine)}
+        if self.processes.rank > 0:  # they are summed over the processes, but for the prunings
+            dropped = {"prunings": dropped["prunings"]}
+        self.quarantine = Quarantine(**dropped)
+        self.optimizer.restore(checkpoint)
+        self.densifier.restore(checkpoint)
+        self._radii = torch.from_numpy(checkpoint.array("radii", (len(self.model),), np.int32)).to(self.device)
+        self._background_random.set_state(torch.from_numpy(checkpoint.generator("random.background")))
+        self._set_iteration(checkpoint.count("iteration"))
+
+    def _set_iteration(self, iteration: int) -> None:
+        self.optimizer.set_iteration(iteration)
+        self.degree = min(iteration // self.config.sh_interval, self.config.sh_degree)
+
+    def _next_view(self) -> View:
+        """Views in random order, each once before any comes again; all processes deal, each takes its own."""
+        dealt: list[View] = []
+        while len(dealt) < self.processes.count:
+            if not self._deck:
+                self._deck = list(self.scene.train)
+            index = self._views_random.randrange(len(self._deck))
+            if self._deck[index] not in dealt:  # a new deck holds those of this step again
+                dealt.append(self._deck.pop(index))
+        return dealt[self.processes.rank]
+
+    def _at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
+        """Camera and photograph of ``view`` at this iteration's size: coarse to fine, if so configured."""
+        config = self.config
+        doublings = (config.coarse.bit_length() - 1) * iteration // config.coarse_until_iter
+        shrink = max(config.coarse >> doublings, 1)
+        if shrink != self._shrink:
+            self._shrink = shrink
+            self._photographs.clear()
+        width, height = (max(size // shrink, 1) for size in (view.camera.width, view.camera.height))
+        camera = view.camera if shrink == 1 else view.camera.resized(width, height)
+        return camera, self._photograph(view, height, width)
+
+    def _photograph(self, view: View, height: int, width: int) -> Photograph:
+        """The photograph of ``view`` on the device; for a GPU, it waits there or in page-locked memory of the host."""
+        kept = self._photographs.get(view)
+        if kept is None:
+            with stage("photographs"):
+                alpha = view.alpha if self.config.random_background else None
+                planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
+                kept = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
+            self._photographs[view] = kept
+        return Photograph(*(None if p is None else p.to(self.device, non_blocking=True) for p in kept))
+
+    def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
+        kept = torch.from_numpy(pixels).to(self.config.data_device)
+        if kept.shape[:2] != (height, width):
+            planes = kept.permute(2, 0, 1)[None].float()
+            means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
+            kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
+        return kept if kept.device.type == self.device.type else kept.pin_memory()
+
+    def _render(self, camera: Camera, background: torch.Tensor, depth: bool = False) -> RenderOutput:
+        options = replace(self.options, sh_degree=self.degree, depth=depth)
+        with stage("project"):
+            gaussians = self.model.activated(self.degree)
+        return render(gaussians, camera, background, options, self.config.adjoint)
+
+    def look(self, camera: Camera, depth: bool = False) -> RenderOutput:
+        """The present model seen by ``camera``, without gradients; nothing of the training changes."""
+        with torch.no_grad():
+            return self._render(camera, self.background, depth)
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """The present model seen by ``camera``, [H, W, 3] uint8."""
+        return to_bytes(self.look(camera).image, self.scene.linear)
+
+    def evaluate(self, views: list[View]) -> float:
+        """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
+        return float(np.mean([psnr(self.picture(view.camera), view.picture, view.mask) for view in views]))
+
+
+def _log_curve(linear: torch.Tensor) -> torch.Tensor:
+    return torch.log1p(linear / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR)
+
+
+#: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.
+LOSS_CURVES = {
+    "srgb": lambda linear: to_srgb(linear.clamp_min(0.0), torch.where),
+    "log": lambda linear: _log_curve(linear.clamp_min(0.0)),
+}

@@ -1,0 +1,87 @@
+"""``warp-splat view``: a model in a browser, until Ctrl-C."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.config import ViewConfig
+from warp_splat.errors import InputError
+from warp_splat.formats.model_folder import open_model
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import RenderOutput
+from warp_splat.raster.api import render as render_gaussians
+from warp_splat.raster.selftest import settle_device
+from warp_splat.rendering.command import is_linear, load_trained_scene, options_of
+from warp_splat.runtime import launch
+from warp_splat.runtime.devices import memory_explained
+from warp_splat.runtime.interrupts import interruptible
+from warp_splat.scene.types import Scene
+from warp_splat.viewer.pace import LARGEST
+from warp_splat.viewer.picture import on_screen
+from warp_splat.viewer.server import Draw, Viewer, free_port
+
+IDLE = 0.2  # seconds between two looks at Ctrl-C
+
+
+def view(config: ViewConfig) -> int:
+    """Serve the model that ``config`` names until Ctrl-C; returns the process's exit code.
+
+    Raises:
+        InputError: if the model, the scene or the port is not usable.
+    """
+    if not config.model:
+        raise InputError("MODEL: expected the folder of a trained model, or a file of Gaussians; name one.")
+    free_port(config.port)  # before the scene is loaded
+    device = settle_device(launch.prepare(config.device, config.threads), config.device)
+    iteration, gaussians, trained = open_model(config.model, config.iteration)
+    model = GaussianModel.from_splats(gaussians.splats).arranged().to(device)
+    print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
+    scene = _find_scene(config, trained)
+    draw = make_draw(model, trained, is_linear(scene, trained))
+    print("Preparing kernels (compiled once on a machine, about 40 s) ...")
+    advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
+    with (
+        memory_explained(device, model, [LARGEST], advice),
+        Viewer(draw, lambda: model.parameters["means"], scene, config.port) as viewer,
+    ):
+        with interruptible() as interrupted:
+            print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
+            while not interrupted:
+                if not viewer.draw():
+                    viewer.wait(IDLE)
+    return 0
+
+
+def make_draw(model: GaussianModel, trained: dict, linear: bool = False) -> Draw:
+    """A function from a camera, and whether depth is wanted, to what the model looks like.
+
+    Args:
+        model: the Gaussians.
+        trained: options of the training.
+        linear: its colors are in linear light.
+    """
+    options = options_of(trained)
+    background = torch.full((3,), float(bool(trained.get("white_background"))), device=model.device)
+    with torch.no_grad():
+        gaussians = model.activated()
+
+    def draw(camera: Camera, depth: bool) -> RenderOutput:
+        with torch.no_grad():
+            out = render_gaussians(gaussians, camera, background, replace(options, depth=depth))
+        return on_screen(out, linear)
+
+    return draw
+
+
+def _find_scene(config: ViewConfig, trained: dict) -> Scene | None:
+    """The scene of the model; None if it is not known or has gone, since one can look around without it."""
+    try:
+        return load_trained_scene(config.model, config.source_path, trained, print)
+    except InputError as error:
+        if config.source_path:
+            raise
+        print(f"Without photographs: {error}")
+        return None
