@@ -1,17 +1,22 @@
 """What pages repeat, from where it stands: ``python docs/make_pages.py``.
 
-docs/flags.md from the configurations; between ``<!-- NAME -->`` and ``<!-- end -->`` what benchmarks/NAME.py wrote.
+- docs/flags.md, from the configurations.
+- Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote; for ``imports``, the package's imports.
+- docs/images/architecture.svg, from the imports.
 """
 
 import re
 from dataclasses import fields
 from pathlib import Path
 
+import make_architecture
+
 from warp_splat.cli import COMMANDS
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
 DOCS = Path(__file__).parent
-TABLED = [DOCS.parent / "README.md", DOCS / "performance.md"]
+TABLED = [DOCS.parent / "README.md", DOCS / "performance.md", DOCS / "architecture.md"]
+PICTURE = DOCS / "images" / "architecture.svg"
 TABLE = re.compile(r"<!-- (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 INTRODUCTION = """# Every flag
 
@@ -29,7 +34,9 @@ def filled(text: str) -> str:
     """A page with its tables as the benchmarks wrote them."""
 
     def table(found: re.Match) -> str:
-        return f"<!-- {found[1]} -->\n{(DOCS / 'benchmarks' / f'{found[1]}.md').read_text().strip()}\n<!-- end -->"
+        name, file = found[1], DOCS / "benchmarks" / f"{found[1]}.md"
+        text = make_architecture.table() if name == "imports" else file.read_text().strip()
+        return f"<!-- {name} -->\n{text}\n<!-- end -->"
 
     return TABLE.sub(table, text)
 
@@ -74,6 +81,7 @@ def _shown(value: object) -> str:
 
 
 if __name__ == "__main__":
+    PICTURE.write_text(make_architecture.picture())
     (DOCS / "flags.md").write_text(flags())
     for page in TABLED:
         page.write_text(filled(page.read_text()))

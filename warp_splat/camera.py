@@ -1,4 +1,4 @@
-"""A pinhole camera in COLMAP's conventions: x right, y down, z forward, pixel centres at +0.5."""
+"""A pinhole camera in COLMAP's conventions: x right, y down, z forward, pixel centers at +0.5."""
 
 from __future__ import annotations
 

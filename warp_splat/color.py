@@ -1,4 +1,4 @@
-"""From linear light to values that a screen shows; for NumPy's and torch's arrays alike."""
+"""Between linear light and what a screen shows. For NumPy's and torch's arrays alike."""
 
 from __future__ import annotations
 

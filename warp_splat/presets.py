@@ -1,4 +1,4 @@
-"""Other defaults of training. Standard library only."""
+"""Other defaults: of ``--preset``, and of training the embedded scene. Standard library only."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Adjoint against adjoint, knob against knob, splats against physics: error and run time, measured."""
+"""Adjoints, knobs and shortcuts of splatting compared: error against run time."""

@@ -1,1 +1,1 @@
-"""How good a model is: metrics, pictures beside photographs, tables."""
+"""How good a model is: metrics, tables, pictures beside photographs."""

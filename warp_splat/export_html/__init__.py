@@ -1,1 +1,1 @@
-"""A page that shows a model in any browser, from disk: Gaussians packed in Python, drawn by WebGL2."""
+"""One HTML file that shows a model in any browser, from disk, by WebGL2."""

@@ -1,1 +1,1 @@
-"""The files that are exchanged with other programs; each format has a module of its own."""
+"""The files that are read and written, each format in a module of its own."""

@@ -1,1 +1,1 @@
-"""``warp-splat inspect``: what is wrong with a scene, before anyone trains on it."""
+"""What is wrong with a scene, before anyone trains on it: verdicts, and a page with pictures."""

@@ -1,4 +1,4 @@
-"""Scenes on disk, COLMAP models and cameras in JSON: cameras, photographs, masks and points to start from."""
+"""What training reads: cameras, photographs, masks and points."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""From photographs or a video to a scene with cameras: structure from motion by pycolmap, on the CPU."""
+"""From photographs or a video to a scene with cameras, by pycolmap on the CPU."""

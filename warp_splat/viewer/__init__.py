@@ -1,1 +1,1 @@
-"""A scene in the browser, drawn by the renderer of this package."""
+"""A model in the browser, drawn by this package's renderer."""
