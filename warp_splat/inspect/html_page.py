@@ -12,8 +12,9 @@ from warp_splat.inspect.subject import Finding
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 table { border-collapse: collapse; width: 100%; }
-td { border-bottom: 1px solid #d9d9d9; padding: .35rem .6rem; vertical-align: top; overflow-wrap: anywhere; }
-td:first-child { font-weight: 600; white-space: nowrap; }
+td { border-bottom: 1px solid #d9d9d9; padding: .35rem .6rem; vertical-align: top; white-space: nowrap; }
+td:first-child { font-weight: 600; }
+td:last-child { white-space: normal; overflow-wrap: anywhere; }
 .ok { color: #009e73; } .note { color: #0072b2; } .warning { color: #b35900; } .error { color: #c00000; }
 img { max-width: 100%; } figure { margin: 2rem 0; } figcaption { font-weight: 600; margin-bottom: .4rem; }
 """
