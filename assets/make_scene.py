@@ -17,7 +17,7 @@ import pycolmap
 from scene_geometry import still_life
 from scene_trace import Tracer
 
-VIEWS, TURNS = 50, 3  # a closed spiral: each eighth view lies between its neighbours
+VIEWS, TURNS = 50, 3  # a closed spiral: each eighth view lies between its neighbors
 SIZE = (264, 248)  # width, height [px]; not multiples of a tile
 FOCAL = (291.0, 288.0)  # fx, fy [px]
 CENTER = (130.6, 125.3)  # cx, cy [px]
@@ -29,7 +29,7 @@ SEED = 7
 
 
 def camera_path() -> tuple[np.ndarray, np.ndarray]:
-    """Camera centres [V, 3] and rotations camera-from-world [V, 3, 3] (x right, y down, z forward)."""
+    """Camera centers [V, 3] and rotations camera-from-world [V, 3, 3] (x right, y down, z forward)."""
     t = 2 * np.pi * np.arange(VIEWS) / VIEWS
     azimuth, elevation = TURNS * t, np.radians(34 + 17 * np.cos(t + 0.4))
     distance = 3.2 + 0.45 * np.sin(7 * t)
@@ -50,7 +50,7 @@ def project(points: np.ndarray, center: np.ndarray, rotation: np.ndarray) -> tup
 
 
 def scan(tracer: Tracer, images: list[np.ndarray], centers: np.ndarray, rotations: np.ndarray):
-    """Surface points seen through random pixels: positions [N, 3], colours [N, 3], distances [N]."""
+    """Surface points seen through random pixels: positions [N, 3], colors [N, 3], distances [N]."""
     rng = np.random.default_rng(SEED)
     view = np.arange(2 * POINTS) % VIEWS  # more than needed: some will be seen too rarely
     column, row = rng.integers(SIZE[0], size=len(view)), rng.integers(SIZE[1], size=len(view))

@@ -1,6 +1,6 @@
-"""What each surface of the still life looks like: colour and gloss as functions of texture coordinates.
+"""What each surface of the still life looks like: color and gloss as functions of texture coordinates.
 
-Everything is procedural. Colours are linear RGB; patterns are made from lattice noise, stripes and a 5 x 7 pixel font.
+Everything is procedural. Colors are linear RGB; patterns are made from lattice noise, stripes and a 5 x 7 pixel font.
 """
 
 from enum import IntEnum
@@ -66,9 +66,9 @@ def cell(x: float, y: float, seed: int):
 
 
 @wp.func
-def band(x: float, centre: float, half: float):
-    """1 within ``half`` of ``centre``, else 0."""
-    return wp.where(wp.abs(x - centre) < half, 1.0, 0.0)
+def band(x: float, center: float, half: float):
+    """1 within ``half`` of ``center``, else 0."""
+    return wp.where(wp.abs(x - center) < half, 1.0, 0.0)
 
 
 @wp.func
@@ -82,7 +82,7 @@ def wood(x: float, y: float, light: wp.vec3, dark: wp.vec3, seed: int):
 
 @wp.func
 def palette(t: float):
-    """A smooth ring of saturated colours."""
+    """A smooth ring of saturated colors."""
     return wp.vec3(
         0.5 + 0.42 * wp.cos(TAU * t), 0.42 + 0.38 * wp.cos(TAU * (t + 0.67)), 0.42 + 0.4 * wp.cos(TAU * (t + 0.36))
     )
@@ -273,7 +273,7 @@ def ornament(material: int, u: float, v: float, seed: float):
 
 @wp.func
 def paint(material: int, p: wp.vec3, lettering: wp.array2d[float]):
-    """Colour and gloss (0..1; above 0.5 the surface also mirrors the room) at texture coordinates ``p``."""
+    """Color and gloss (0..1; above 0.5 the surface also mirrors the room) at texture coordinates ``p``."""
     c = wp.vec3(0.62, 0.60, 0.55)
     gloss = 0.0
     if material == int(Material.TABLE):

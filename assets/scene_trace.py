@@ -38,7 +38,7 @@ class Scene:
 
 @wp.struct
 class Camera:
-    """Pinhole; COLMAP axes (x right, y down, z forward), pixel centres at half integers."""
+    """Pinhole; COLMAP axes (x right, y down, z forward), pixel centers at half integers."""
 
     position: wp.vec3
     world_from_camera: wp.mat33

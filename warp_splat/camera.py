@@ -67,7 +67,7 @@ class Camera:
 
     @property
     def center(self) -> np.ndarray:
-        """Camera centre in world coordinates, [3]."""
+        """Camera center in world coordinates, [3]."""
         return -self.rotation.T @ self.translation
 
     @property

@@ -1,6 +1,6 @@
 """Pictures and tables of a result: views beside photographs, training curves, time by stage.
 
-Colours are those of Okabe and Ito (2008), which people with colour vision deficiencies can tell apart.
+Colors are those of Okabe and Ito (2008), which people with color vision deficiencies can tell apart.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    """Running mean over a twentieth of the values, centred, or what there is of it at the ends."""
+    """Running mean over a twentieth of the values, centered, or what there is of it at the ends."""
     half = len(values) // 40
     sums = np.concatenate([[0.0], np.cumsum(values)])
     index = np.arange(len(values))

@@ -5,7 +5,7 @@
     1   log scale 2         int16
         opacity             uint16, 0 to 1
         rotation            three int16, (x, y, z) / (1 + w) of the unit quaternion with w >= 0, steps of 1/8192
-        base colour         three int16, SH coefficients of degree 0, steps of 1/256
+        base color         three int16, SH coefficients of degree 0, steps of 1/256
     2.. five more SH coefficients, RGB each: int8 in steps of 2^e / 128, and e, uint8
 
 An attribute's bytes lie together, first bytes first, before gzip: so they compress. Half a step is the largest error.

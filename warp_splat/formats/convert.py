@@ -66,7 +66,7 @@ def _changes(old: SplatArrays, new: SplatArrays) -> list[tuple[str, str, float, 
         ("position", "", largest(old.means), np.abs(old.means.astype(np.float64) - new.means)),
         ("scale", "", largest(scales[0]), np.abs(scales[0] - scales[1])),
         ("opacity", "", 1.0, np.abs(sigmoid(old.opacities) - sigmoid(new.opacities))),
-        ("colour", "", 1.0, SH_C0 * np.abs(old.sh[:, 0] - new.sh[:, 0])),
+        ("color", "", 1.0, SH_C0 * np.abs(old.sh[:, 0] - new.sh[:, 0])),
         ("harmonics", "", 1.0, np.abs(old.sh[:, 1:shared] - new.sh[:, 1:shared])),
         ("rotation", " degrees", 360.0, np.degrees(4 * np.arctan2(*halves))),
     ]

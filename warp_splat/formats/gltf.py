@@ -42,7 +42,7 @@ UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may requi
 COLOR_SPACE = "srgb_rec709_display"  # that of the photographs
 RENDER_MODE = "SplatRenderMode"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
-LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the colour
+LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the color
 GLB_BYTES = 2**32 - 1  # the length in the header of a .glb file has four bytes
 ARRAY_BUFFER = 34962
 
@@ -195,7 +195,7 @@ def _read_primitive(document: Document, primitive: dict, report: Callable[[str],
     if kernel != "ellipse" or extension.get("extensions"):
         raise Unexpected(f"Gaussians of kernel {kernel!r:.40} or in a compressed form; export them without extensions")
     if space != COLOR_SPACE:
-        report(f"the colours are in {space!r:.40} and are kept as they are; expected {COLOR_SPACE!r}")
+        report(f"the colors are in {space!r:.40} and are kept as they are; expected {COLOR_SPACE!r}")
     coefficients = sum(name.startswith(f"{NAME}:SH_DEGREE_") for name in attributes)
     if coefficients not in COEFFICIENTS:
         raise Unexpected(f"a primitive with {coefficients} coefficients of SH, not 1, 4, 9 or 16")

@@ -194,7 +194,7 @@ def _parse_namespace(text: str, path: Path) -> dict[str, object]:
 def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: Sequence[View]) -> None:
     """Write ``cameras.json`` for viewers: test cameras first, then training cameras, at their original sizes.
 
-    Positions are camera centres and rotations camera-to-world, both in world coordinates; focal lengths in pixels.
+    Positions are camera centers and rotations camera-to-world, both in world coordinates; focal lengths in pixels.
 
     Raises:
         InputError: if the file cannot be written.

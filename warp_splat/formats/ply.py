@@ -28,7 +28,7 @@ F_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 COLOR = ("red", "green", "blue")
-GRAY = 127  # of points without colours
+GRAY = 127  # of points without colors
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
 
 EXPECTED = "a PLY file with an element 'vertex'"
@@ -57,7 +57,7 @@ def save_ply(
 
     Args:
         path: the file to write.
-        means: centres, [N, 3], world units.
+        means: centers, [N, 3], world units.
         sh: spherical harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16.
         opacities: logits, [N].
         scales: natural logarithms of the standard deviations, [N, 3].
@@ -87,12 +87,12 @@ def save_ply(
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write a coloured point cloud as the reference's ``input.ply``: x y z, zero normals, red green blue.
+    """Write a colored point cloud as the reference's ``input.ply``: x y z, zero normals, red green blue.
 
     Args:
         path: the file to write.
         points: positions, [P, 3], world units.
-        colors: colours 0..255, [P, 3] uint8.
+        colors: colors 0..255, [P, 3] uint8.
 
     Raises:
         InputError: if the shapes are not both [P, 3]; if the file cannot be written.
@@ -110,7 +110,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     """Read a point cloud: x y z and, if there are any, red green blue (0..255, or 0..1 as floats; gray otherwise).
 
     Returns:
-        Positions [P, 3] float32, finite; colours [P, 3] uint8.
+        Positions [P, 3] float32, finite; colors [P, 3] uint8.
 
     Raises:
         InputError: if the file is missing, damaged, or has no positions.
@@ -119,7 +119,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     names = vertex.dtype.names or ()
     if not set(POSITION) <= set(names):
         raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {', '.join(names):.200}.")
-    with np.errstate(over="ignore", invalid="ignore"):  # as in load_ply; colours that are not finite are any
+    with np.errstate(over="ignore", invalid="ignore"):  # as in load_ply; colors that are not finite are any
         points = np.stack([vertex[name].astype(np.float32) for name in POSITION], axis=1)
         colors = np.full(points.shape, GRAY, np.uint8)
         if set(COLOR) <= set(names):

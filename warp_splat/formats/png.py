@@ -40,12 +40,12 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
 
 
 def load_png(path: str | Path) -> np.ndarray:
-    """Read the colours of an image, without its alpha, as [H, W, 3] uint8.
+    """Read the colors of an image, without its alpha, as [H, W, 3] uint8.
 
     Raises:
-        InputError: if the file is missing, damaged, or has no three colours.
+        InputError: if the file is missing, damaged, or has no three colors.
     """
-    unassociated = oiio.ImageSpec()  # otherwise OpenImageIO multiplies the colours by alpha
+    unassociated = oiio.ImageSpec()  # otherwise OpenImageIO multiplies the colors by alpha
     unassociated["oiio:UnassociatedAlpha"] = 1
     source = oiio.ImageInput.open(str(path), unassociated)
     if source is None:
@@ -60,7 +60,7 @@ def load_png(path: str | Path) -> np.ndarray:
 
 
 def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write frames as an MP4 that browsers and phones play: H.264, 4:2:0, BT.709 colours, index at the front.
+    """Write frames as an MP4 that browsers and phones play: H.264, 4:2:0, BT.709 colors, index at the front.
 
     H.264 needs even sizes: an odd width or height is filled up by repeating the last column or row.
 
@@ -98,12 +98,12 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
 
 
 def _h264_stream(container, width: int, height: int, fps: float):
-    """A stream that states its colours: players guess BT.601 or BT.709 by the size otherwise."""
+    """A stream that states its colors: players guess BT.601 or BT.709 by the size otherwise."""
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc  # noqa: PLC0415 - as above
 
     stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-    stream.options = {"crf": "18"}  # visually lossless: artefacts should be the renderer's own
+    stream.options = {"crf": "18"}  # visually lossless: artifacts should be the renderer's own
     context = stream.codec_context
     context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
     context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709

@@ -47,7 +47,7 @@ def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] 
     means, sh, opacities, scales, quats = file.splats
     if not len(means):
         raise InputError(f"{path}: there are no Gaussians, and a .splat file cannot say so; choose another format.")
-    colors = clipped("colour", SH_C0 * sh[:, 0] + 0.5, 0, 1, report)
+    colors = clipped("color", SH_C0 * sh[:, 0] + 0.5, 0, 1, report)
     rows = np.empty(len(means), ROW)
     rows["mean"] = means
     rows["scale"] = np.exp(clipped("log scale", scales, *LOG_SCALES, report))

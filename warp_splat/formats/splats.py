@@ -14,13 +14,13 @@ import numpy as np
 from warp_splat.errors import InputError
 
 COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
-SH_C0 = 0.28209479177387814  # colour = SH_C0 * (coefficient of degree 0) + 0.5
+SH_C0 = 0.28209479177387814  # color = SH_C0 * (coefficient of degree 0) + 0.5
 LOG_SCALES = (-87.0, 88.0)  # exp() of these, and of what lies between, is a normal number in float32
 AXIS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 
 
 class SplatArrays(NamedTuple):
-    """Gaussians as stored, float32: before sigmoid, exp and normalisation."""
+    """Gaussians as stored, float32: before sigmoid, exp and normalization."""
 
     means: np.ndarray  # [N, 3] world units
     sh: np.ndarray  # [N, K, 3] spherical harmonics, K = 1, 4, 9 or 16
@@ -105,11 +105,11 @@ def frame(letters: str) -> np.ndarray:
 def turned(
     splats: SplatArrays, turn: np.ndarray, translation: np.ndarray | None = None, scale: float = 1.0
 ) -> SplatArrays:
-    """The Gaussians in another frame, x_new = scale * turn @ x + translation, with their rotations and colours.
+    """The Gaussians in another frame, x_new = scale * turn @ x + translation, with their rotations and colors.
 
     Args:
         splats: the Gaussians.
-        turn: [3, 3], orthogonal; mirrors too: a Gaussian is its own mirror image but for rotation and colour.
+        turn: [3, 3], orthogonal; mirrors too: a Gaussian is its own mirror image but for rotation and color.
         translation: [3], in units of the new frame.
         scale: new units per old unit, positive.
     """
@@ -133,7 +133,7 @@ def turned(
 
 
 def _turn_harmonics(turn: np.ndarray, coefficients: int) -> np.ndarray:
-    """[K, K]: new coefficients from old, so that the colour seen along ``turn @ d`` is what was seen along d.
+    """[K, K]: new coefficients from old, so that the color seen along ``turn @ d`` is what was seen along d.
 
     Real harmonics with the Condon-Shortley phase, as in the reference; exact, since a turn keeps each degree.
     """

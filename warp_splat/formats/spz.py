@@ -1,6 +1,6 @@
 """Gaussians as SPZ files, the compressed format of Niantic (github.com/nianticlabs/spz): 20 to 65 bytes each.
 
-Version 2 and 3 are one gzip stream: a header of 16 bytes, then all positions (24-bit fixed point), opacities, colours,
+Version 2 and 3 are one gzip stream: a header of 16 bytes, then all positions (24-bit fixed point), opacities, colors,
 log scales, rotations, spherical harmonics. Version 4 has a header of 32 bytes, extension records, a table of sizes and
 one Zstandard stream for each of the six. All three are read, version 3, which more viewers know, is written.
 
@@ -58,7 +58,7 @@ SMALLEST_LIMIT = 2**24  # bytes that any file may expand to
 class _Packed(NamedTuple):
     """A file's bytes, decompressed, by attribute."""
 
-    streams: list[bytes]  # positions, opacities, colours, scales, rotations, harmonics
+    streams: list[bytes]  # positions, opacities, colors, scales, rotations, harmonics
     version: int
     degree: int
     fraction_bits: int
@@ -84,7 +84,7 @@ def save_spz(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
     bits = min(FRACTION_BITS, max(0, int(np.floor(np.log2(POSITION_MAX / max(widest, 1.0))))))
     reach = POSITION_MAX / 2.0**bits
     fixed = np.rint(clipped("position", means, -reach, reach, report) * 2.0**bits).astype("<i4")
-    colors = clipped("colour coefficient", sh[:, 0], -0.5 / COLOR_SCALE, 0.5 / COLOR_SCALE, report)
+    colors = clipped("color coefficient", sh[:, 0], -0.5 / COLOR_SCALE, 0.5 / COLOR_SCALE, report)
     steps = SCALE_STEP * (clipped("log scale", scales, SCALE_LOW, SCALE_LOW + 255 / SCALE_STEP, report) - SCALE_LOW)
     payload = [
         HEADER.pack(MAGIC, 3, count, COEFFICIENTS.index(coefficients), bits, FLAG_ANTIALIASED * file.antialiased, 0),

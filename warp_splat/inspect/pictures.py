@@ -18,7 +18,7 @@ from warp_splat.scene.types import visible
 SHEET, COLUMNS = 60, 10  # thumbnails, at most, and in a row
 ON_PHOTOS = 6
 DOTS = 1500  # points drawn on a photograph
-MOST = 3.0  # px; larger errors have the same colour
+MOST = 3.0  # px; larger errors have the same color
 MAPPED = 5000  # points drawn on the map
 PAGE_DPI = 110
 
@@ -32,7 +32,7 @@ def draw(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:
     if not len(subject.points):
         return
     if measured.errors:
-        caption = "Where points were seen, coloured by how far from there they project (the worst images first)"
+        caption = "Where points were seen, colored by how far from there they project (the worst images first)"
     else:
         caption = "Points projected into photographs: they should lie on what is there"
     yield caption, _encode(_on_photos(subject, measured))

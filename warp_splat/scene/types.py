@@ -63,7 +63,7 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """1.1 x the largest distance of a training camera's centre from their mean (the reference's getNerfppNorm).
+        """1.1 x the largest distance of a training camera's center from their mean (the reference's getNerfppNorm).
 
         Where all cameras stand at one place that is 0, and nothing could learn: then 1.1 x the median distance of the
         points from there.

@@ -40,7 +40,7 @@ def browser_camera(wxyz, position, fov: float, width: int, height: int) -> Camer
 
     Args:
         wxyz: quaternion, camera to world, in the axes that both sides share (x right, y down, z forward).
-        position: the camera's centre, [3], world.
+        position: the camera's center, [3], world.
         fov: vertical field of view, rad.
         width: of the window, px.
         height: of the window, px.
