@@ -1,7 +1,9 @@
 """What pages repeat, from where it stands: ``python docs/make_pages.py``.
 
 - docs/flags.md, from the configurations.
-- Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote; for ``imports``, the package's imports.
+- Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote, a table of docs/sentences.py, or, for
+  ``imports``, the package's imports.
+- Figures in running text: see docs/sentences.py.
 - docs/images/architecture.svg, from the imports.
 """
 
@@ -10,12 +12,13 @@ from dataclasses import fields
 from pathlib import Path
 
 import make_architecture
+import sentences
 
 from warp_splat.cli import COMMANDS
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
 DOCS = Path(__file__).parent
-TABLED = [DOCS.parent / "README.md", DOCS / "performance.md", DOCS / "architecture.md"]
+PAGES = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
 PICTURE = DOCS / "images" / "architecture.svg"
 TABLE = re.compile(r"<!-- (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 INTRODUCTION = """# Every flag
@@ -30,15 +33,17 @@ PRESET_TEXT = """
 """
 
 
-def filled(text: str) -> str:
-    """A page with its tables as the benchmarks wrote them."""
+def filled(page: Path) -> str:
+    """The text of a page, with tables and figures as they were measured."""
 
     def table(found: re.Match) -> str:
-        name, file = found[1], DOCS / "benchmarks" / f"{found[1]}.md"
-        text = make_architecture.table() if name == "imports" else file.read_text().strip()
-        return f"<!-- {name} -->\n{text}\n<!-- end -->"
+        name, written = found[1], DOCS / "benchmarks" / f"{found[1]}.md"
+        make = {**sentences.TABLES, "imports": make_architecture.table}.get(name, written.read_text)
+        return f"<!-- {name} -->\n{make().strip()}\n<!-- end -->"
 
-    return TABLE.sub(table, text)
+    if page.name == "flags.md":
+        return flags()
+    return sentences.filled(page.name, TABLE.sub(table, page.read_text()))
 
 
 def flags() -> str:
@@ -82,6 +87,5 @@ def _shown(value: object) -> str:
 
 if __name__ == "__main__":
     PICTURE.write_text(make_architecture.picture())
-    (DOCS / "flags.md").write_text(flags())
-    for page in TABLED:
-        page.write_text(filled(page.read_text()))
+    for page in PAGES:
+        page.write_text(filled(page))

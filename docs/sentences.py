@@ -1,0 +1,229 @@
+"""The figures in pages: two tables, and those in running text.
+
+A page stays plain Markdown. :func:`sentences` repeats the text around a figure, and says what stands there.
+docs/make_pages.py writes it into the page, and raises an error if the text is not there. A figure that no file holds is
+said to be measured by hand, once.
+"""
+
+import re
+
+import figures as f
+
+
+def modes() -> str:
+    """The README's table."""
+    derived = {
+        "manual": "hand",
+        "stepwise": "hand (loop), Warp (its body)",
+        "reversible": "Warp, T recovered by an inverse step",
+        "stored": "Warp, every T kept in memory",
+    }
+    lines = ["| mode | derived by | time of the adjoint | peak memory | error |", "| --- | --- | ---: | ---: | ---: |"]
+    for mode, by in derived.items():
+        shown = f.two if mode in ("manual", "stepwise") else f.one
+        time = "1" if mode == "manual" else " to ".join(f.span(f.times_manual(mode), shown))
+        error = " to ".join(f.span(f.errors(mode), f.small))
+        lines.append(f"| `{mode}` | {by} | {time} | {f.mebibytes(mode)} MiB | {error} |")
+    return "\n".join(lines)
+
+
+def adjoint_times() -> str:
+    """The table of 100,000 Gaussians."""
+    header = (
+        "mode | adjoint, 1 thread | times manual | 2 threads | times manual | peak memory | lines: rules + plumbing"
+    )
+    lines = [f"| {header} |", "| --- |" + " ---: |" * 6]
+    for mode in f.WITH_GENERATED:
+        cells = []
+        for threads in (1, 2):
+            time = f.seconds(mode, "adjoint", threads)
+            cells += [f"{1e3 * time:.0f} ms", f.two(time / f.seconds("manual", "adjoint", threads))]
+        lines.append(
+            f"| {mode} | {' | '.join(cells)} | {f.mebibytes(mode)} MiB | {f.rules(mode)} + {f.plumbing(mode)} |"
+        )
+    return "\n".join(lines)
+
+
+TABLES = {"modes": modes, "adjoint_times": adjoint_times}
+
+
+def sentences() -> dict[str, list[tuple]]:
+    """By page: pieces of its text, with ``{}`` for a figure, and the figures."""
+    measured = f.quoted("compare/compare.txt", r"Measured on (.*), 2 threads")[0]
+    over_modes, over_seeds = f.quoted("compare/compare.txt", r"is ([\d.]+) dB over modes and ([\d.]+) dB over seeds")
+    exponentials = [f.knob(scene, "exp_degree 3") for scene in f.scenes("knobs")]
+    stops = [f.knob(scene, "t_min 0.01") for scene in f.scenes("knobs")]
+    default_stops = [f.knob(scene, "t_min 0.0001")[0] for scene in f.scenes("knobs")]
+    caps = [f.worst("adjoints", f.MANY, f"cap {cap}") for cap in (2048, 128)]
+    lists = max(int(row["longest_list"]) for row in f.rows("training") if not row["variant"].startswith("cap"))
+    count = f.cases()
+    image, gradient, _ = f.knob(f.EMBEDDED, "alpha_min 0.003922")
+    finer, finest = (f.knob(f.EMBEDDED, f"alpha_min {value}") for value in ("0.001", "0.0001"))
+    long = f.quoted("compare/compare.txt", r"embedded, step 300 \| central differences .*\| ([\d.e+]+) extrapolated")[0]
+    return {
+        "README.md": [
+            ("The training takes {} s on two cores", f.data("preset")["rows"][0][6]),
+            (
+                "In the worst of {} stiff and extreme cases, gradients err by {}.",
+                count,
+                f.small(max(float(row["gradient_error"] or 0) for row in f.rows("stability"))),
+            ),
+            ("recorded naively is wrong by {} %", round(100 * min(f.errors("plain")))),
+            ("Without them it takes {} to {} times the time", *f.span(f.times_manual("generated"), "{:.0f}".format)),
+            ("modes differ by {} dB, seeds by {} dB", over_modes, over_seeds),
+            ("shrink from {} lines to {}.", f.rules("manual"), f.rules("stepwise")),
+            ("Measured on {}, by `uv run python -m warp_splat.compare`", measured),
+        ],
+        "renderer.md": [
+            ("the forward pass is {} times as fast", round(f.blend_gain())),
+            ("exactly enough ({} after 100,000", f.small(f.stability("recovery_100000", "value_error"))),
+            ("has the catalog of {} stiff", count),
+        ],
+        "extending.md": [
+            ("`: {} stiff and extreme cases, {} verdicts over", count, len(f.rows("stability"))),
+        ],
+        "adjoints.md": [
+            ("Machine of all figures: {}.\n", measured),
+            (
+                "545 px, {} million tile",
+                f.two(int(f.quoted("benchmarks/adjoints.md", r"(\d+) tile instances")[0]) / 1e6),
+            ),
+            ("Its gradient is wrong by {} %", round(100 * min(f.errors("plain")))),
+            ("`stepwise` lay between {} and {} times", *f.span(f.times_manual("stepwise"), f.two)),
+            ("`reversible` between {} and {}. `stored`", *f.span(f.times_manual("reversible"), f.one)),
+            (
+                "in the forward pass: {} ms instead of {} here",
+                *(round(1e3 * f.seconds(mode, "forward", 2)) for mode in ("stored", "manual")),
+            ),
+            ("**All modes lie between {} and {}.**", *f.span(f.errors(*f.WITH_GENERATED), f.small)),
+            ("That is at least {} times below", int(2e-4 / max(f.errors(*f.WITH_GENERATED)))),
+            ("within a factor of {} of each other", f.one(f.spread_of_modes())),
+            (
+                "it is off by {}, and the gradients by {}, where",
+                f.small(f.stability("recovery_100000", "value_error")),
+                f.small(f.stability("chain_100000", "gradient_error")),
+            ),
+            ("they take {} hours", f.one(float(long) / 3.6e6)),
+            ("Their error over the scenes is {} to {}.", *f.span(f.errors("central differences"), f.small)),
+            ("1e-4, which errs by {} to {} in the image", *f.span(default_stops, f.small)),
+            (
+                "1e-6 takes {} to {} times as long",
+                *f.span([f.slower("t_min 1e-06", "t_min 0.0001", scene) for scene in f.scenes("knobs")], f.two),
+            ),
+            (
+                "1e-2 takes {} to {} times as long, and errs by {} to {}.",
+                *f.span([f.slower("t_min 0.01", "t_min 0.0001", scene) for scene in f.scenes("knobs")], f.two),
+                *f.span([image for image, *_ in stops], f.small),
+            ),
+            (
+                "1/255 errs by {} in the image and {} % in the gradient",
+                f"{image:.1e}".replace("e-0", "e-"),
+                round(100 * gradient),
+            ),
+            (
+                "1e-3 errs by {} and {} %, and takes {} times as long",
+                f"{finer[0]:.1e}".replace("e-0", "e-"),
+                f.one(100 * finer[1]),
+                f.two(f.slower("alpha_min 0.001", "alpha_min 0.003922")),
+            ),
+            (
+                "1e-4 errs by {} and {} %, and takes {} times as long",
+                f"{finest[0]:.1e}".replace("e-0", "e-"),
+                f.one(100 * finest[1]),
+                f.two(f.slower("alpha_min 0.0001", "alpha_min 0.003922")),
+            ),
+            ("deviations takes {} times as long", f.two(f.slower("extent square", "extent ellipse"))),
+            (
+                "exponential, which takes {} to {} times as long",
+                *f.span([f.slower("exp_degree none", "exp_degree 5", scene) for scene in f.scenes("knobs")], f.one),
+            ),
+            (
+                "3 takes {} to {} times as long, and errs by {} in the image and {} in gradients",
+                *f.span([f.slower("exp_degree 3", "exp_degree 5", scene) for scene in f.scenes("knobs")], f.two),
+                f.small(max(image for image, *_ in exponentials)),
+                f.small(max(off for _, off, _ in exponentials)),
+            ),
+            ("its gradients err by {} (2048 of 10,000 candidates) to {} (128", f.small(caps[0]), f.one(caps[1])),
+            ("different modes are {} to {} times closer", *f.span(f.nearer(), "{:.0f}".format)),
+            ("PSNR scatters by {} dB over modes and by {} dB over seeds", over_modes, over_seeds),
+            ("The mean of `manual` is {} dB", f.two(f.psnr("manual"))),
+            (
+                "`reversible` takes {} times the time of `manual`, by `stored` {} times",
+                *(f.one(f.steps_slower(mode)) for mode in ("reversible", "stored")),
+            ),
+            ("no tile lists more than {}.", lists),
+            ("A cap of 128 cuts {} % of", round(100 * f.fact("training", "embedded", "cap 128", "lists_cut"))),
+            ("It costs {} dB, or {} dB if applied", f.one(f.lost("cap 128")), f.one(f.lost("cap 128, rendering only"))),
+            ("it takes {} times as long as projection and colors", f.one(f.projection_backwards())),
+            ("it gains {} to {} dB over the affine", *f.span(f.gained(), "{:.0f}".format)),
+            ("ends {} dB lower (one seed)", f.two(f.lost("ellipsoid"))),
+            ("runs {} named cases, {} verdicts", count, len(f.rows("stability"))),
+            (
+                "direction the image errs by {}.",
+                f.small(max(f.stability(f"size_{size}", "value_error") for size in ("1x20000", "20000x1"))),
+            ),
+            (
+                "(measured on a slab: {} and {})",
+                *f.quoted("compare/volume.txt", r"slab +\| Euler .*\| ([\d.]+) +\|\n.*\| ([\d.]+)"),
+            ),
+            (
+                "its 64 samples err by {}, those of the exponential by {}.",
+                *(f.small(f.integrated(name)) for name in ("RK4", "exponential")),
+            ),
+            ("linearized exponential: up to {},", f.small(max(f.shortcut("linear depth") + f.shortcut("linear peak")))),
+            ("overlap: {} where", f.small(max(f.shortcut("no overlap")))),
+            ("affine projection: {} to {};", *f.span(f.shortcut("affine"), f.small)),
+            ("low-pass: up to {}.", f.small(max(f.shortcut("affine + blur")))),
+            (
+                "`stepwise` has {} in all, `manual` {}.",
+                *(f.rules(mode) + f.plumbing(mode) for mode in ("stepwise", "manual")),
+            ),
+            ("it saves a third: {} against {}.", f.rules("stepwise"), f.rules("manual")),
+            ("`stored` takes {} to {} times the adjoint", *f.span(f.stored_to_reversible(), f.one)),
+            ("What it costs is {} times the memory", round(f.mebibytes("stored") / f.mebibytes("manual"))),
+        ],
+        "performance.md": [
+            (
+                "Two threads do {} times the multiply-adds of one, but move only {} times the bytes",
+                f.two(f.of_two_threads("rate")),
+                f.two(f.of_two_threads("bandwidth")),
+            ),
+            (
+                "pixels: {} times as many in `full`, {} times where",
+                f.one(f.looked_at("full")),
+                f.one(f.looked_at("synthetic")),
+            ),
+            ("two processes see {} times the images per second", f.two(f.images_gained())),
+        ],
+        "cuda.md": [
+            ("the blend has {} registers and", f.registers("blend")[0]),
+            ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),
+            (
+                "Its adjoints have {} to {} registers,",
+                *f.span(f.registers("manual", "stepwise", "reversible", "stored"), str),
+            ),
+            ("registers, {} % (`stored` {}).", f.resident("manual"), f.resident("stored")),
+            (
+                "projection and colors have {} and {} registers, {} %:",
+                *f.registers("project", "adjoint of shade"),
+                f.resident("project"),
+            ),
+        ],
+    }
+
+
+def filled(name: str, page: str) -> str:
+    """The text of a page with its figures.
+
+    Raises:
+        LookupError: if a sentence is not in it, or more than once.
+    """
+    for sentence, *values in sentences().get(name, []):
+        pieces = [re.sub(r"(?:\\?\s)+", r"\\s+", re.escape(piece)) for piece in sentence.split("{}")]
+        found = list(re.finditer(r"([^|]{1,60}?)".join(pieces), page))
+        if len(found) != 1:
+            raise LookupError(f"{name}: expected once, found {len(found)} times: {sentence}")
+        for number, value in reversed(list(enumerate(values, 1))):
+            if " ".join(found[0][number].split()) != str(value):
+                page = page[: found[0].start(number)] + str(value) + page[found[0].end(number) :]
+    return page
