@@ -18,8 +18,9 @@ from scenes import BlendScene, blend_scene
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.raster.api import Blend, Dropped
-from warp_splat.raster.bin import Bins, balanced_slices
+from warp_splat.raster.bin import balanced_slices
+from warp_splat.raster.blend import blend as blend_splats
+from warp_splat.raster.data import Bins, Splats2D
 from warp_splat.runtime import launch
 
 
@@ -30,8 +31,9 @@ class Lanes:
         splats = scene.splats
         self.mode = mode
         # the blend takes their values from the splats; tensors are there to receive gradients (of conics for roots)
-        fields = ("mean", "root", "opacity", "color", "depth")
-        self.tensors = [torch.from_numpy(splats[name].copy()).requires_grad_() for name in fields]
+        fields = ("mean", "root", "opacity", "color", "depth", "extent")
+        tensors = [torch.from_numpy(splats[name].copy()).requires_grad_() for name in fields]
+        self.projected = Splats2D(*tensors, radii=torch.ones(len(splats), dtype=torch.int32))
         self.camera = Camera(scene.width, scene.height, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))
         self.scene, self.upstream = scene, upstream
         self.order = wp.array(np.arange(len(splats), dtype=np.int32), dtype=int, device="cpu")
@@ -41,12 +43,12 @@ class Lanes:
 
     def forward(self) -> None:
         slices = balanced_slices(self.scene.ranges[:, 1])
-        bins = Bins(self.order, self.splats, *self.lists, slices, self.scene.tiles_x, invalid=0)
-        black = torch.zeros(3)
-        self.image, _, _ = Blend.apply(*self.tensors, black, bins, self.camera, RasterOptions(), self.mode, Dropped())
+        count = len(self.scene.splats)
+        bins = Bins(count, self.order, self.splats, *self.lists, slices, self.scene.tiles_x, invalid=0)
+        self.image = blend_splats(self.projected, bins, torch.zeros(3), self.camera, RasterOptions(), self.mode).image
 
     def adjoint(self) -> None:
-        self.grads = torch.autograd.grad(self.image, self.tensors[:4], self.upstream, retain_graph=True)
+        self.grads = torch.autograd.grad(self.image, self.projected[:4], self.upstream, retain_graph=True)
 
 
 class Scalar:

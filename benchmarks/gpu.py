@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -34,8 +33,7 @@ from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
 from warp_splat.formats.atomic import atomic_write, write_json
-from warp_splat.raster import api
-from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
+from warp_splat.raster.drivers import CUDA, using
 from warp_splat.runtime.devices import is_out_of_memory
 from warp_splat.runtime.launch import prepare
 from warp_splat.text import format_table
@@ -224,11 +222,7 @@ def main() -> None:
         return
     results, driver = Results(arguments.out, device, arguments.seconds), nullcontext()
     if device == "cpu":  # the kernels of a GPU, in fibers
-        wp.config.enable_cpu_blocks = True
-        case, driver = (
-            (500, 64, 40),
-            patch.multiple(api, blend_lanes=blend_blocks, adjoint_of_lanes=adjoint_of_blocks),
-        )
+        case, driver = (500, 64, 40), using(CUDA)
     expected = expectation(arguments.expected, case)
     with driver:
         check(results, device, case, expected)

@@ -1,6 +1,6 @@
 """For ``gpu.py``: the two blends alone, their share of what the card can do, and slots against atomics.
 
-Slots: each tile instance has a row of its own, ``adjoints.gather`` sums a Gaussian's rows in order. Atomics: the same
+Slots: each tile instance has a row of its own, ``gather`` sums a Gaussian's rows in order. Atomics: the same
 kernel adds into the Gaussian's row at once; no rows per instance, no second kernel, another sum in every run.
 """
 
@@ -11,11 +11,10 @@ from gpu_scene import cameras, make_gaussians, milliseconds
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.cuda.adjoint import make_reverse_block
-from warp_splat.raster.adjoints import gather, list_inputs
-from warp_splat.raster.api import Dropped
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.cuda import THREADS, blend_blocks, spread_upstream
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.cuda import THREADS, spread_upstream
+from warp_splat.raster.data import Gaussians, Pixels
+from warp_splat.raster.drivers import CUDA
+from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, launch_blocks, view
 
 #: Floating-point operations for one Gaussian at one pixel (operators of kernels/blend.py and kernels/step.py).
@@ -58,32 +57,30 @@ def add(rows: wp.array2d[float], instance: int, splat: int, column: int, value: 
 class Blends:
     """The launches of a forward pass and its ``manual`` adjoint by the kernels of a GPU, one by one."""
 
-    def __init__(self, gaussians: tuple[torch.Tensor, ...], camera: Camera):
+    def __init__(self, gaussians: Gaussians, camera: Camera):
         self.camera, self.options = camera, RasterOptions()
-        self.background = torch.zeros(3, device=gaussians[0].device)
+        self.background = torch.zeros(3, device=gaussians.means.device)
         with torch.no_grad():
-            cam = camera_view(camera, gaussians[5].shape[1], self.options)
-            self.projected = Project.apply(*gaussians, cam, Dropped())
-            self.bins = bin_tiles(*self.projected, camera, self.options)
-        self.count, new = len(gaussians[0]), self.background.new_empty
-        self.slots = new(len(self.bins.instances), 9)
+            self.splats = project(gaussians, camera, self.options)
+            self.bins = CUDA.bin(self.splats, camera, self.options)
+        self.count, new = len(gaussians.means), self.background.new_empty
+        self.slots = self.bins.new_slots(self.options)
         self.forward()
-        pixels = (torch.ones_like(self.image), torch.zeros_like(self.image[..., 0]), new(0, 0))
-        self.adj_pixels = pixels
+        self.adj_pixels = Pixels(torch.ones_like(self.image), torch.zeros_like(self.image[..., 0]), new(0, 0))
         self.upstream(self.slots)
         self.rows = new(len(self.bins.gaussians), 9)
 
     def forward(self) -> None:
-        self.image, _, _, saved = blend_blocks(self.bins, self.camera, self.background, self.options, False)
-        self.final, self.stopped, _ = saved
+        pixels, (self.final, self.stopped, _) = CUDA.blend(self.bins, self.camera, self.background, self.options, False)
+        self.image = pixels.image
 
     def upstream(self, slots: torch.Tensor) -> None:
         states = (self.background, self.final, self.stopped)
         found = spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
-        self.up, self.adj_final, _, _, self.steps = found
+        (self.up, self.adj_final), _, _, self.steps = found
 
     def reverse(self, rows: torch.Tensor, *write: wp.Function) -> None:
-        lists = list_inputs(self.bins, self.options)
+        lists = self.bins.views(self.options)
         states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
         inputs = [*lists, *states, view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
         kernel = make_reverse_block("manual", False, self.options.exp_degree, *write)
@@ -93,7 +90,7 @@ class Blends:
         self.reverse(self.slots)
 
     def gather(self) -> list[torch.Tensor]:
-        return gather(self.bins, self.slots, self.count)[:4]
+        return CUDA.gather(self.bins, self.slots)[:4]  # all but those of the depths
 
     def by_atomics(self) -> torch.Tensor:
         self.rows.zero_()

@@ -11,6 +11,7 @@ from warp_splat.compare.workloads import layered
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
 from warp_splat.rendering.camera_paths import ORBIT_SIZE
 from warp_splat.rendering.command import make_picture
 from warp_splat.runtime import launch
@@ -97,13 +98,13 @@ def measure_orbit(count: int, device: str, frames: int) -> list[list]:
 
 def measure_modes(count: int, width: int, height: int, device: str, repeats: int) -> list[list]:
     """Forward and backward pass in every mode: time, and memory beyond the Gaussians."""
-    gaussians = [tensor.detach().requires_grad_() for tensor in make_gaussians(count, device).activated()]
+    gaussians = Gaussians(*(tensor.detach().requires_grad_() for tensor in make_gaussians(count, device).activated()))
     (camera,), background = cameras(width, height, 1), torch.zeros(3, device=device)
     rows = []
     for mode in ADJOINTS:
 
         def forward(mode=mode) -> torch.Tensor:
-            return render(tuple(gaussians), camera, background, RasterOptions(), mode).image
+            return render(gaussians, camera, background, RasterOptions(), mode).image
 
         def both(forward=forward) -> None:
             image = forward()

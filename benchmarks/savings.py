@@ -24,10 +24,11 @@ from common import machine, write_table
 from gpu_scene import NEVER, steps_of
 from step import add_arguments, synthetic, trained
 
-from warp_splat.raster import api, cpu
-from warp_splat.raster.api import Dropped, render
-from warp_splat.raster.bin import Bins
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster import cpu
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Bins, Gaussians
+from warp_splat.raster.drivers import CPU, using
+from warp_splat.raster.project import project
 from warp_splat.runtime import launch
 from warp_splat.scene.images import read_rgb
 from warp_splat.training.trainer import Trainer
@@ -88,24 +89,23 @@ def frozen(trainer: Trainer) -> Iterator[None]:
 def every_block(_: Trainer) -> AbstractContextManager:
     """All blocks of a tile for each Gaussian that it lists."""
 
-    def bin_tiles(*arguments) -> Bins:
-        bins = original(*arguments)
+    def bin_wide(*arguments) -> Bins:
+        bins = CPU.bin(*arguments)
         bins.splats.numpy()["extent"] = 1e9
         return bins
 
-    original = api.bin_tiles
-    return patch.object(api, "bin_tiles", bin_tiles)
+    return using(replace(CPU, bin=bin_wide))
 
 
 def whole_lists(_: Trainer) -> AbstractContextManager:
     """The adjoint from the end of each tile's list, not from where its last pixel stopped."""
 
-    def adjoint_of_blend(mode, bins: Bins, chosen, states, steps: torch.Tensor, slots) -> None:
+    def differentiate(mode, bins: Bins, chosen, saved, upstream, steps: torch.Tensor, slots) -> None:
         steps.copy_(bins.ranges[:, 1] - bins.ranges[:, 0])
-        original(mode, bins, chosen, states, steps, slots)
+        original(mode, bins, chosen, saved, upstream, steps, slots)
 
-    original = cpu.adjoint_of_blend
-    return patch.object(cpu, "adjoint_of_blend", adjoint_of_blend)
+    original = cpu.differentiate
+    return patch.object(cpu, "differentiate", differentiate)
 
 
 CASES = (
@@ -170,19 +170,18 @@ def difference(trainer: Trainer, case: Case) -> str:
 def measure_projection(trainer: Trainer) -> list[str]:
     """Projection and its adjoint, against as many Gaussians that are all seen: copies of those that are."""
     camera, chosen = trainer.scene.train[0].camera, trainer.options
-    everything = tuple(tensor.detach() for tensor in trainer.model.activated())
-    cam = camera_view(camera, everything[5].shape[1], chosen)
-    seen = (Project.apply(*everything, cam, Dropped())[6] > 0).nonzero()[:, 0]
-    count = len(everything[0])
+    everything = Gaussians(*(tensor.detach() for tensor in trainer.model.activated()))
+    seen = (project(everything, camera, chosen).radii > 0).nonzero()[:, 0]
+    count = len(everything.means)
     copied = seen.repeat(-(-count // len(seen)))[:count].sort().values
     ways = [
-        tuple(tensor[rows].requires_grad_() for tensor in everything) for rows in (copied, torch.arange(count))
-    ]  # fmt: skip
+        Gaussians(*(tensor[rows].requires_grad_() for tensor in everything)) for rows in (copied, torch.arange(count))
+    ]
     found: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS * STEPS):
         for times, gaussians in zip(found, ways, strict=True):
             start = time.perf_counter()
-            out = Project.apply(*gaussians, cam, Dropped())[:5]
+            out = project(gaussians, camera, chosen)[:5]  # what has gradients
             torch.autograd.grad(out, gaussians, [torch.ones_like(tensor) for tensor in out])
             times.append(time.perf_counter() - start)
     name = f"projection and adjoint of the {100 - 100 * len(seen) / count:.0f} % of Gaussians not seen (alone)"

@@ -23,9 +23,8 @@ from gpu_scene import make_trainer
 
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, new_figure, plain_axes, save_figure
-from warp_splat.raster.api import Dropped
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.drivers import CPU
+from warp_splat.raster.project import project
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.text import format_table
@@ -131,8 +130,8 @@ def count_instances(trainer: Trainer) -> int:
     counts = []
     with torch.no_grad():
         for camera in (view.camera for view in trainer.scene.train):
-            projected = Project.apply(*gaussians, camera_view(camera, gaussians[5].shape[1], options), Dropped())
-            counts.append(len(bin_tiles(*projected, camera, options).instances))
+            bins = CPU.bin(project(gaussians, camera, options), camera, options)
+            counts.append(len(bins.instances))
     return round(statistics.mean(counts))
 
 

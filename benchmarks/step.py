@@ -28,6 +28,7 @@ from work import Counts, count, mean, work_of
 from warp_splat.config import RasterOptions
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.data import Gaussians
 from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
 from warp_splat.training.trainer import Trainer
@@ -131,7 +132,7 @@ def main() -> None:
     limits = {threads: measure_limits(threads) for threads in THREADS}
     rows, notes, data = [], [], {"machine": machine(), "limits": {k: v._asdict() for k, v in limits.items()}}
     for name, trainer, rounds in trainers(arguments):
-        gaussians = tuple(tensor.detach() for tensor in trainer.model.activated())
+        gaussians = Gaussians(*(tensor.detach() for tensor in trainer.model.activated()))
         counts = mean([count(gaussians, view.camera, RasterOptions()) for view in trainer.scene.train])
         times = time_steps(trainer, rounds)
         added, data[name] = rows_of(name, times, counts, limits)

@@ -26,11 +26,9 @@ from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, offset_x, offset_y, reach
 from warp_splat.kernels.lanes import LANES, total, vec16, where_less
 from warp_splat.kernels.splat import Splat2D, alpha_of, exponent, make_exp
-from warp_splat.raster.adjoints import list_inputs
-from warp_splat.raster.api import Dropped
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.cpu import blend_lanes
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import CPU
+from warp_splat.raster.project import camera_view, project
 from warp_splat.runtime.launch import launch, view
 
 FORWARD, ADJOINT = 31, 49  # operations per pair
@@ -96,19 +94,20 @@ class Counts:
     looked_at: float  # Gaussians in pixels of blocks of 4 x 4
 
 
-def count(gaussians: tuple[torch.Tensor, ...], camera: Camera, options: RasterOptions) -> Counts:
+def count(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> Counts:
     """Of one view on the CPU; ``gaussians`` as :func:`warp_splat.raster.api.render` takes them."""
     with torch.no_grad():
-        cam = camera_view(camera, gaussians[5].shape[1], options)
-        bins = bin_tiles(*Project.apply(*gaussians, cam, Dropped()), camera, options)
-        _, _, _, (_, stopped, _) = blend_lanes(bins, camera, torch.zeros(3), options, False)
+        bins = CPU.bin(project(gaussians, camera, options), camera, options)
+        _, (_, stopped, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
         pairs = torch.empty(len(bins.ranges), 2, dtype=torch.int64)
-        inputs = [*list_inputs(bins, options), view(stopped, vec16), camera.width, camera.height]
+        inputs = [*bins.views(options), view(stopped, vec16), camera.width, camera.height]
         launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
     blended, looked_at = pairs.sum(0).tolist()
     pixels = camera.width * camera.height
-    coefficients = (cam.sh_degree + 1) ** 2
-    return Counts(len(gaussians[0]), coefficients, len(bins.gaussians), pixels, len(bins.instances), blended, looked_at)
+    coefficients = (camera_view(camera, gaussians.sh_rest.shape[1], options).sh_degree + 1) ** 2
+    return Counts(
+        len(gaussians.means), coefficients, len(bins.gaussians), pixels, len(bins.instances), blended, looked_at
+    )
 
 
 def mean(counts: list[Counts]) -> Counts:

@@ -10,9 +10,10 @@ from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.api import Dropped, rasterize
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.api import rasterize
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.project import project
 from warp_splat.rendering.command import load_trained_scene
 from warp_splat.training.loss import image_loss
 
@@ -26,15 +27,15 @@ def draw(model: str, images: Path) -> list[Path]:
     scene = load_trained_scene(model, "", trained, lambda line: None)
     view = scene.evaluated[1][0]
     activated = GaussianModel.from_splats(gaussians.splats).activated()
-    activated = [tensor.detach() for tensor in activated]
-    arguments = (*activated[:4], (activated[4], activated[5]), view.camera)
-    leaf = activated[0].requires_grad_()
-    out = rasterize(leaf, *arguments[1:])
+    activated = Gaussians(*(tensor.detach() for tensor in activated))
+    means, quats, scales, opacities, *sh = activated
+    arguments = (means.requires_grad_(), quats, scales, opacities, sh, view.camera)
+    out = rasterize(*arguments)
     out.means2d.retain_grad()
     image_loss(out.image, torch.from_numpy(view.image), 0.2).backward()
     with torch.no_grad():
-        projected = Project.apply(*activated, camera_view(view.camera, 15, RasterOptions()), Dropped())
-        ranges = bin_tiles(*projected, view.camera, RasterOptions()).ranges
+        splats = project(activated, view.camera, RasterOptions())
+        ranges = driver_of(means.device).bin(splats, view.camera, RasterOptions()).ranges
         early = rasterize(*arguments, options=RasterOptions(max_steps=FEW)).image.numpy()
     lists = (ranges[:, 1] - ranges[:, 0]).reshape(-(-view.camera.height // TILE), -1).numpy()
     paths = [images / "renderer.jpg", images / "renderer_pixel.png"]

@@ -1,13 +1,16 @@
 """Tile lists against a loop over every pixel of every tile."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from warp_splat import Camera, InputError, RasterOptions, set_threads
-from warp_splat.raster import adjoints, api, bin
-from warp_splat.raster.api import Dropped
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster import api, bin, cpu
+from warp_splat.raster import project as projection
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime.launch import get_threads
 
 SIZE = (70, 53)
@@ -21,9 +24,8 @@ def project(count=300, seed=0, size=SIZE, stretch=1.0, options=PLAIN):
     scales = torch.exp(stretch * torch.randn(count, 3, generator=generator) - 3.0)
     quats, opacities = torch.randn(count, 4, generator=generator), torch.rand(count, generator=generator)
     camera = Camera(*size, 60.0, 55.0, 0.43 * size[0], 0.51 * size[1], np.eye(3), np.zeros(3))
-    view = camera_view(camera, 0, options)
-    tensors = (means, quats, scales, opacities, torch.zeros(count, 1, 3), torch.zeros(count, 0, 3))
-    return camera, Project.apply(*tensors, view, Dropped())
+    gaussians = Gaussians(means, quats, scales, opacities, torch.zeros(count, 1, 3), torch.zeros(count, 0, 3))
+    return camera, projection.project(gaussians, camera, options)
 
 
 def lists(bins):
@@ -36,7 +38,7 @@ def lists(bins):
 def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
     camera, projected = project(seed=seed)
     means2d, conics, opacities, _, depths, _, radii = (tensor.double().numpy() for tensor in projected)
-    found = lists(bin.bin_tiles(*projected, camera, RasterOptions()))
+    found = lists(CPU.bin(projected, camera, RasterOptions()))
     spare = 0
     for tile, listed in enumerate(found):
         left, top = tile % 5 * 16, tile // 5 * 16
@@ -64,18 +66,19 @@ def test_places_are_those_of_each_splat():
 @pytest.mark.parametrize("width", [9, 10])
 def test_rows_are_summed_by_gaussian(width, monkeypatch):
     """Whoever shares the work: bit for bit the sums that one gets from first to last."""
-    monkeypatch.setattr(adjoints, "AT_ONCE", 700)
+    monkeypatch.setattr(cpu, "AT_ONCE", 700)
     camera, projected = project(5000)
     threads = get_threads()
     try:
-        for bins in counted_and_sorted(camera, projected):
+        for driver in (CPU, CUDA):
+            bins = driver.bin(projected, camera, PLAIN)
             slots = torch.randn(len(bins.instances), width, generator=torch.Generator().manual_seed(1))
             sums = np.zeros((5000, width), np.float32)
             first_to_last = bins.gaussians.numpy()[bins.instances.numpy()[bins.places.numpy()]]
             np.add.at(sums, first_to_last, slots.numpy()[bins.places.numpy()])
             for count in (1, 2, 3):
                 set_threads(count)
-                found = adjoints.gather(bins, slots, 5000)
+                found = driver.gather(bins, slots)
                 assert [grad.shape[1:].numel() for grad in found] == [2, 3, 1, 3, 1]
                 assert width == 10 or not found[4].any()
                 assert (torch.cat([grad.view(5000, -1) for grad in found], 1)[:, :width].numpy() == sums).all()
@@ -92,23 +95,23 @@ def torch_threads():
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_rows_are_summed_in_any_mode_of_torch(count, torch_threads, monkeypatch):
-    monkeypatch.setattr(adjoints, "AT_ONCE", 100)
+    monkeypatch.setattr(cpu, "AT_ONCE", 100)
     torch_threads(count)
     camera, projected = project(2000)
-    bins = bin.bin_tiles(*projected, camera, PLAIN)
+    bins = CPU.bin(projected, camera, PLAIN)
     slots = torch.rand(len(bins.instances), 9)
-    expected = adjoints.gather(bins, slots, 2000)
+    expected = CPU.gather(bins, slots)
     with torch.inference_mode():
-        found = adjoints.gather(bins, slots, 2000)
+        found = CPU.gather(bins, slots)
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
 def test_without_gaussians_or_instances_sums_are_zero():
     for count in (0, 2000):
         camera, projected = project(count)
-        projected[-1][:] = 0  # radii
-        bins = bin.bin_tiles(*projected, camera, PLAIN)
-        assert not torch.cat([grad.view(-1) for grad in adjoints.gather(bins, torch.empty(0, 9), count)]).any()
+        projected.radii[:] = 0
+        bins = CPU.bin(projected, camera, PLAIN)
+        assert not torch.cat([grad.view(-1) for grad in CPU.gather(bins, torch.empty(0, 9))]).any()
 
 
 def test_the_number_of_threads_changes_nothing():
@@ -118,7 +121,7 @@ def test_the_number_of_threads_changes_nothing():
         results = []
         for count in (1, 2, 3):
             set_threads(count)
-            results.append(bin.bin_tiles(*projected, camera, RasterOptions()))
+            results.append(CPU.bin(projected, camera, RasterOptions()))
     finally:
         set_threads(threads)
     for other in results[1:]:
@@ -128,7 +131,7 @@ def test_the_number_of_threads_changes_nothing():
 
 
 def counted_and_sorted(camera, projected, options=PLAIN):
-    return [bin_on(*projected, camera, options) for bin_on in (bin.bin_by_counting, bin.bin_by_sorting)]
+    return [bin_on(projected, camera, options) for bin_on in (bin.bin_by_counting, bin.bin_by_sorting)]
 
 
 def listed(bins):
@@ -160,16 +163,15 @@ def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, optio
 
 def test_sorting_breaks_ties_by_index_and_leaves_out_what_is_invalid():
     camera, projected = project(400)
-    *_, depths, _, radii = projected
     with torch.no_grad():
-        depths[:] = (4.0 * depths).round() / 4.0
-        radii[7] = -1
+        projected.depths[:] = (4.0 * projected.depths).round() / 4.0
+        projected.radii[7] = -1
     counted, by_sorting = counted_and_sorted(camera, projected)
     assert (listed(by_sorting) == listed(counted)).all() and torch.equal(by_sorting.ranges, counted.ranges)
     assert int(by_sorting.invalid) == counted.invalid == 1
 
 
-def test_images_and_gradients_are_the_same_from_sorted_lists(monkeypatch):
+def test_images_and_gradients_are_the_same_from_sorted_lists():
     """A GPU ranks the Gaussians that are not drawn, too."""
     generator, results = torch.Generator().manual_seed(5), []
     means = torch.randn(400, 3, generator=generator) * 1.5 + torch.tensor([0.0, 0.0, 3.0])
@@ -177,10 +179,10 @@ def test_images_and_gradients_are_the_same_from_sorted_lists(monkeypatch):
     tensors = (means, torch.randn(400, 4, generator=generator), scales, torch.rand(400, generator=generator))
     sh = torch.randn(400, 4, 3, generator=generator)
     camera = Camera(*SIZE, 60.0, 55.0, 30.0, 27.0, np.eye(3), np.zeros(3))
-    for bin_on in (bin.bin_by_counting, bin.bin_by_sorting):
-        monkeypatch.setattr(api, "bin_tiles", bin_on)
+    for driver in (CPU, replace(CPU, bin=CUDA.bin, gather=CUDA.gather)):
         leaves = [tensor.clone().requires_grad_() for tensor in (*tensors, sh)]
-        out = api.rasterize(*leaves, camera)
+        with using(driver):
+            out = api.rasterize(*leaves, camera)
         assert 0 < (out.radii > 0).sum() < 400
         results.append([out.image, *torch.autograd.grad(out.image.square().sum(), leaves)])
     assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
@@ -190,31 +192,30 @@ def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
     camera, projected = project()
     monkeypatch.setattr(bin, "MAX_INSTANCES", 100)
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        bin.bin_tiles(*projected, camera, RasterOptions())
+        CPU.bin(projected, camera, RasterOptions())
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        bin.bin_by_sorting(*projected, camera, RasterOptions())
+        bin.bin_by_sorting(projected, camera, RasterOptions())
 
 
 @pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
 def test_the_count_does_not_wrap(bin_on):
     """70,000 Gaussians that cover 188 x 182 tiles each: 32 bits would see a negative number of instances."""
     camera, projected = project(70_000, size=(3000, 2900), stretch=0.0)
-    *_, opacities, _, depths, extents, radii = projected
     with torch.no_grad():
-        for tensor, value in ((opacities, 0.5), (depths, 4.0), (extents, 1e5), (radii, 100_000)):
-            tensor.fill_(value)
-        projected[1][:] = torch.tensor([1e-10, 0.0, 1e-10])
+        for name, value in (("opacities", 0.5), ("depths", 4.0), ("extents", 1e5), ("radii", 100_000)):
+            getattr(projected, name).fill_(value)
+        projected.conics[:] = torch.tensor([1e-10, 0.0, 1e-10])
     with pytest.raises(InputError, match=f"touch tiles {70_000 * 188 * 182} times, more than the 2147483647"):
-        bin_on(*projected, camera, RasterOptions(extent="ellipse"))
+        bin_on(projected, camera, RasterOptions(extent="ellipse"))
 
 
 @pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
 def test_one_tile_with_too_many_is_refused(bin_on, monkeypatch):
     camera, projected = project()
-    longest = max(map(len, lists(bin.bin_tiles(*projected, camera, PLAIN))))
+    longest = max(map(len, lists(CPU.bin(projected, camera, PLAIN))))
     monkeypatch.setattr(bin, "MAX_TILE", longest)
-    bin_on(*projected, camera, PLAIN)
+    bin_on(projected, camera, PLAIN)
     monkeypatch.setattr(bin, "MAX_TILE", longest - 1)
     message = f"one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {longest - 1} that fit"
     with pytest.raises(InputError, match=message):
-        bin_on(*projected, camera, PLAIN)
+        bin_on(projected, camera, PLAIN)

@@ -1,31 +1,26 @@
 """The CUDA kernels on the CPU, by Warp's fibers: equal to the float64 oracle and to the CPU's driver, in every mode.
 
-What is replaced is the choice of the driver alone; all else is the renderer as users call it.
+The driver alone is another one; all else is the renderer as users call it.
 """
 
 import pytest
 import torch
-import warp as wp
 from test_rasterize import check_gradients, check_image, relative_error, run, truth
 
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.raster import api
-from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
+from warp_splat.raster.drivers import CUDA, using
 
 SCENES = ("degree1", "dense_tile", "saturated", "needles", "ties", "size_1x1", "size_17x33", "single", "empty")
 PLAIN = RasterOptions()
 
 
 @pytest.fixture
-def blocks(monkeypatch):
+def blocks():
     """The renderer with the driver of a GPU, in fibers."""
-    before = wp.config.enable_cpu_blocks
-    wp.config.enable_cpu_blocks = True
-    monkeypatch.setattr(api, "blend_lanes", blend_blocks)
-    monkeypatch.setattr(api, "adjoint_of_lanes", adjoint_of_blocks)
-    yield
-    wp.config.enable_cpu_blocks = before
+    with using(CUDA):
+        yield
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
@@ -38,10 +33,10 @@ def test_against_the_oracle(name, adjoint, blocks):
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
-def test_against_the_lanes(adjoint, blocks, monkeypatch):
+def test_against_the_lanes(adjoint):
     options = RasterOptions(depth=True, alpha_min=1e-3, t_min=1e-3)
-    first, gradients = run("dense_tile", "cpu", options, adjoint)
-    monkeypatch.undo()
+    with using(CUDA):
+        first, gradients = run("dense_tile", "cpu", options, adjoint)
     second, expected = run("dense_tile", "cpu", options, adjoint)
     for key in ("image", "alpha"):
         assert (getattr(first, key) - getattr(second, key)).abs().max() < 1e-6, key
@@ -71,8 +66,8 @@ def test_pixels_that_are_not_finite_are_dropped(blocks):
     assert all(map(torch.equal, *results))
 
 
-def test_loop_cap(blocks, monkeypatch):
+def test_loop_cap():
     options = RasterOptions(max_steps=100)
-    image = run("dense_tile", "cpu", options)[0].image
-    monkeypatch.undo()
+    with using(CUDA):
+        image = run("dense_tile", "cpu", options)[0].image
     assert (image - run("dense_tile", "cpu", options)[0].image).abs().max() < 1e-6

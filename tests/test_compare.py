@@ -15,12 +15,9 @@ from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.lanes import LANES, vec16
-from warp_splat.raster import api
-from warp_splat.raster.adjoints import list_inputs
-from warp_splat.raster.api import Blend, Dropped
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, view
 
 PLAIN = RasterOptions()
@@ -30,7 +27,7 @@ WITHOUT_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is acc
 def workload(name="degree1"):
     """A test scene as the comparison takes it; every pixel is looked at."""
     scene = SCENES[name]()
-    tensors = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh[:, :1], scene.sh[:, 1:])
+    tensors = Gaussians(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh[:, :1], scene.sh[:, 1:])
     pixels = torch.cartesian_prod(torch.arange(scene.camera.height), torch.arange(scene.camera.width))
     return workloads.Workload(name, tensors, scene.camera, scene.background, PLAIN, pixels)
 
@@ -39,13 +36,9 @@ def workload(name="degree1"):
 def test_what_is_differentiated_is_the_blend(mode):
     """The loop whose adjoint Warp generates computes the colors and transmittances of the forward kernel."""
     given = workload("dense_tile")
-    cam = camera_view(given.camera, 3, PLAIN)
-    *projected, extents, radii = Project.apply(*given.gaussians, cam, Dropped())
-    bins = bin_tiles(*projected, extents, radii, given.camera, PLAIN)
-    black = torch.zeros(3, requires_grad=True)
-    image, _, _ = Blend.apply(*projected, black, bins, given.camera, PLAIN, "manual", Dropped())
-    final, count, kept = image.grad_fn.saved_tensors[1:]
-    lists, steps = list_inputs(bins, PLAIN), count.amax((1, 2)).int()
+    bins = CPU.bin(project(given.gaussians, given.camera, PLAIN), given.camera, PLAIN)
+    (image, _, _), (final, count, kept) = CPU.blend(bins, given.camera, torch.zeros(3), PLAIN, False)
+    lists, steps = bins.views(PLAIN), count.amax((1, 2)).int()
     if mode == "generated":
         lists[3] = wp.array(bins.splats.numpy()[bins.instances.numpy()], dtype=bins.splats.dtype, device="cpu")
     color, behind = torch.zeros(len(final), 3 * BLOCKS, LANES), torch.zeros_like(final)
@@ -94,8 +87,7 @@ def test_error_measures():
 
 def test_layered_scenes_are_as_deep_as_they_say():
     given = workloads.layered(100)
-    *projected, extents, radii = Project.apply(*given.gaussians, camera_view(given.camera, 0, PLAIN), Dropped())
-    bins = bin_tiles(*projected, extents, radii, given.camera, PLAIN)
+    bins = CPU.bin(project(given.gaussians, given.camera, PLAIN), given.camera, PLAIN)
     assert (bins.ranges[:, 1] - bins.ranges[:, 0] > 90).all()
 
 
@@ -140,16 +132,14 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
 
 def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
     """Its kernels run in fibers, its memory is told by a stub; all else is what a card would see."""
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setattr(api, "blend_lanes", blend_blocks)
-    monkeypatch.setattr(api, "adjoint_of_lanes", adjoint_of_blocks)
     monkeypatch.setattr(workloads, "LAYERED_SIZE", 16)
     monkeypatch.setattr(workloads.Workload, "device", torch.device("cuda"))
     for name, value in (("memory_allocated", 3), ("max_memory_allocated", 10), ("reset_peak_memory_stats", None)):
         monkeypatch.setattr(torch.cuda, name, lambda device, value=value: value)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     said = []
-    measured = adjoints.measure([workloads.layered(10)], ADJOINTS, said.append)
+    with using(CUDA):
+        measured = adjoints.measure([workloads.layered(10)], ADJOINTS, said.append)
     names = [item.variant for item in measured]
     assert names == [*ADJOINTS, *(f"cap {cap}" for cap in adjoints.CAPS), "central differences"]
     assert "Left out: generated, plain" in said[0]
@@ -160,7 +150,7 @@ def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
 
 
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
-    monkeypatch.setattr("warp_splat.raster.adjoints.available_memory", lambda device: 2**10)
+    monkeypatch.setattr("warp_splat.raster.bin.available_memory", lambda device: 2**10)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     measured = adjoints.measure([workload()], ["stored"], lambda _: None)
     row = next(item for item in measured if item.variant == "stored")

@@ -1,15 +1,18 @@
 """Which device is chosen, why a GPU is refused, and a self-test that finds one that computes nothing, or wrongly."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import warp as wp
 
 from warp_splat import InputError
 from warp_splat.config import ADJOINTS
-from warp_splat.raster import api, cpu, selftest
+from warp_splat.raster import cpu, selftest
+from warp_splat.raster.drivers import CPU, using
 from warp_splat.runtime import devices, launch
 
-CPU = torch.device("cpu")
+HOST = torch.device("cpu")
 
 
 def machine(monkeypatch, built="13.2", toolkit=(13, 4), driver=(13, 4), available=True, error=None):
@@ -48,17 +51,17 @@ def test_why_a_gpu_cannot_be_used_and_what_to_do(found, words, monkeypatch):
     message = str(error.value)
     assert message.startswith("--device cuda: ") and message.endswith(", or use --device cpu.")
     assert all(word in message for word in words) and "\n" not in message
-    assert launch.prepare("auto", 0) == CPU
+    assert launch.prepare("auto", 0) == HOST
 
 
 def test_a_gpu_that_answers_is_chosen(monkeypatch):
     machine(monkeypatch)
     assert devices.choose_device("auto") == devices.choose_device("cuda") == torch.device("cuda", 1)
-    assert devices.choose_device("cpu") == CPU
+    assert devices.choose_device("cpu") == HOST
 
 
 def test_memory_that_can_be_had():
-    assert launch.available_memory(CPU) > 2**20
+    assert launch.available_memory(HOST) > 2**20
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
@@ -71,7 +74,7 @@ def test_kernels_that_do_nothing_are_found(monkeypatch):
     monkeypatch.setattr(torch, "empty", torch.zeros)
     monkeypatch.setattr(torch.Tensor, "new_empty", torch.Tensor.new_zeros)
     with pytest.raises(InputError, match=r"--device cpu: the self-test expected 0\.\d+ as a pixel and found 0: "):
-        selftest.check_device(CPU)
+        selftest.check_device(HOST)
 
 
 def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
@@ -80,34 +83,33 @@ def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
 
     monkeypatch.setattr(selftest, "check_device", fail)
     said = []
-    assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append) == CPU
+    assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append) == HOST
     assert "wrong. Going on with the CPU." in said[-1]
     with pytest.raises(InputError):
         selftest.settle_device(torch.device("cuda"), "cuda", say=said.append)
-    assert selftest.settle_device(CPU, "cpu", say=said.append) == CPU
+    assert selftest.settle_device(HOST, "cpu", say=said.append) == HOST
     monkeypatch.setattr(selftest, "check_device", lambda device, adjoint: None)
     assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append).type == "cuda"
 
 
 @pytest.mark.parametrize("factor", [0.0, 1.001, float("nan")])
-def test_a_wrong_gradient_is_found(factor, monkeypatch):
+def test_a_wrong_gradient_is_found(factor):
     def wrong(*arguments):
-        slots, adj_background, bad = cpu.adjoint_of_lanes(*arguments)
+        slots, adj_background, bad = CPU.adjoint(*arguments)
         return factor * slots, adj_background, bad
 
-    monkeypatch.setattr(api, "adjoint_of_lanes", wrong)
-    with pytest.raises(InputError, match=r"self-test expected \S+ as a gradient"):
-        selftest.check_device(CPU)
+    with using(replace(CPU, adjoint=wrong)), pytest.raises(InputError, match=r"self-test expected \S+ as a gradient"):
+        selftest.check_device(HOST)
 
 
 @pytest.mark.parametrize(
     ("error", "words"),
     [(RuntimeError("CUDA error 700\nmore"), r"CUDA error 700\)"), (torch.OutOfMemoryError("x"), "not enough memory")],
 )
-def test_kernels_that_cannot_run_are_explained(error, words, monkeypatch):
+def test_kernels_that_cannot_run_are_explained(error, words):
     def fail(*arguments):
         raise error
 
-    monkeypatch.setattr(api, "blend_lanes", fail)
-    with pytest.raises(InputError, match=f"--device cpu: .*{words}.* or use another device"):
-        selftest.check_device(CPU)
+    expected = pytest.raises(InputError, match=f"--device cpu: .*{words}.* or use another device")
+    with using(replace(CPU, blend=fail)), expected:
+        selftest.check_device(HOST)

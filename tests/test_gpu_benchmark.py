@@ -12,7 +12,10 @@ import warp as wp
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
-from warp_splat.raster.api import Blend, Dropped
+from warp_splat.raster.blend import blend
+from warp_splat.raster.data import Gaussians, Splats2D
+from warp_splat.raster.drivers import CPU
+from warp_splat.raster.project import project
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -29,14 +32,16 @@ def fibers(monkeypatch):
 
 def test_atomics_and_slots_give_the_gradients_of_the_product(fibers):
     """Against autograd through the CPU's driver, which shares no kernel with them."""
-    gaussians = tuple(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated())
+    gaussians = Gaussians(*(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated()))
     camera = gpu_scene.cameras(60, 40, 1)[0]
     blends = gpu_blends.Blends(gaussians, camera)
     blends.into_slots()
     found = {"slots": blends.gather(), "atomics": blends.by_gaussian(blends.by_atomics()).split([2, 3, 1, 3], 1)}
-    leaves = [tensor.detach().requires_grad_() for tensor in blends.projected[:5]]
-    image, *_ = Blend.apply(*leaves, torch.zeros(3), blends.bins, camera, RasterOptions(), "manual", Dropped())
-    expected = torch.autograd.grad(image.sum(), leaves[:4])
+    splats, options = project(gaussians, camera, RasterOptions()), RasterOptions()
+    leaves = [tensor.detach().requires_grad_() for tensor in splats[:4]]
+    splats = Splats2D(*leaves, *splats[4:])
+    image = blend(splats, CPU.bin(splats, camera, options), torch.zeros(3), camera, options).image
+    expected = torch.autograd.grad(image.sum(), leaves)
     assert (blends.image - image).abs().max() < 1e-6 and len(blends.slots) > 1500
     for way, gradients in found.items():
         for gradient, exact in zip(gradients, expected, strict=True):

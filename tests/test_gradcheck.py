@@ -8,7 +8,8 @@ from scenes import SCENES
 from warp_splat import InputError, RasterOptions, check_gradients
 from warp_splat.compare import oracle
 from warp_splat.config import ADJOINTS
-from warp_splat.raster import api, differences
+from warp_splat.raster import blend, differences, project
+from warp_splat.raster.checks import check_gaussians
 from warp_splat.raster.differences import INPUTS, INTERMEDIATES
 
 EVERYTHING = INPUTS + INTERMEDIATES
@@ -105,12 +106,12 @@ def make_means_not_finite(gradients):
 @pytest.mark.parametrize(
     ("function", "change", "named"),
     [
-        (api.Blend, scale_conics, {"conics", "quats", "scales"}),
-        (api.Blend, scale_opacities, {"opacities2d", "opacities"}),
-        (api.Blend, forget_background, {"background"}),
-        (api.Project, flip_one_entry_of_quats, {"quats"}),
-        (api.Project, forget_higher_degrees, {"sh"}),
-        (api.Project, make_means_not_finite, {"means"}),
+        (blend.Blend, scale_conics, {"conics", "quats", "scales"}),
+        (blend.Blend, scale_opacities, {"opacities2d", "opacities"}),
+        (blend.Blend, forget_background, {"background"}),
+        (project.Project, flip_one_entry_of_quats, {"quats"}),
+        (project.Project, forget_higher_degrees, {"sh"}),
+        (project.Project, make_means_not_finite, {"means"}),
     ],
 )
 def test_a_wrong_gradient_is_named(function, change, named, monkeypatch):
@@ -133,12 +134,12 @@ def test_turning_balls_changes_nothing(monkeypatch):
     )
     arguments = (means, upright, balls, opacities, sh, scene.camera)
     assert check_gradients(*arguments, parameters=["quats"]).ok
-    spoil(monkeypatch, api.Project, lambda gradients: gradients.__setitem__(1, gradients[1] + 1))
+    spoil(monkeypatch, project.Project, lambda gradients: gradients.__setitem__(1, gradients[1] + 1))
     assert check_gradients(*arguments, parameters=["quats"]).named("off") == ["quats"]
 
 
 def test_a_uniform_error_is_measured(monkeypatch):
-    spoil(monkeypatch, api.Blend, scale_conics)
+    spoil(monkeypatch, blend.Blend, scale_conics)
     report = check("degree1", parameters=["conics"])
     assert report.rows[0].error == pytest.approx(0.05, rel=0.02)
     assert report.worst.analytic == pytest.approx(1.05 * report.worst.difference, rel=0.01)
@@ -153,7 +154,7 @@ def test_the_gaussian_that_is_off_is_found(monkeypatch):
         gradients[2] = gradients[2].clone()
         gradients[2][loudest] = 0
 
-    spoil(monkeypatch, api.Project, change)
+    spoil(monkeypatch, project.Project, change)
     report = check("degree1")
     assert report.named("off") == ["scales"]
     assert (report.worst.name, report.worst.index) == ("scales", loudest)
@@ -170,9 +171,12 @@ def loud_gaussian():
 
 def subject(name, options=None, seed=0):
     """What check_gradients works on."""
-    scene = SCENES[name]()
-    values = dict(zip(INPUTS, [*scene.parameters(), scene.background], strict=True))
-    return differences.MovableScene(values, scene.camera, options or RasterOptions(), "manual", seed)
+    return movable(SCENES[name](), options, seed)
+
+
+def movable(scene, options=None, seed=0):
+    gaussians, options = check_gaussians(*scene.parameters()), options or RasterOptions()
+    return differences.MovableScene(gaussians, scene.background, scene.camera, options, "manual", seed)
 
 
 @pytest.mark.parametrize("name", ["degree2", "dense_tile"])
@@ -200,13 +204,12 @@ def test_boxes_grow_as_the_projection_says():
     """Conics and boxes of thicker Gaussians: the boxes that the check derives from the conics alone are the same."""
     thin, thick = subject("needles"), SCENES["needles"]()
     thick.scales.mul_(1.01)
-    values = dict(zip(INPUTS, [*thick.parameters(), thick.background], strict=True))
-    thick = differences.MovableScene(values, thick.camera, RasterOptions(), "manual", 0)
+    thick = movable(thick)
     drawn = (thin.radii > 0) & (thick.radii > 0)
     step = (thick.out.conics.double() - thin.out.conics.double()).detach()
-    grown = thin.extents * differences._growth(thin, "conics", step)
-    assert (grown / thick.extents - 1)[drawn].abs().max() < 2e-5
-    assert (thick.extents / thin.extents - 1)[drawn].max() > 1e-3
+    grown = thin.splats.extents * differences._growth(thin, "conics", step)
+    assert (grown / thick.splats.extents - 1)[drawn].abs().max() < 2e-5
+    assert (thick.splats.extents / thin.splats.extents - 1)[drawn].max() > 1e-3
 
 
 def test_deterministic_and_seeded():

@@ -11,8 +11,8 @@ import warp as wp
 
 from warp_splat import RasterOptions
 from warp_splat.config import ALPHA_MIN, T_MIN
-from warp_splat.raster.api import Dropped
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.project import project
 from warp_splat.runtime import launch
 
 ROOT = Path(__file__).parents[1]
@@ -34,12 +34,12 @@ def two_threads():
 
 
 def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
-    gaussians = tuple(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated())
-    gaussians = (*gaussians[:2], 3.0 * gaussians[2], gaussians[3].clamp_min(0.5), *gaussians[4:])  # pixels stop
+    gaussians = Gaussians(*(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated()))
+    # pixels stop
+    gaussians = gaussians._replace(scales=3.0 * gaussians.scales, opacities=gaussians.opacities.clamp_min(0.5))
     camera = gpu_scene.cameras(40, 30, 1)[0]
     found = work.count(gaussians, camera, RasterOptions())
-    cam = camera_view(camera, 15, RasterOptions())
-    means, conics, opacities, _, depths, _, radii = Project.apply(*gaussians, cam, Dropped())
+    means, conics, opacities, _, depths, _, radii = project(gaussians, camera, RasterOptions())
     drawn = np.flatnonzero(radii.numpy() > 0)
     order = drawn[np.argsort(depths.numpy()[drawn], kind="stable")]
     y, x = np.mgrid[:30, :40] + 0.5

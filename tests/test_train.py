@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.png import load_png
+from warp_splat.raster.drivers import CPU, DRIVERS
 
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "assets" / "still_life"
@@ -270,9 +272,9 @@ def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, 
 
 
 def fail_at(monkeypatch, target, call, error):
-    """Let a function raise ``error`` when it is called for the ``call``-th time."""
+    """Let a function, or one of the CPU's driver, raise ``error`` when it is called for the ``call``-th time."""
     module, name = target.rsplit(".", 1)
-    function, calls = getattr(importlib.import_module(module), name), []
+    function, calls = getattr(CPU if module == "driver" else importlib.import_module(module), name), []
 
     def failing(*arguments, **options):
         calls.append(0)
@@ -280,7 +282,10 @@ def fail_at(monkeypatch, target, call, error):
             raise error
         return function(*arguments, **options)
 
-    monkeypatch.setattr(target, failing)
+    if module == "driver":
+        monkeypatch.setitem(DRIVERS, "cpu", replace(CPU, **{name: failing}))
+    else:
+        monkeypatch.setattr(target, failing)
 
 
 def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
@@ -295,9 +300,9 @@ def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("target", "error", "where"),
     [
-        ("warp_splat.raster.api.bin_tiles", MemoryError(), "in stage 'bin'"),
-        ("warp_splat.raster.api.bin_tiles", RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), "'bin'"),
-        ("warp_splat.raster.api.adjoint_of_lanes", torch.OutOfMemoryError("CUDA out of memory."), "'adjoint of blend'"),
+        ("driver.bin", MemoryError(), "in stage 'bin'"),
+        ("driver.bin", RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), "'bin'"),
+        ("driver.adjoint", torch.OutOfMemoryError("CUDA out of memory."), "'adjoint of blend'"),
         (
             "warp_splat.training.trainer.image_loss",
             RuntimeError("[enforce fail] . not enough memory: you"),
@@ -325,7 +330,7 @@ def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
     ],
 )
 def test_memory_that_runs_out_while_rendering_is_explained(options, error, words, trained, monkeypatch, capsys):
-    fail_at(monkeypatch, "warp_splat.raster.api.bin_tiles", 3, error)
+    fail_at(monkeypatch, "driver.bin", 3, error)
     message = fails(capsys, "render", "-m", str(trained), *options)
     count = len(load_ply(ply_path(trained, 60)).means)
     assert all(word in message for word in (*words, f"Out of memory on cpu in stage 'bin', with {count} Gaussians"))

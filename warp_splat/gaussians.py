@@ -13,6 +13,8 @@ from torch.autograd.function import once_differentiable
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.harmonics import C0
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import in_slices, torch_slices
 
 INITIAL_OPACITY = 0.1
@@ -43,6 +45,7 @@ class Activate(torch.autograd.Function):
 
         in_slices(run, torch_slices(len(logits), logits.device))
         ctx.save_for_backward(scales, opacities)
+        ctx.peeks = driver_of(scales.device).peeks
         return scales, opacities
 
     @staticmethod
@@ -55,7 +58,7 @@ class Activate(torch.autograd.Function):
         def run(low: int, high: int) -> None:
             part = scales[low:high]
             torch.mul(adj_scales[low:high], part, out=adj_logarithms[low:high])
-            if scales.is_cuda or not part.max() < end:  # the clamp's share, rarely: zero beyond it, and of no number
+            if not (ctx.peeks and part.max() < end):  # the clamp's share, rarely: zero beyond it, and of no number
                 adj_logarithms[low:high].masked_fill_(~(part < end), 0.0)
             torch.mul(adj_opacities[low:high], 1.0 - opacities[low:high], out=adj_logits[low:high])
             adj_logits[low:high].mul_(opacities[low:high])
@@ -128,13 +131,13 @@ class GaussianModel:
             found["sh_rest"] = found["sh_rest"][:, : (degree + 1) ** 2 - 1]
         return list(found.values())
 
-    def activated(self, degree: int | None = None) -> tuple[torch.Tensor, ...]:
-        """(means, quats, scales, opacities, sh_dc, sh_rest) as the renderer takes them.
+    def activated(self, degree: int | None = None) -> Gaussians:
+        """As the renderer takes them.
 
         At ``degree`` 0, sh_rest is empty, so that none of the 45 numbers gets a gradient.
         """
         raw = self.parameters
-        return (
+        return Gaussians(
             raw["means"],
             raw["quats"],
             *Activate.apply(raw["scales"], raw["opacities"]),

@@ -1,7 +1,7 @@
 """Adjoint against adjoint: error, time and memory, by scene and parameter.
 
 All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
-instance (:mod:`warp_splat.raster.adjoints` says where they differ). Beside the modes of ``rasterize`` stand
+instance (:mod:`warp_splat.raster.cpu` says where they differ). Beside the modes of ``rasterize`` stand
 ``generated`` (``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong),
 the thesis's loop cap, and central differences.
 """
@@ -23,6 +23,7 @@ from warp_splat.compare.workloads import Workload
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
 from warp_splat.runtime import launch
 
 ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
@@ -95,7 +96,7 @@ def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[
 
 def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement:
     """Error and memory; compiles and warms up the kernels."""
-    result = Measurement(workload.name, variant.name, len(workload.gaussians[0]))
+    result = Measurement(workload.name, variant.name, len(workload.gaussians.means))
     if workload.device.type == "cpu":
         result.rules, result.plumbing = derivative_lines(variant.adjoint)
     options = variant.options(workload)
@@ -132,7 +133,7 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
 
 def _differentiate(workload: Workload, variant: Variant) -> None:
     """A forward and a backward pass over the whole image."""
-    leaves = tuple(tensor.clone().requires_grad_() for tensor in workload.gaussians)
+    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
     out = render(leaves, workload.camera, workload.background, variant.options(workload), variant.adjoint)
     out.image.backward(torch.ones_like(out.image))
 
@@ -153,8 +154,8 @@ def peak_memory(run: Callable[[], object], device: torch.device) -> int:
 
 def central_differences(workload: Workload, truth: Truth) -> Measurement:
     """Time per parameter, measured; for all of them, extrapolated. Error at the largest gradients of the opacities."""
-    result = Measurement(workload.name, "central differences", len(workload.gaussians[0]))
-    opacities, exact = workload.gaussians[3], truth.gradients["opacities"]
+    result = Measurement(workload.name, "central differences", len(workload.gaussians.means))
+    opacities, exact = workload.gaussians.opacities, truth.gradients["opacities"]
     chosen = exact.abs().argsort(descending=True)[:DIFFERENCES]
     found, seconds = [], []
     for index in chosen:
@@ -178,7 +179,7 @@ def central_differences(workload: Workload, truth: Truth) -> Measurement:
 
 
 def _loss(workload: Workload, truth: Truth, opacities: torch.Tensor) -> float:
-    gaussians = (*workload.gaussians[:3], opacities, *workload.gaussians[4:])
+    gaussians = workload.gaussians._replace(opacities=opacities)
     with torch.no_grad():
         image = render(gaussians, workload.camera, workload.background, workload.options).image
     rows, columns = workload.pixels.T

@@ -29,9 +29,8 @@ from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import psnr, ssim
 from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.presets import EMBEDDED_DEFAULTS
-from warp_splat.raster.api import Dropped
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.project import project
 from warp_splat.scene import Scene, View
 from warp_splat.text import format_table
 from warp_splat.training.trainer import Trainer
@@ -207,9 +206,9 @@ def _judge(trainer: Trainer, result: Run) -> None:
 @torch.no_grad()
 def _list_lengths(trainer: Trainer, view: View) -> np.ndarray:
     """Entries in the list of each tile of a view."""
-    gaussians = trainer.model.activated()
-    projected = Project.apply(*gaussians, camera_view(view.camera, gaussians[5].shape[1], trainer.options), Dropped())
-    return np.diff(bin_tiles(*projected, view.camera, trainer.options).ranges.cpu().numpy())
+    splats = project(trainer.model.activated(), view.camera, trainer.options)
+    bins = driver_of(trainer.device).bin(splats, view.camera, trainer.options)
+    return np.diff(bins.ranges.cpu().numpy())
 
 
 def _views(scene: Scene) -> list[View]:

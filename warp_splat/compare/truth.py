@@ -10,6 +10,7 @@ from warp_splat.compare import oracle
 from warp_splat.compare.workloads import Workload
 from warp_splat.config import RasterOptions
 from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
 
 ZERO = 1e-12  # norm of a gradient that is rounding only, as that of the rotation of a ball
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "background", "means2d")
@@ -59,15 +60,16 @@ def gradients_of(
 
     All on the host.
     """
-    leaves = [tensor.clone().requires_grad_() for tensor in workload.gaussians]
+    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
     background = workload.background.clone().requires_grad_()
-    out = render(tuple(leaves), workload.camera, background, options, adjoint)
+    out = render(leaves, workload.camera, background, options, adjoint)
     out.means2d.retain_grad()
     rows, columns = workload.pixels.T
     seen = out.image[rows, columns]
     (seen * truth.weights.to(seen.device)).sum().backward()
-    sh = torch.cat([leaves[4].grad, leaves[5].grad], 1)
-    gradients = [*(leaf.grad for leaf in leaves[:4]), sh, background.grad, out.means2d.grad]
+    found = Gaussians(*(leaf.grad for leaf in leaves))
+    sh = torch.cat([found.sh_dc, found.sh_rest], 1)
+    gradients = [found.means, found.quats, found.scales, found.opacities, sh, background.grad, out.means2d.grad]
     return seen.detach().cpu(), {name: grad.cpu() for name, grad in zip(PARAMETERS, gradients, strict=True)}
 
 

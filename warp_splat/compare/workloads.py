@@ -12,6 +12,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.compare.trained import SHORT
 from warp_splat.config import RasterOptions, TrainConfig
+from warp_splat.raster.data import Gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
@@ -28,7 +29,7 @@ class Workload:
     """Activated Gaussians, as :func:`warp_splat.raster.api.render` takes them, a camera, and pixels to look at."""
 
     name: str
-    gaussians: tuple[torch.Tensor, ...]  # means, quats, scales, opacities, sh_dc, sh_rest
+    gaussians: Gaussians
     camera: Camera
     background: torch.Tensor  # [3]
     options: RasterOptions
@@ -41,7 +42,7 @@ class Workload:
 
     def to(self, device: torch.device) -> Workload:
         """The same on ``device``."""
-        gaussians = tuple(tensor.to(device) for tensor in self.gaussians)
+        gaussians = Gaussians(*(tensor.to(device) for tensor in self.gaussians))
         return replace(self, gaussians=gaussians, background=self.background.to(device))
 
 
@@ -60,11 +61,9 @@ def layered(candidates: int) -> Workload:
     opacities = rng.uniform(0.0045, max(0.008, min(0.9, 15 / candidates)), candidates)
     arrays = (means, rng.normal(size=(candidates, 4)), scales, opacities, rng.uniform(-1.5, 1.5, (candidates, 1, 3)))
     tensors = [torch.tensor(array, dtype=torch.float32) for array in arrays]
-    rest = torch.zeros(candidates, 0, 3)
+    gaussians = Gaussians(*tensors, sh_rest=torch.zeros(candidates, 0, 3))
     background = torch.tensor([0.2, 0.4, 0.7])
-    return Workload(
-        f"{candidates} layers", (*tensors, rest), camera, background, RasterOptions(), sample_pixels(camera)
-    )
+    return Workload(f"{candidates} layers", gaussians, camera, background, RasterOptions(), sample_pixels(camera))
 
 
 def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[str], None]) -> list[Workload]:
@@ -77,7 +76,7 @@ def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[st
             trainer.differentiate(iteration)
         if iteration in STAGES:
             with torch.no_grad():
-                gaussians = tuple(tensor.detach().clone() for tensor in trainer.model.activated())
+                gaussians = Gaussians(*(tensor.detach().clone() for tensor in trainer.model.activated()))
             stage = f"{name}, step {iteration}"
             say(f"{stage}: {len(trainer.model)} Gaussians, {camera.width} x {camera.height} px")
             options = RasterOptions(sh_degree=trainer.degree)

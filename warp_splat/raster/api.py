@@ -1,7 +1,7 @@
-"""From 3D Gaussians to an image, differentiable in torch: project, bin, blend, and the adjoints of the first and last.
+"""From 3D Gaussians to an image, differentiable in torch: project, bin, blend.
 
-Two autograd functions, so that what lies between them (the 2D means above all, whose gradient steers densification)
-are torch tensors with gradients of their own.
+Two autograd functions, the first and the last, so that what lies between them (the 2D means above all, whose gradient
+steers densification) are torch tensors with gradients of their own.
 """
 
 from __future__ import annotations
@@ -10,36 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.raster.adjoints import gather
-from warp_splat.raster.bin import bin_tiles
+from warp_splat.raster.blend import blend
 from warp_splat.raster.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
-from warp_splat.raster.cpu import adjoint_of_lanes, blend_lanes
-from warp_splat.raster.cuda import adjoint_of_blocks, blend_blocks
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.data import Dropped, Gaussians
+from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.project import project
 from warp_splat.runtime.launch import stage
-
-
-@dataclass
-class Dropped:
-    """What the adjoint refused to spread: counted during ``backward``, where that ran, and read when asked for."""
-
-    pixel_count: int | torch.Tensor = 0
-    gaussian_count: int | torch.Tensor = 0
-
-    @property
-    def pixels(self) -> int:
-        """Pixels whose upstream gradient was not finite."""
-        return int(self.pixel_count)
-
-    @property
-    def gaussians(self) -> int:
-        """Gaussians whose own gradient was not finite."""
-        return int(self.gaussian_count)
 
 
 @dataclass
@@ -153,68 +133,35 @@ def _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, 
     for camera in cameras:
         outputs.append(render(gaussians, camera, background, options, adjoint))
         if outputs[-1].invalid:
-            explain_invalid(outputs[-1].invalid, gaussians[1])
+            explain_invalid(outputs[-1].invalid, gaussians.quats)
     return outputs
 
 
 def render(
-    gaussians: tuple[torch.Tensor, ...],
+    gaussians: Gaussians,
     camera: Camera,
     background: torch.Tensor,
     options: RasterOptions,
     adjoint: str = "manual",
 ) -> RenderOutput:
     """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted."""
-    dropped = Dropped()
+    driver, dropped = driver_of(gaussians.means.device), Dropped()
     with stage("project"):
-        means2d, conics, opacities2d, colors, depths, extents, radii = Project.apply(
-            *gaussians, camera_view(camera, gaussians[5].shape[1], options), dropped
-        )
+        splats = project(gaussians, camera, options, driver, dropped)
     with stage("bin"):
-        bins = bin_tiles(means2d, conics, opacities2d, colors, depths, extents, radii, camera, options)
+        bins = driver.bin(splats, camera, options)
     with stage("blend"):
-        image, alpha, depth = Blend.apply(
-            means2d, conics, opacities2d, colors, depths, background, bins, camera, options, adjoint, dropped
-        )
-    if options.depth:
-        depth = depth / alpha.clamp_min(1e-10)
+        image, alpha, depth = blend(splats, bins, background, camera, options, adjoint, driver, dropped)
     return RenderOutput(
         image=image,
         alpha=alpha,
-        depth=depth if options.depth else None,
-        means2d=means2d,
-        radii=radii.clamp_min(0),
-        conics=conics,
-        colors=colors,
-        depths=depths,
-        opacities2d=opacities2d,
+        depth=depth / alpha.clamp_min(1e-10) if options.depth else None,
+        means2d=splats.means2d,
+        radii=splats.radii.clamp_min(0),
+        conics=splats.conics,
+        colors=splats.colors,
+        depths=splats.depths,
+        opacities2d=splats.opacities,
         invalid_count=bins.invalid,
         dropped=dropped,
     )
-
-
-class Blend(torch.autograd.Function):
-    """2D Gaussians to pixels, in lanes on the CPU and in blocks on a GPU; the adjoint walks the lists back to front."""
-
-    @staticmethod
-    def forward(ctx, means2d, conics, opacities, colors, depths, background, bins, camera, options, adjoint, dropped):
-        blend = blend_blocks if means2d.is_cuda else blend_lanes
-        keep = adjoint == "stored" and any(ctx.needs_input_grad)
-        background = background.contiguous()
-        image, alpha, depth, saved = blend(bins, camera, background, options, keep)
-        ctx.save_for_backward(background, *saved)
-        ctx.bins, ctx.options, ctx.adjoint, ctx.dropped = bins, options, adjoint, dropped
-        ctx.gaussian_count = len(means2d)
-        return image, alpha, depth
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, adj_image, adj_alpha, adj_depth):
-        with stage("adjoint of blend"):
-            background, *saved = ctx.saved_tensors
-            bins, adj_pixels = ctx.bins, [adj.contiguous() for adj in (adj_image, adj_alpha, adj_depth)]
-            adjoint = adjoint_of_blocks if adj_image.is_cuda else adjoint_of_lanes
-            slots, adj_background, bad = adjoint(ctx.adjoint, bins, ctx.options, background, saved, *adj_pixels)
-            ctx.dropped.pixel_count += bad.sum()
-            grads = gather(bins, slots, ctx.gaussian_count)
-        return *grads, adj_background, None, None, None, None, None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -14,6 +13,7 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.splat import Splat2D
+from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D
 from warp_splat.runtime.launch import (
     available_memory,
     empty,
@@ -25,89 +25,60 @@ from warp_splat.runtime.launch import (
     view,
 )
 
-MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 
 
-@dataclass
-class Bins:
-    """Tile lists: V splats (Gaussians drawn; on a GPU all, those not drawn behind), M tile instances, T tiles."""
-
-    gaussians: wp.array  # [V] Gaussian of each splat: ascending; on a GPU, nearest first
-    splats: wp.array  # [V] Splat2D
-    instances: torch.Tensor  # [M] int32, splats, by tile, nearest first
-    places: torch.Tensor  # [M] int32, where in ``instances`` a splat stands, splat by splat
-    place_begins: torch.Tensor  # [V] int32, where in ``places`` those of each splat begin
-    ranges: torch.Tensor  # [T, 2] int32, first and last instance
-    slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU; on a GPU empty
-    tiles_x: int
-    invalid: int | torch.Tensor
-
-
-def bin_tiles(
-    means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
-) -> Bins:
-    """List the Gaussians of each tile by depth (ties by index).
+def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> Bins:
+    """The Gaussians of each tile by depth (ties by index) on the CPU: a counting sort by tile, a band per thread.
 
     Raises:
-        InputError: if the tile instances are more than the kernels can number.
+        InputError: if the tile instances are more than the kernels can number, or than fit.
     """
-    bin_on = bin_by_sorting if means2d.is_cuda else bin_by_counting
-    return bin_on(means2d, conics, opacities, colors, depths, extents, radii, camera, options)
-
-
-def bin_by_counting(
-    means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
-) -> Bins:
-    """:func:`bin_tiles` for the CPU: a counting sort by tile, a band of Gaussians per thread."""
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    invalid = int(np.count_nonzero(radii.numpy() < 0))
-    drawn = np.flatnonzero(radii.numpy() > 0).astype(np.int32)
+    radii = splats2d.radii.numpy()
+    invalid = int(np.count_nonzero(radii < 0))
+    drawn = np.flatnonzero(radii > 0).astype(np.int32)
     count = len(drawn)
-    order, nearness = np.empty(count, dtype=np.int32), _taken(depths.detach().numpy(), drawn)
+    order, nearness = np.empty(count, dtype=np.int32), _taken(splats2d.depths.detach().numpy(), drawn)
     splats, rows = wp.empty(count, dtype=Splat2D, device="cpu"), np.empty(count, dtype=np.int32)
-    tensors = views2d((means2d, conics, opacities, colors, depths, extents))
     gaussians, square = _array(drawn), int(options.extent == "square")
-    inputs = [gaussians, *tensors, camera.height, options.alpha_min, square]
+    inputs = [gaussians, *splats2d.views(), camera.height, options.alpha_min, square]
     # one thread sorts while others pack
     launch(tiles.pack, count, inputs, [splats, _array(rows)], beside=partial(order_by_depth, nearness, order))
     by_depth = _taken(rows, order)
     row_ends = np.cumsum(by_depth, dtype=np.int64)  # a 32-bit scan wraps without a word
-    _check_count(_last(row_ends), camera, count, radii.device)
+    _check_count(_last(row_ends), camera, count, splats2d.radii.device)
     begins = _put(row_ends - by_depth, order)
     spans, counts = wp.empty(_last(row_ends), dtype=wp.vec2i, device="cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, _array(rows), _array(begins), camera.width, camera.height, tiles_x, square]
     launch(tiles.find_spans, count, inputs, [spans, _array(counts)])
     place_ends = np.cumsum(counts)
-    _check_count(_last(place_ends), camera, count, radii.device)
+    _check_count(_last(place_ends), camera, count, splats2d.radii.device)
     begins = (place_ends - counts).astype(np.int32)
     instances, places, ends = _sort_by_tile(
         order, _taken(begins, order), row_ends, spans, _last(place_ends), tiles_x * tiles_y
     )
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     lists = (instances, places, torch.from_numpy(begins), ranges)
-    return Bins(gaussians, splats, *lists, balanced_slices(ends), tiles_x, invalid)
+    return Bins(len(radii), gaussians, splats, *lists, balanced_slices(ends), tiles_x, invalid)
 
 
-def bin_by_sorting(
-    means2d, conics, opacities, colors, depths, extents, radii, camera: Camera, options: RasterOptions
-) -> Bins:
-    """:func:`bin_tiles` for a GPU: the host waits for the number of tile instances.
+def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> Bins:
+    """:func:`bin_by_counting` for a GPU: the host waits for the number of tile instances.
 
     Where these are so many that one tile might hold too many, it waits for the longest list as well.
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    device, total = radii.device, len(radii)
-    keys = torch.where(radii > 0, depths.detach(), torch.inf)
+    radii, device, total = splats2d.radii, splats2d.radii.device, len(splats2d.radii)
+    keys = torch.where(radii > 0, splats2d.depths.detach(), torch.inf)
     order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
     rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
-    tensors = views2d((means2d, conics, opacities, colors, depths, extents))
     square = int(options.extent == "square")
-    inputs = [order, *tensors, camera.height, options.alpha_min, square]
+    inputs = [order, *splats2d.views(), camera.height, options.alpha_min, square]
     launch(tiles.pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
     inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
 
@@ -131,7 +102,8 @@ def bin_by_sorting(
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
         _check_longest(int(bounds.diff().max()))
     invalid = torch.count_nonzero(radii < 0)
-    return Bins(order, splats, instances, places, (place_ends - counts).int(), ranges, [], tiles_x, invalid)
+    lists = (instances, places, (place_ends - counts).int(), ranges)
+    return Bins(total, order, splats, *lists, [], tiles_x, invalid)
 
 
 def _sort_by_tile(
@@ -229,15 +201,25 @@ def _check_longest(count: int) -> None:
         )
 
 
+def room_for_states(bins: Bins) -> torch.Tensor:
+    """Room for the T of every tile instance at every pixel of its tile, [M, TILE TILE]: 1 KiB per instance.
+
+    Raises:
+        InputError: if that does not fit.
+    """
+    count, device = len(bins.instances), bins.instances.device
+    needed, available = 4 * TILE * TILE * count, available_memory(device)
+    if needed > 0.8 * available:
+        raise InputError(
+            f"adjoint 'stored': the transmittances of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
+            f"{available / 2**30:.1f} GiB are free; use 'reversible', which needs none, or a smaller image."
+        )
+    return torch.empty(count, TILE * TILE, dtype=torch.float32, device=device)
+
+
 def balanced_slices(ends: np.ndarray) -> list[int]:
     """Bounds of slices of tiles with about the same number of instances; an empty tile counts a little, too."""
     work = ends + 32 * np.arange(1, len(ends) + 1)
     parts = SLICES_PER_THREAD * get_threads() if get_threads() > 1 else 1
     inner = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
     return [0, *inner.tolist(), len(ends)]
-
-
-def views2d(tensors) -> list:
-    """Kernel arguments for as many of (means2d, conics, opacities, colors, depths, extents) as are given."""
-    types = (wp.vec2, wp.vec3, wp.float32, wp.vec3, wp.float32, wp.vec2)
-    return [view(tensor, dtype) for tensor, dtype in zip(tensors, types, strict=False)]

@@ -11,6 +11,8 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import DRIVERS
 
 CAMERA_PIXELS_MOST = 2**32  # 80 GiB of image, alpha and what the adjoint reads; kernels number tiles with 32 bits
 
@@ -62,8 +64,8 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     )
 
 
-def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, ...]:
-    """The arguments as the renderer reads them: (means, quats, scales, opacities, sh_dc, sh_rest).
+def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
+    """The arguments as the renderer reads them.
 
     Raises:
         InputError: naming the first argument whose type, shape, dtype, device or range is not as it should be.
@@ -90,7 +92,7 @@ def check_gaussians(means, quats, scales, opacities, sh) -> tuple[torch.Tensor, 
     check_range("scales", scales, bool((scales <= 0).any()), "positive values (activated, not their logarithm)")
     outside = bool(((opacities < 0) | (opacities > 1)).any())
     check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
-    return tuple(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest))
+    return Gaussians(*(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
 
 
 def _check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.device | None) -> None:
@@ -106,7 +108,7 @@ def _check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch
         raise InputError(
             f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float()."
         )
-    if tensor.device.type not in ("cpu", "cuda"):
+    if tensor.device.type not in DRIVERS:
         raise InputError(
             f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
         )

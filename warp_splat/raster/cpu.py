@@ -1,52 +1,61 @@
-"""The blend and its adjoint on the CPU: the kernels of ``blend_lanes`` and those that follow from it, and their memory.
+"""The blend and its adjoint on the CPU, in lanes of sixteen pixels; those on a GPU are in ``raster/cuda.py``.
 
-``blocks`` offers the same two functions for a GPU.
+The modes share the forward kernel, the tile lists, the upstream gradients in blocks, the rows and their summation; they
+differ in the kernel between them alone. Two exceptions: ``stored`` has a forward kernel that writes every T, and
+``generated`` (for the comparison) reads a copy of the Gaussian per tile instance.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 import warp as wp
+from torch.nn.functional import embedding_bag
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
+from warp_splat.kernels.cpu.adjoint import make_reverse
 from warp_splat.kernels.cpu.blend import BLOCKS, make_blend, make_upstream
+from warp_splat.kernels.cpu.taped import make_walk, rows_of_copies
 from warp_splat.kernels.lanes import LANES, vec16
-from warp_splat.raster.adjoints import adjoint_of_blend, list_inputs, memory_for_states, stop_inputs
-from warp_splat.raster.bin import Bins
-from warp_splat.runtime.launch import launch, view
+from warp_splat.kernels.splat import Splat2D
+from warp_splat.raster.bin import room_for_states
+from warp_splat.raster.data import Bins, Pixels, limits_of
+from warp_splat.runtime.launch import empty, in_slices, launch, view
+
+#: Gaussians whose slots a thread sums at a time: the sums of all have no place in a heap in use, and fresh pages for
+#: them cost 15 to 50 ms at 1M Gaussians.
+AT_ONCE = 2**15
 
 
-def blend_lanes(
+def blend(
     bins: Bins, camera: Camera, background: torch.Tensor, options: RasterOptions, keep: bool
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, tuple[torch.Tensor, ...]]:
-    """Image [H, W, 3], alpha [H, W], depth [H, W] (or nothing, if not asked for), and what the adjoint reads.
+) -> tuple[Pixels, tuple[torch.Tensor, ...]]:
+    """The pixels, and what the adjoint reads.
 
     Args:
-        bins: which Gaussians each tile lists.
+        bins: the splats, and which of them each tile lists.
         camera: its size is the image's.
         background: [3].
         options: what to compute.
         keep: store every transmittance, for the adjoint "stored".
     """
-    height, width, new = camera.height, camera.width, background.new_empty
-    image, alpha = new(height, width, 3), new(height, width)
-    depth = new(height, width) if options.depth else new(0, 0)
-    tile_count = len(bins.ranges)
+    tile_count, new = len(bins.ranges), background.new_empty
+    pixels = Pixels.empty(camera, options, background)
     final, count = new(tile_count, BLOCKS, LANES), new(tile_count, BLOCKS, LANES)
-    kept = memory_for_states(bins) if keep else new(0, 0, LANES)
+    kept = room_for_states(bins).view(-1, BLOCKS, LANES) if keep else new(0, 0, LANES)
     launch(
         make_blend(options.depth, options.exp_degree, keep),
         tile_count,
-        [*list_inputs(bins, options), *stop_inputs(options), view(background, wp.float32)],
-        [*_pixel_views(image, alpha, depth), *(view(lanes, vec16) for lanes in (final, count, kept))],
+        [*bins.views(options), *limits_of(options), view(background, wp.float32)],
+        [*pixels.views(), *_in_lanes(final, count, kept)],
         bounds=bins.slices,
     )
-    return image, alpha, depth, (final, count, kept)
+    return pixels, (final, count, kept)
 
 
-def adjoint_of_lanes(
-    mode: str, bins: Bins, options: RasterOptions, background, saved, adj_image, adj_alpha, adj_depth
+def adjoint(
+    mode: str, bins: Bins, options: RasterOptions, background: torch.Tensor, saved, adj_pixels: Pixels
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Gradients of the slots [M, 9 or 10] and of the background [3], and the number of pixels dropped in each tile.
 
@@ -55,41 +64,98 @@ def adjoint_of_lanes(
         bins: as in the forward pass, like the next two.
         options: what was computed.
         background: [3].
-        saved: what :func:`blend_lanes` returned last.
-        adj_image: upstream gradient, like the next two; dense.
-        adj_alpha: [H, W].
-        adj_depth: [H, W], or nothing.
+        saved: what :func:`blend` returned last.
+        adj_pixels: upstream gradients; dense.
     """
-    final, count, kept = saved
-    slots = background.new_empty(len(bins.instances), 10 if options.depth else 9)
-    adj_pixels = (adj_image, adj_alpha, adj_depth)
-    up, adj_final, adj_background, bad, steps = _spread_upstream(
+    slots, (final, count, _) = bins.new_slots(options), saved
+    upstream, adj_background, dropped, steps = _spread_upstream(
         bins, options, background, final, count, adj_pixels, slots
     )
-    adjoint_of_blend(mode, bins, options, [final, count, kept, up, adj_final], steps, slots)
-    return slots, torch.from_numpy(adj_background.numpy().sum(0)), bad
+    differentiate(mode, bins, options, _in_lanes(*saved), _in_lanes(*upstream), steps, slots)
+    return slots, torch.from_numpy(adj_background.numpy().sum(0)), dropped
 
 
-def _pixel_views(image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> list:
-    return [view(tensor, wp.float32) for tensor in (image, alpha, depth)]
+def _spread_upstream(bins: Bins, options: RasterOptions, background, final, count, adj_pixels: Pixels, slots) -> tuple:
+    """(Upstream gradients in blocks, dL/dT behind), dL/dbackground, dropped and steps of each tile; zeros in ``slots``.
 
-
-def _spread_upstream(
-    bins: Bins, options: RasterOptions, background, final, count, adj_pixels, slots
-) -> tuple[torch.Tensor, ...]:
+    The zeros are for the instances that the adjoint does not walk.
+    """
     tile_count, new = len(bins.ranges), background.new_empty
     up = new(tile_count, BLOCKS * (4 if options.depth else 3), LANES)
     adj_final, adj_background = torch.empty_like(final), new(tile_count, 3)
-    bad, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
-    lists, row = [bins.tiles_x, view(bins.ranges, wp.vec2i)], wp.types.vector(length=slots.shape[1], dtype=float)
+    dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
+    tiles_x, ranges, *_ = bins.views(options)
+    slot = wp.types.vector(length=slots.shape[1], dtype=float)
     launch(
         make_upstream(options.depth),
         tile_count,
-        [*lists, view(background, wp.float32), view(final, vec16), view(count, vec16), *_pixel_views(*adj_pixels)],
+        [tiles_x, ranges, view(background, wp.float32), *_in_lanes(final, count), *adj_pixels.views()],
         [
-            *(view(up, vec16), view(adj_final, vec16), view(adj_background, wp.float32)),
-            *(view(bad, wp.int32), view(steps, wp.int32), view(slots, row)),
+            *(*_in_lanes(up, adj_final), view(adj_background, wp.float32)),
+            *(view(dropped, wp.int32), view(steps, wp.int32), view(slots, slot)),
         ],
         bounds=bins.slices,
     )
-    return up, adj_final, adj_background, bad, steps
+    return (up, adj_final), adj_background, dropped, steps
+
+
+def differentiate(mode: str, bins: Bins, options: RasterOptions, saved, upstream, steps, slots) -> None:
+    """Fill ``slots`` [M, 9 or 10]; ``saved`` and ``upstream`` as the kernels take them, ``steps`` [T]."""
+    lists, tile_count = bins.views(options), len(bins.ranges)
+    (final, count, kept), steps, rows = saved, view(steps, wp.int32), view(slots, wp.float32)
+    if mode in ("manual", "stepwise"):
+        inputs = [*lists, final, count, steps, *upstream]
+        launch(make_reverse(mode, options.depth, options.exp_degree), tile_count, inputs, [rows], bounds=bins.slices)
+        return
+    walk, inputs = make_walk(mode, options.depth, options.exp_degree), [final, count, kept, steps, rows]
+    # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``rows``
+    if mode != "generated":
+        inputs = [*lists, *inputs]
+        adjoint = {"adj_inputs": [None] * len(inputs), "adj_outputs": upstream}
+        launch(walk, tile_count, inputs, upstream, bounds=bins.slices, **adjoint)
+        return
+    tiles_x, ranges, instances, _splats, alpha_min = lists
+    copies, adj_copies = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
+    copies.assign(bins.splats.numpy()[bins.instances.numpy()])
+    adj_copies.zero_()
+    adjoint = {
+        "adj_inputs": [None, None, None, adj_copies, None, *(None for _ in inputs)],
+        "adj_outputs": upstream,
+    }
+    inputs = [tiles_x, ranges, instances, copies, alpha_min, *inputs]
+    launch(walk, tile_count, inputs, upstream, bounds=bins.slices, **adjoint)
+    launch(rows_of_copies, len(bins.instances), [copies, adj_copies], [rows])
+
+
+def gather(bins: Bins, slots: torch.Tensor) -> list[torch.Tensor]:
+    """Gradients of means2d, conics, opacities, colors and depths: sums of each Gaussian's slots, zero where culled.
+
+    Always in the same order and without atomics: the same bits for any number of threads. Splats come in the order of
+    the Gaussians; column by column and by numpy it takes half of the time that torch takes to copy or to scatter short
+    rows. (Tried: a Warp kernel that loops over each Gaussian's slots: 11 ms instead of 6 for 540,000 slots, since torch
+    prefetches them.)
+    """
+    count, gaussians, grads = bins.gaussian_count, bins.gaussians.numpy(), bins.new_gradients(slots)
+    begins = np.append(bins.place_begins.numpy(), np.int32(len(slots)))
+    columns = [column for grad in grads for column in grad.numpy().T][: slots.shape[1]]
+
+    def run(low: int, high: int) -> None:
+        first, last = np.searchsorted(gaussians, np.array([low, high], dtype=np.int32))
+        if first == last:
+            for column in columns:
+                column[low:high] = 0.0
+            return
+        # those that are not drawn have no slots: theirs begin where the next one's do
+        repeats = np.diff(gaussians[first:last], prepend=low - 1, append=high - 1)
+        places = bins.places[begins[first] : begins[last]]
+        bags = torch.from_numpy(np.repeat(begins[first : last + 1] - begins[first], repeats))
+        rows = embedding_bag(places, slots, bags, mode="sum").numpy()
+        for column, sums in zip(columns, rows.T, strict=True):
+            column[low:high] = sums
+
+    in_slices(run, [*range(0, count, AT_ONCE), count] if torch.get_num_threads() == 1 else [0, count])
+    return [grad.squeeze(1) for grad in grads]
+
+
+def _in_lanes(*tensors: torch.Tensor) -> list:
+    return [view(tensor, vec16) for tensor in tensors]

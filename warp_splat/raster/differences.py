@@ -30,12 +30,15 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.raster.api import Blend, Dropped, RenderOutput, render
-from warp_splat.raster.bin import bin_tiles
-from warp_splat.raster.project import Project, camera_view
+from warp_splat.raster.api import RenderOutput, render
+from warp_splat.raster.blend import blend
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.project import project
 
-INPUTS = ("means", "quats", "scales", "opacities", "sh", "background")
-INTERMEDIATES = ("means2d", "conics", "opacities2d", "colors", "depths")  # in the order of the blend's arguments
+SHAPES = ("means", "quats", "scales", "opacities")
+INPUTS = (*SHAPES, "sh", "background")
+INTERMEDIATES = ("means2d", "conics", "opacities2d", "colors", "depths")
 LEAST = 2.0**-14  # the smallest step, relative to a parameter's natural size
 RUNGS = range(1, 10)  # steps h tried: LEAST times 2^rung
 ROUNDING = 2.0**-23  # float32, the last place of 1
@@ -77,9 +80,17 @@ class MovableScene:
     """The scene rendered once with gradients, and again with one parameter moved."""
 
     def __init__(
-        self, values: dict[str, torch.Tensor], camera: Camera, options: RasterOptions, adjoint: str, seed: int
+        self,
+        gaussians: Gaussians,
+        background: torch.Tensor,
+        camera: Camera,
+        options: RasterOptions,
+        adjoint: str,
+        seed: int,
     ):
         self.camera, self.options, self.adjoint = camera, options, adjoint
+        sh = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)
+        values = {name: getattr(gaussians, name) for name in SHAPES} | {"sh": sh, "background": background}
         self.inputs = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         with torch.enable_grad():
             self.out = self._render(self.inputs)
@@ -87,9 +98,8 @@ class MovableScene:
             deepest = self.out.depths.detach().max() if len(self.out.depths) else 1.0
             self.depth_weight = (self.out.alpha / deepest).detach()
             self.picture = self._stack(self.out.image, self.out.alpha, self.out.depth)
-        view = camera_view(camera, values["sh"].shape[1] - 1, options)
         with torch.no_grad():
-            self.extents, self.radii = Project.apply(*_gaussians(self.inputs), view, Dropped())[5:]
+            self.splats = project(_gaussians(self.inputs), camera, options)
         self.generator = torch.Generator().manual_seed(seed)
         random = torch.randn(self.picture.shape, generator=self.generator, dtype=torch.float32, device="cpu")
         self.weights = random.to(self.picture.device)
@@ -114,12 +124,11 @@ class MovableScene:
         if name in INPUTS:
             out = self._render(self.inputs | {name: moved})
             return self._stack(out.image, out.alpha, out.depth).double()
-        splats = [moved if key == name else self.tensor(key) for key in INTERMEDIATES]
-        extents = (self.extents * _growth(self, name, step)).float()
-        bins = bin_tiles(*splats, extents, self.radii, self.camera, self.options)
-        image, alpha, depth = Blend.apply(
-            *splats, self.inputs["background"], bins, self.camera, self.options, self.adjoint, Dropped()
-        )
+        key = "opacities" if name == "opacities2d" else name
+        extents = (self.splats.extents * _growth(self, name, step)).float()
+        splats = self.splats._replace(extents=extents, **{key: moved})
+        bins = driver_of(moved.device).bin(splats, self.camera, self.options)
+        image, alpha, depth = blend(splats, bins, self.inputs["background"], self.camera, self.options, self.adjoint)
         return self._stack(image, alpha, depth / alpha.clamp_min(1e-10) if self.options.depth else None).double()
 
     def _render(self, inputs: dict[str, torch.Tensor]) -> RenderOutput:
@@ -131,10 +140,10 @@ class MovableScene:
         return torch.cat(channels if depth is None else [*channels, (depth * self.depth_weight)[..., None]], 2)
 
 
-def _gaussians(inputs: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+def _gaussians(inputs: dict[str, torch.Tensor]) -> Gaussians:
     """As the renderer takes them."""
     sh = inputs["sh"]
-    return *(inputs[name] for name in INPUTS[:4]), sh[:, :1], sh[:, 1:]
+    return Gaussians(*(inputs[name] for name in SHAPES), sh_dc=sh[:, :1], sh_rest=sh[:, 1:])
 
 
 def _growth(scene: MovableScene, name: str, step: torch.Tensor) -> torch.Tensor:
@@ -152,7 +161,7 @@ def _growth(scene: MovableScene, name: str, step: torch.Tensor) -> torch.Tensor:
         return ((2 * ((opacities + step) / least).log()).clamp_min(1e-6) / reach).sqrt()[:, None]
     xx, xy, yy = scene.out.conics.double().unbind(1)
     dxx, dxy, dyy = step.double().unbind(1)
-    cov_xx, cov_yy = (scene.extents.double() ** 2 / reach[:, None]).unbind(1)
+    cov_xx, cov_yy = (scene.splats.extents.double() ** 2 / reach[:, None]).unbind(1)
     cov_xy = -xy * cov_yy / xx
     trace = cov_xx * dxx + 2 * cov_xy * dxy + cov_yy * dyy
     det = (1 + trace + cov_yy / xx * (dxx * dyy - dxy**2)).clamp_min(1e-3)

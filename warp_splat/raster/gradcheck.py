@@ -145,9 +145,9 @@ def check_gradients(
     """
     options = _check(adjoint, options, camera, parameters, directions, tolerance, seed)
     names = INPUTS if parameters is None else tuple(parameters)
-    *geometry, sh_dc, sh_rest = check_gaussians(means, quats, scales, opacities, sh)
-    values = (*geometry, torch.cat([sh_dc, sh_rest], 1), check_background(background, means.device))
-    scene = MovableScene(dict(zip(INPUTS, values, strict=True)), camera, options, adjoint, int(seed))
+    gaussians = check_gaussians(means, quats, scales, opacities, sh)
+    background = check_background(background, means.device)
+    scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
     if scene.out.invalid:
         explain_invalid(scene.out.invalid, quats)
     trials = {name: try_directions(scene, name, directions, tolerance) for name in names}

@@ -12,11 +12,11 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
-from warp_splat.kernels.lanes import LANES
 from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade, mat53, mat73
-from warp_splat.raster.bin import views2d
+from warp_splat.raster.data import Dropped, Gaussians, Splats2D
+from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import SMALLEST_SLICE, even_slices, in_slices, launch, stage, torch_slices, view
 
 
@@ -41,7 +41,21 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView
 
 
 def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RasterOptions,
+    driver: Driver | None = None,
+    dropped: Dropped | None = None,
+) -> Splats2D:
+    """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
+    cam = camera_view(camera, gaussians.sh_rest.shape[1], options)
+    driver = driver or driver_of(gaussians.means.device)
+    return Splats2D(*Project.apply(*gaussians, cam, driver, dropped or Dropped()))
+
+
+def _project_geometry(
     cam: CameraView,
+    lanes: int,
     inputs: Sequence[torch.Tensor],
     outputs: Sequence[torch.Tensor],
     adj_inputs: Sequence[torch.Tensor] = (),
@@ -49,17 +63,17 @@ def project(
 ) -> None:
     """The geometry of N Gaussians; or, with adjoints, the adjoint of that, added to ``adj_inputs``.
 
-    On a CPU in groups of sixteen: the last ones are filled up with zeros, which are no Gaussians.
+    In groups of ``lanes``: the last ones are filled up with zeros, which are no Gaussians.
 
     Args:
         cam: camera.
+        lanes: Gaussians that a kernel takes at once.
         inputs: means, quats, scales, opacities.
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
         adj_inputs: of all inputs.
-        adj_outputs: of the first four outputs.
+        adj_outputs: of all outputs; those of the last two are not read.
     """
     count = len(outputs[-1])
-    lanes = _lanes(outputs[-1].device)
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
     _project_groups(cam, lanes, *([tensor[:whole] for tensor in table] for table in tables))
@@ -77,7 +91,7 @@ def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
 
 
 def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> None:
-    """See :func:`project`; N is a multiple of ``lanes``."""
+    """See :func:`_project_geometry`; N is a multiple of ``lanes``."""
     number, integer, *_ = make_numbers(lanes)
     pair, triple, quadruple = (make_rows(lanes).row for make_rows in (make_rows2, make_rows3, make_rows4))
     types_in, types_out = (triple, quadruple, triple, number), (pair, triple, number, number, pair, integer)
@@ -88,10 +102,10 @@ def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> Non
 
     adjoint = {}
     if adj_inputs:
-        adj_in, adj_out = in_groups(adj_inputs, types_in), in_groups(adj_outputs, types_out)
+        adj_in, adj_out = in_groups(adj_inputs, types_in), in_groups(adj_outputs[:4], types_out)
         adjoint = {"adj_inputs": [cam, *adj_in], "adj_outputs": [*adj_out, None, None]}
     given, found = [cam, *in_groups(inputs, types_in)], in_groups(outputs, types_out)
-    _launch_groups(make_project, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
+    _launch_groups(make_project, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
 
 
 def _by_degree(sh_rest: torch.Tensor) -> list:
@@ -102,14 +116,10 @@ def _by_degree(sh_rest: torch.Tensor) -> list:
     ]
 
 
-def _lanes(device: torch.device) -> int:
-    """How many Gaussians a kernel takes at once."""
-    return 1 if device.type == "cuda" else LANES
-
-
-def _launch_groups(make_kernel: Callable[[int], wp.Kernel], count: int, inputs, outputs, device, **adjoint) -> None:
+def _launch_groups(
+    make_kernel: Callable[[int], wp.Kernel], lanes: int, count: int, inputs, outputs, device, **adjoint
+) -> None:
     """Launch a kernel for groups of lanes on ``count`` Gaussians."""
-    lanes = _lanes(device)
     groups = -(-count // lanes)
     bounds = even_slices(groups, SMALLEST_SLICE // lanes)
     launch(make_kernel(lanes), groups, inputs, outputs, bounds=bounds, device=device, **adjoint)
@@ -119,49 +129,62 @@ class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, dropped):
-        count, new = means.shape[0], means.new_zeros
-        inputs = [tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)]
-        outputs = (new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2))
-        radii = torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device)
-        project(cam, inputs[:4], [*outputs[:3], *outputs[4:], radii])
-        given = [cam, *_views3d([inputs[0], inputs[4][:, 0]]), *_by_degree(inputs[5])]
-        _launch_groups(make_shade, count, given, [*views2d(outputs), view(radii, wp.int32)], radii.device)
-        ctx.save_for_backward(*inputs, *outputs, radii)
-        ctx.cam, ctx.dropped = cam, dropped
-        ctx.mark_non_differentiable(outputs[5], radii)
-        return *outputs, radii
+    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, driver, dropped):
+        gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
+        count, new, lanes = means.shape[0], means.new_zeros, driver.lanes
+        splats = Splats2D(
+            *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
+            radii=torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device),
+        )
+        _project_geometry(cam, lanes, _shapes(gaussians), _geometry(splats))
+        given = [cam, *_views3d([gaussians.means, gaussians.sh_dc[:, 0]]), *_by_degree(gaussians.sh_rest)]
+        found = [*splats.views(), view(splats.radii, wp.int32)]
+        _launch_groups(make_shade, lanes, count, given, found, means.device)
+        ctx.save_for_backward(*gaussians, *splats)
+        ctx.cam, ctx.driver, ctx.dropped = cam, driver, dropped
+        ctx.mark_non_differentiable(splats.extents, splats.radii)
+        return tuple(splats)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
-            means, quats, scales, opacities, sh_dc, sh_rest, *outputs, radii = ctx.saved_tensors
-            adj_outputs = [adj.contiguous() for adj in adj_outputs[:5]]
-            adj_colors = adj_outputs.pop(3)
-            colored = [torch.empty_like(tensor) for tensor in (means, sh_dc, sh_rest)]
-            seen, (centers, *colors) = view(radii, wp.int32), _views3d([means, outputs[3], adj_colors])
-            given = [ctx.cam, centers, *_by_degree(sh_rest), seen, *colors]
-            stored = [*_views3d([colored[0], colored[1][:, 0]]), *_by_degree(colored[2])]
-            _launch_groups(make_adj_shade, len(radii), given, stored, radii.device)
-            placed = [colored[0], *(torch.zeros_like(tensor) for tensor in (quats, scales, opacities))]
-            geometry = [*outputs[:3], *outputs[4:], radii]
-            project(ctx.cam, (means, quats, scales, opacities), geometry, placed, adj_outputs)
-            adj_inputs = [*placed, *colored[1:]]
-            if not _all_finite(adj_inputs[:5]):  # sh_rest's are multiples of those of sh_dc
-                bad = torch.zeros_like(radii)
+            given = Gaussians(*ctx.saved_tensors[: len(Gaussians._fields)])
+            splats = Splats2D(*ctx.saved_tensors[len(given) :])
+            adj_splats = Splats2D(*(adj.contiguous() for adj in adj_outputs[:5]), splats.extents, splats.radii)
+            lanes, count, device = ctx.driver.lanes, len(given.means), given.means.device
+            seen, rest = view(splats.radii, wp.int32), given.sh_rest
+            adj_placed, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
+            means, colors, adj_colors = _views3d([given.means, splats.colors, adj_splats.colors])
+            inputs = [ctx.cam, means, *_by_degree(rest), seen, colors, adj_colors]
+            outputs = [*_views3d([adj_placed, adj_dc[:, 0]]), *_by_degree(adj_rest)]
+            _launch_groups(make_adj_shade, lanes, count, inputs, outputs, device)
+            shapes = (torch.zeros_like(tensor) for tensor in (given.quats, given.scales, given.opacities))
+            adj = Gaussians(adj_placed, *shapes, adj_dc, adj_rest)
+            _project_geometry(ctx.cam, lanes, _shapes(given), _geometry(splats), _shapes(adj), _geometry(adj_splats))
+            # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
+            if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
+                bad = torch.zeros_like(splats.radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
-                found = [view(tensor, dtype) for tensor, dtype in zip((*adj_inputs, bad), types, strict=True)]
-                launch(quarantine, len(radii), [seen], found, device=radii.device)
+                found = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
+                launch(quarantine, count, [seen], found, device=device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
-        wanted = zip(adj_inputs, ctx.needs_input_grad[:6], strict=True)
-        return *(adj if wants else None for adj, wants in wanted), None, None
+        wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
+        return *(tensor if wants else None for tensor, wants in wanted), None, None, None
+
+
+def _geometry(splats: Splats2D) -> list[torch.Tensor]:
+    """All but the colors."""
+    return [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.extents, splats.radii]
+
+
+def _shapes(gaussians: Gaussians) -> list[torch.Tensor]:
+    """All but the colors."""
+    return [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
 
 
 def _all_finite(tensors: Sequence[torch.Tensor]) -> bool:
-    """Whether the sums of ``tensors``, N rows each, are finite: then all is. Not asked on a GPU, which would stop."""
-    if tensors[0].is_cuda:
-        return False
+    """Whether the sums of ``tensors``, N rows each, are finite: then all is."""
     sums: list[float] = []
 
     def run(low: int, high: int) -> None:

@@ -21,6 +21,7 @@ from warp_splat.config import BLUR, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
 from warp_splat.runtime.devices import is_out_of_memory
 
 # The far ball stands first: the device has to sort. Each shows in every pixel of the four tiles.
@@ -95,13 +96,13 @@ def _compute(device: torch.device, adjoint: str) -> tuple[np.ndarray, float]:
     """The image [H, W, 3] and the gradient, by the renderer."""
     tensor = lambda values: torch.tensor(values, device=device)  # noqa: E731
     scales = tensor([[scale] * 3 for scale in SCALES]).requires_grad_()
-    gaussians = (
-        tensor([[0.0, 0.0, depth] for depth in DEPTHS]),
-        tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
-        scales,
-        tensor(OPACITIES),
-        (tensor(COLORS)[:, None] - 0.5) / C0,
-        torch.zeros(2, 0, 3, device=device),
+    gaussians = Gaussians(
+        means=tensor([[0.0, 0.0, depth] for depth in DEPTHS]),
+        quats=tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
+        scales=scales,
+        opacities=tensor(OPACITIES),
+        sh_dc=(tensor(COLORS)[:, None] - 0.5) / C0,
+        sh_rest=torch.zeros(2, 0, 3, device=device),
     )
     out = render(gaussians, CAMERA, tensor(BACKGROUND), RasterOptions(), adjoint)
     (gradient,) = torch.autograd.grad(out.image.sum(), scales)

@@ -15,6 +15,7 @@ from torch.nn import functional
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
 from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.raster.drivers import DRIVERS, driver_of
 from warp_splat.runtime.launch import even_slices, launch, stage, view
 
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbours'
@@ -55,7 +56,7 @@ def image_loss(
                 f"image_loss: expected dense tensors on one device, got one of {tensor.layout} on {tensor.device} "
                 f"beside an image on {image.device}; convert it."
             )
-    if image.device.type not in ("cpu", "cuda"):
+    if image.device.type not in DRIVERS:
         raise InputError(
             f"image_loss: expected tensors on the CPU or an NVIDIA GPU, got one on {image.device}; convert it."
         )
@@ -81,7 +82,7 @@ def image_loss(
             )
         counts = mask != 0
         image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))
-    if image.is_cuda:
+    if driver_of(image.device).lanes == 1:
         return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
 

@@ -23,6 +23,7 @@ from warp_splat.compare import oracle
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster import api
+from warp_splat.raster.data import Gaussians
 
 EPS = 2.0**-24  # float32, half a unit in the last place of 1
 FLOAT_MAX = torch.finfo(torch.float32).max
@@ -107,10 +108,10 @@ def leaves_of(problem: Problem, dtype: torch.dtype) -> dict[str, torch.Tensor]:
     return {name: tensor.requires_grad_() for name, tensor in leaves.items()}
 
 
-def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-    """(means, quats, scales, opacities, sh_dc, sh_rest), through the trainer's activations if ``raw``."""
+def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> Gaussians:
+    """As the renderer takes them, through the trainer's activations if ``raw``."""
     if not problem.raw:
-        return tuple(leaves[name] for name in ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest"))
+        return Gaussians(**{name: leaves[name] for name in Gaussians._fields})
     model = GaussianModel({name: leaves[name] for name in GaussianModel.NAMES})
     model.parameters = leaves
     return model.activated()

@@ -1,0 +1,122 @@
+"""What travels between the stages of the renderer, and how kernels read it.
+
+N Gaussians, V splats, M tile instances (a splat in the list of a tile), T tiles, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from warp_splat.camera import Camera
+from warp_splat.config import T_LEAST, RasterOptions
+from warp_splat.runtime.launch import view
+
+MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
+WIDTHS = (2, 3, 1, 3, 1)  # columns of a slot: mean, conic, opacity, color, and depth where it is asked for
+
+
+class Gaussians(NamedTuple):
+    """3D Gaussians, activated."""
+
+    means: torch.Tensor  # [N, 3] world units
+    quats: torch.Tensor  # [N, 4] (w, x, y, z), any norm
+    scales: torch.Tensor  # [N, 3] standard deviations, world units
+    opacities: torch.Tensor  # [N] 0..1
+    sh_dc: torch.Tensor  # [N, 1, 3]
+    sh_rest: torch.Tensor  # [N, K - 1, 3]
+
+
+class Splats2D(NamedTuple):
+    """Gaussians projected; all 0 where culled."""
+
+    means2d: torch.Tensor  # [N, 2] px
+    conics: torch.Tensor  # [N, 3] 1/px^2, (xx, xy, yy) of the inverse 2D covariance
+    opacities: torch.Tensor  # [N] after antialiasing
+    colors: torch.Tensor  # [N, 3]
+    depths: torch.Tensor  # [N] world units, z in the camera
+    extents: torch.Tensor  # [N, 2] px, half sides of the box where alpha >= alpha_min; no gradient
+    radii: torch.Tensor  # [N] int32, px; 0 if culled, -1 if invalid; no gradient
+
+    def views(self) -> list:
+        """All but the radii, as kernels take them."""
+        types = (wp.vec2, wp.vec3, wp.float32, wp.vec3, wp.float32, wp.vec2)
+        return [view(tensor, dtype) for tensor, dtype in zip(self[:-1], types, strict=True)]
+
+
+@dataclass
+class Bins:
+    """Tile lists. Splats are the Gaussians drawn, packed for the blend; on a GPU all, those not drawn behind."""
+
+    gaussian_count: int  # N
+    gaussians: wp.array  # [V] Gaussian of each splat: ascending; on a GPU, nearest first
+    splats: wp.array  # [V] Splat2D
+    instances: torch.Tensor  # [M] int32, splats, by tile, nearest first
+    places: torch.Tensor  # [M] int32, where in ``instances`` a splat stands, splat by splat
+    place_begins: torch.Tensor  # [V] int32, where in ``places`` those of each splat begin
+    ranges: torch.Tensor  # [T, 2] int32, first and last instance
+    slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU; on a GPU empty
+    tiles_x: int
+    invalid: int | torch.Tensor  # Gaussians left out because an input was not finite or a quaternion was zero
+
+    def views(self, options: RasterOptions) -> list:
+        """What every blend kernel reads first."""
+        ranges, instances = view(self.ranges, wp.vec2i), view(self.instances, wp.int32)
+        return [self.tiles_x, ranges, instances, self.splats, options.alpha_min]
+
+    def new_slots(self, options: RasterOptions) -> torch.Tensor:
+        """Room for a row of gradients per tile instance, [M, 9 or 10]."""
+        count, columns = len(self.instances), sum(WIDTHS) - (not options.depth)
+        return torch.empty(count, columns, dtype=torch.float32, device=self.instances.device)
+
+    def new_gradients(self, slots: torch.Tensor) -> list[torch.Tensor]:
+        """Room for what slots sum up to, [N, width] each; zeros for depths, if slots have none."""
+        grads = [slots.new_empty(self.gaussian_count, width) for width in WIDTHS]
+        if slots.shape[1] < sum(WIDTHS):
+            grads[-1].zero_()
+        return grads
+
+
+class Pixels(NamedTuple):
+    """An image, or the upstream gradient of one."""
+
+    image: torch.Tensor  # [H, W, 3]
+    alpha: torch.Tensor  # [H, W]
+    depth: torch.Tensor  # [H, W] world units, sum of weight times z; [0, 0] if not asked for
+
+    @classmethod
+    def empty(cls, camera: Camera, options: RasterOptions, like: torch.Tensor) -> Pixels:
+        """Room for an image of ``camera``'s size on the device of ``like``."""
+        height, width, new = camera.height, camera.width, like.new_empty
+        return cls(new(height, width, 3), new(height, width), new(height, width) if options.depth else new(0, 0))
+
+    def views(self) -> list:
+        """As kernels take them."""
+        return [view(tensor, wp.float32) for tensor in self]
+
+
+@dataclass
+class Dropped:
+    """What the adjoint refused to spread: counted during ``backward``, where that ran, and read when asked for."""
+
+    pixel_count: int | torch.Tensor = 0
+    gaussian_count: int | torch.Tensor = 0
+
+    @property
+    def pixels(self) -> int:
+        """Pixels whose upstream gradient was not finite."""
+        return int(self.pixel_count)
+
+    @property
+    def gaussians(self) -> int:
+        """Gaussians whose own gradient was not finite."""
+        return int(self.gaussian_count)
+
+
+def limits_of(options: RasterOptions) -> list:
+    """Where a pixel stops, as kernels take it: its least transmittance, and the entries of the list that it sees."""
+    steps = MAX_INSTANCES if options.max_steps is None else min(options.max_steps, MAX_INSTANCES)
+    return [max(options.t_min, T_LEAST), steps]
