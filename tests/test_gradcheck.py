@@ -205,7 +205,7 @@ def test_boxes_grow_as_the_projection_says():
     thin, thick = subject("needles"), SCENES["needles"]()
     thick.scales.mul_(1.01)
     thick = movable(thick)
-    drawn = (thin.radii > 0) & (thick.radii > 0)
+    drawn = (thin.splats.radii > 0) & (thick.splats.radii > 0)
     step = (thick.out.conics.double() - thin.out.conics.double()).detach()
     grown = thin.splats.extents * differences._growth(thin, "conics", step)
     assert (grown / thick.splats.extents - 1)[drawn].abs().max() < 2e-5
