@@ -170,7 +170,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("case", DAMAGE)
 def test_damage_is_found(life, tmp_path, capsys, monkeypatch, case):
-    monkeypatch.setattr("warp_splat.inspect.command.draw", lambda subject, measured: ())  # takes long
+    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject, measured: ())  # takes long
     damage, (level, check), text = DAMAGE[case]
     damage(life)
     findings, _ = examine(life, tmp_path, capsys, 1 if level == "error" else 0)
@@ -179,7 +179,7 @@ def test_damage_is_found(life, tmp_path, capsys, monkeypatch, case):
 
 @pytest.mark.parametrize("case", BAD)
 def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case):
-    monkeypatch.setattr("warp_splat.inspect.command.draw", lambda subject, measured: ())
+    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject, measured: ())
     source, options = BAD[case][0](tmp_path)
     if options.keys() - {"images"}:
         return  # of the resolution or the split, which this command does not have

@@ -178,9 +178,9 @@ def test_find_iteration_takes_the_largest_number(tmp_path):
 
 
 def test_prepare_creates_and_leaves_nothing_behind(tmp_path):
-    folder = model_folder.prepare(tmp_path / "a" / "b")
+    folder = model_folder.prepare_folder(tmp_path / "a" / "b")
     assert folder.is_dir() and not list(folder.iterdir())
-    model_folder.prepare(folder)
+    model_folder.prepare_folder(folder)
 
 
 def test_a_folder_is_claimed_by_one_training(tmp_path):
@@ -210,14 +210,14 @@ def test_prepare_refuses_before_training(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "model"):
         with pytest.raises(InputError, match="choose another model path"):
-            model_folder.prepare(folder)
+            model_folder.prepare_folder(folder)
 
     def refuse(*_args, **_keywords):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "write_text", refuse)
     with pytest.raises(InputError, match="Permission denied"):
-        model_folder.prepare(tmp_path / "model")
+        model_folder.prepare_folder(tmp_path / "model")
 
 
 def test_default_model_path_is_new_each_time():

@@ -20,7 +20,7 @@ from warp_splat.cli import main
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html.command import make_page
-from warp_splat.export_html.pack import pack, shown
+from warp_splat.export_html.pack import pack_gaussians, shown
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.png import load_png
@@ -76,7 +76,7 @@ def test_what_is_embedded_decodes_within_the_stated_error(coefficients):
     wanted, origin = some_splats(200, coefficients), np.array([1e4, -20.0, 3.0])
     wanted.sh[7:9] *= 40.0
     wanted = wanted._replace(means=(wanted.means + origin).astype(np.float32))
-    found = unpacked(pack(wanted, origin), 200, coefficients)
+    found = unpacked(pack_gaussians(wanted, origin), 200, coefficients)
     offsets = wanted.means - origin
     np.testing.assert_allclose(found.means, offsets, rtol=2**-18 * 1.01, atol=0)
     np.testing.assert_allclose(found.scales, wanted.scales, atol=1.01 / 512, rtol=0)
@@ -97,7 +97,7 @@ def test_what_is_embedded_decodes_within_the_stated_error(coefficients):
 def test_coefficients_beyond_the_range_stay_finite():
     splats = some_splats(5)
     splats.sh[:] = np.float32([3e38, -3e38, 1e3])[None, None]
-    found = unpacked(pack(splats, np.zeros(3)), 5, 16)
+    found = unpacked(pack_gaussians(splats, np.zeros(3)), 5, 16)
     np.testing.assert_allclose(found.sh[:, 1:], np.broadcast_to([127.0, -127, 127], (5, 15, 3)))
 
 

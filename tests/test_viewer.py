@@ -17,7 +17,7 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.viewer import server
-from warp_splat.viewer.command import make_draw, view
+from warp_splat.viewer.command import make_draw, view_model
 from warp_splat.viewer.pace import MOST
 
 
@@ -160,7 +160,7 @@ def test_small_models(fake_viser, count, coefficients):
 )
 def test_what_cannot_be_viewed(config, message):
     with pytest.raises(InputError, match=message):
-        view(config)
+        view_model(config)
 
 
 @pytest.mark.parametrize("source", ["", "scene"])
@@ -177,7 +177,7 @@ def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, so
 
     monkeypatch.setattr("warp_splat.viewer.command.Viewer", served)
     monkeypatch.setattr("warp_splat.viewer.command.interruptible", lambda: nullcontext([2]))
-    assert view(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
+    assert view_model(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
     draws.append(make_draw(GaussianModel.from_splats(some_gaussians(50)), {}))
     drawn, plain = (draw(PHOTO, False).image for draw in draws)
     assert plain.std() > 0.1

@@ -48,10 +48,10 @@ COMMANDS = {
     "train": (TrainConfig, "training.command.train", "train Gaussians on a scene's photographs"),
     "render": (
         RenderConfig,
-        "rendering.command.render",
+        "rendering.command.render_model",
         "render the views of a trained model with their metrics, or a video",
     ),
-    "view": (ViewConfig, "viewer.command.view", "look at a trained model in a browser"),
+    "view": (ViewConfig, "viewer.command.view_model", "look at a trained model in a browser"),
     "convert": (ConvertConfig, "formats.convert.convert", "convert Gaussians between .ply, .splat, .spz and glTF"),
     "export-html": (
         ExportHtmlConfig,

@@ -95,7 +95,7 @@ def show_views(
     else:
         sections = {f"the worst of {what}": ranked[:each], "the best": ranked[: -each - 1 : -1]}
     rows = {
-        title: [(view.name, view.photo, view.render, describe(view.values)) for view in views]
+        title: [(view.name, view.photo, view.render, metrics_line(view.values)) for view in views]
         for title, views in sections.items()
     }
     report.contact_sheet(folder / "contact_sheet.png", rows, columns)
@@ -105,7 +105,7 @@ def show_views(
     say(_table(ranked[:TOLD]))
 
 
-def describe(values: Mapping[str, float]) -> str:
+def metrics_line(values: Mapping[str, float]) -> str:
     """PSNR 27.68 dB, SSIM 0.8514, ..."""
     order = sorted(values, key=lambda name: name != "PSNR")
     return ", ".join(f"{name} {_rounded(name, values[name])}{' dB' * (name == 'PSNR')}" for name in order)

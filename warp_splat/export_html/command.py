@@ -93,7 +93,7 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         InputError: if there are more Gaussians than browsers take.
     """
     origin = np.median(splats.means, axis=0).astype(np.float64) if len(splats.means) else np.zeros(3)
-    packed = base64.b64encode(pack.pack(splats, origin)).decode()
+    packed = base64.b64encode(pack.pack_gaussians(splats, origin)).decode()
     if len(packed) > LONGEST:
         raise InputError(
             f"{name}: {len(splats.means)} Gaussians make a page of {len(packed) / 1e6:.0f} MB, expected at most "

@@ -55,7 +55,7 @@ def texels(coefficients: int) -> int:
     return 2 + -(-(coefficients - 1) // IN_TEXEL)
 
 
-def pack(splats: SplatArrays, origin: np.ndarray) -> bytes:
+def pack_gaussians(splats: SplatArrays, origin: np.ndarray) -> bytes:
     """The Gaussians, compressed.
 
     Args:

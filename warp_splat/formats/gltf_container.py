@@ -76,7 +76,7 @@ class Document:
         entries = self.json.get(kind)
         if not isinstance(entries, list):
             raise Unexpected(f"no list of {kind}")
-        found = entries[whole(index, f"index of {kind}", len(entries) - 1)]
+        found = entries[whole_number(index, f"index of {kind}", len(entries) - 1)]
         if not isinstance(found, dict):
             raise Unexpected(f"no object as entry {index} of {kind}")
         return found
@@ -84,22 +84,22 @@ class Document:
     def accessor(self, index: Any, kind: str) -> np.ndarray:
         """The values of an accessor of type ``kind`` as float32, [N] or [N, components]."""
         accessor = self.entry("accessors", index)
-        component = whole(accessor.get("componentType"), "componentType", max(COMPONENTS))
+        component = whole_number(accessor.get("componentType"), "componentType", max(COMPONENTS))
         if accessor.get("type") != kind or component not in COMPONENTS:
             raise Unexpected(f"accessor {index} of type {accessor.get('type')!r:.40}, {component}")
         if "sparse" in accessor or "bufferView" not in accessor:
             raise Unexpected(f"accessor {index} without data of its own (sparse, or compressed)")
         dtype, width = np.dtype(COMPONENTS[component]), TYPES[kind]
         view = self.entry("bufferViews", accessor["bufferView"])
-        buffer = self.buffers[whole(view.get("buffer"), "buffer", len(self.buffers) - 1)]
-        first = whole(view.get("byteOffset", 0), "byteOffset", buffer.length)
-        length = whole(view.get("byteLength"), "byteLength of a bufferView", buffer.length - first)
-        offset = whole(accessor.get("byteOffset", 0), "byteOffset of an accessor", length)
+        buffer = self.buffers[whole_number(view.get("buffer"), "buffer", len(self.buffers) - 1)]
+        first = whole_number(view.get("byteOffset", 0), "byteOffset", buffer.length)
+        length = whole_number(view.get("byteLength"), "byteLength of a bufferView", buffer.length - first)
+        offset = whole_number(accessor.get("byteOffset", 0), "byteOffset of an accessor", length)
         element = dtype.itemsize * width
-        stride = whole(view.get("byteStride", element), "byteStride", 252)
+        stride = whole_number(view.get("byteStride", element), "byteStride", 252)
         if stride < element:
             raise ValueError(f"byteStride {stride} for elements of {element} bytes")
-        count = whole(accessor.get("count"), "count", (length - offset - element) // stride + 1)
+        count = whole_number(accessor.get("count"), "count", (length - offset - element) // stride + 1)
         data = np.fromfile(
             buffer.path, np.uint8, max(0, (count - 1) * stride + element), offset=buffer.start + first + offset
         )
@@ -139,7 +139,7 @@ class Document:
         if "uri" not in entry:
             if chunk is None:
                 raise Unexpected("a buffer without data")
-            return chunk._replace(length=whole(entry.get("byteLength"), "byteLength of a buffer", chunk.length))
+            return chunk._replace(length=whole_number(entry.get("byteLength"), "byteLength of a buffer", chunk.length))
         uri = entry["uri"]
         if not isinstance(uri, str) or uri.startswith("data:"):
             raise Unexpected("a buffer inside the JSON; export it as .glb, or with a .bin file")
@@ -150,7 +150,7 @@ class Document:
         if not path.is_file():
             raise Unexpected(f"no file {path.name!r:.80} beside it, where its data should be")
         length = path.stat().st_size
-        return Buffer(path, 0, whole(entry.get("byteLength"), "byteLength of a buffer", length))
+        return Buffer(path, 0, whole_number(entry.get("byteLength"), "byteLength of a buffer", length))
 
     def _read_chunks(self, source, size: int) -> tuple[bytes, Buffer | None]:
         """The JSON and where the binary chunk is, if there is one."""
@@ -178,7 +178,7 @@ class Document:
         return source.read(text.length), chunks.get(b"BIN\0")
 
 
-def whole(value: Any, what: str, most: int) -> int:
+def whole_number(value: Any, what: str, most: int) -> int:
     """``value`` if it is a whole number, 0 to ``most``."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise Unexpected(f"{what} {value!r:.40}, which is no whole number")

@@ -34,7 +34,7 @@ def default_model_path() -> Path:
 
 
 def check_place(folder: Path) -> None:
-    """Refuse a folder that :func:`prepare` could not create or write, as far as one sees without trying.
+    """Refuse a folder that :func:`prepare_folder` could not create or write, as far as one sees without trying.
 
     Raises:
         InputError: if a file is in the way, or permissions are.
@@ -45,7 +45,7 @@ def check_place(folder: Path) -> None:
         raise InputError(f"{folder}: expected a folder that can be written ({place} {reason}); choose another.")
 
 
-def prepare(folder: str | Path) -> Path:
+def prepare_folder(folder: str | Path) -> Path:
     """Create the model folder and prove that it can be written, before hours of training.
 
     Raises:
@@ -66,14 +66,14 @@ def prepare(folder: str | Path) -> Path:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """:func:`prepare` it, and keep other trainings out while the block runs.
+    """:func:`prepare_folder` it, and keep other trainings out while the block runs.
 
     Raises:
         InputError: if the folder cannot be written, or a training in another process holds it.
     """
     from filelock import FileLock, Timeout  # noqa: PLC0415 - only training needs it
 
-    lock = FileLock(prepare(folder) / ".lock")
+    lock = FileLock(prepare_folder(folder) / ".lock")
     try:
         lock.acquire(timeout=0)
     except Timeout as error:

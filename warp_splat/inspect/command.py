@@ -11,7 +11,7 @@ from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
 from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.html_page import write_page
-from warp_splat.inspect.pictures import draw
+from warp_splat.inspect.pictures import draw_pictures
 from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos
 
@@ -42,7 +42,7 @@ def inspect(config: InspectConfig) -> int:
     findings += verdicts.check_loading(subject, config.images) + verdicts.check_cost(subject)
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     verdict = _verdict(findings)
-    write_page(page, f"Scene {source}", verdict, findings, draw(subject, measured))
+    write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject, measured))
     for finding in findings:
         print(f"{_colored(finding.level)}  {finding.check:13s} {finding.text}")
     print(f"{source}: {verdict} ({time.perf_counter() - started:.1f} s)\n  page {page}")

@@ -23,7 +23,7 @@ MAPPED = 5000  # points drawn on the map
 PAGE_DPI = 110
 
 
-def draw(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:
+def draw_pictures(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:
     """Captions and pictures, as addresses of data that a page holds itself."""
     shown = [photo for photo in subject.photos if photo.name in subject.thumbnails]
     if not shown:

@@ -64,7 +64,7 @@ def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
         subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []
         try:
             lines: list[str] = []
-            train, test, subject.points, _ = transforms.read(source, lines.append)
+            train, test, subject.points, _ = transforms.read_transforms(source, lines.append)
             subject.photos = train + test
         except InputError as error:
             findings.append(Finding("transforms", "error", str(error)))

@@ -17,7 +17,7 @@ from warp_splat.color import to_bytes
 from warp_splat.config import RasterOptions, RenderConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
-from warp_splat.evaluation.views import describe, evaluate_views, show_views, write_views
+from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.formats.splats import SplatFile
@@ -34,7 +34,7 @@ OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}
 WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
 
 
-def render(config: RenderConfig) -> int:
+def render_model(config: RenderConfig) -> int:
     """Render as ``config`` says; returns the process's exit code.
 
     Raises:
@@ -109,7 +109,7 @@ def _write_splits(
         means, compared = evaluate(picture, scene.test, folder, "test", iteration)
         show_views(compared, folder, "test", iteration, say)
         print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-        print(f"  {describe(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
+        print(f"  {metrics_line(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
 
 
 def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
@@ -220,7 +220,7 @@ def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output
     if Path(output).suffix.lower() == ".mp4":
         save_video(output, frames, FPS)
     elif output:
-        folder = model_folder.prepare(output)
+        folder = model_folder.prepare_folder(output)
         for index, frame in enumerate(frames):
             save_png(folder / f"{index:05d}.png", frame)
         older = len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)

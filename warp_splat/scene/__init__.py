@@ -134,10 +134,10 @@ def read_photos(
         found = "a file" if source.exists() else "nothing"
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
     if (source / "sparse").is_dir():
-        photos, points, colors = colmap.read(source, folder, report)
+        photos, points, colors = colmap.read_colmap(source, folder, report)
         return with_masks(photos, source, report), [], points, colors
     if transforms.has_transforms(source):
-        train, test, points, colors = transforms.read(source, report)
+        train, test, points, colors = transforms.read_transforms(source, report)
         return with_masks(train, source, report), with_masks(test, source, report), points, colors
     expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
     if (source / "point_cloud").is_dir():

@@ -22,7 +22,9 @@ IMAGE_HEAD = 64  # bytes of id, quaternion, translation, camera id; then the nam
 POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the track, the track
 
 
-def read(source: Path, folder: str, report: Callable[[str], object]) -> tuple[list[Photo], np.ndarray, np.ndarray]:
+def read_colmap(
+    source: Path, folder: str, report: Callable[[str], object]
+) -> tuple[list[Photo], np.ndarray, np.ndarray]:
     """Read the largest model under ``source``/sparse and find its images in ``source``/``folder``.
 
     Args:

@@ -36,7 +36,9 @@ def has_transforms(source: Path) -> bool:
     return any((source / name).is_file() for name in (TRAIN, ALL))
 
 
-def read(source: Path, report: Callable[[str], object]) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
+def read_transforms(
+    source: Path, report: Callable[[str], object]
+) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
     """Read the cameras in ``source``, and its points or, for nerf-synthetic, random ones.
 
     Returns:

@@ -201,7 +201,9 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         )
     model = models[best]
     registered = {model.image(index).name for index in model.reg_image_ids()}
-    stages.undistort(work / "models" / str(best), root, scene, work / "scene.part", sizes[best], threads, config.quiet)
+    stages.write_undistorted(
+        work / "models" / str(best), root, scene, work / "scene.part", sizes[best], threads, config.quiet
+    )
     write_json(
         work / "summary.json",
         {

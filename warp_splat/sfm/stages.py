@@ -174,7 +174,7 @@ def reconstruct(
     return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir() if folder.is_dir()}
 
 
-def undistort(model: Path, root: Path, scene: Path, part: Path, count: int, threads: int, quiet: bool) -> None:
+def write_undistorted(model: Path, root: Path, scene: Path, part: Path, count: int, threads: int, quiet: bool) -> None:
     """Write the photographs without distortion to ``scene``/images and their pinhole cameras to ``scene``/sparse/0."""
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name

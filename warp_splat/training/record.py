@@ -16,7 +16,7 @@ from tqdm import tqdm
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.perceptual import choose_metrics
-from warp_splat.evaluation.views import describe, evaluate_views, show_views
+from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
@@ -170,7 +170,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     state = "Interrupted" if run.iteration < trainer.config.iterations else "Done"
     print(
         f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
-        f"{split} {describe(means)}, {len(trainer.model)} Gaussians"
+        f"{split} {metrics_line(means)}, {len(trainer.model)} Gaussians"
     )
     for name, where in lines:
         print(f"  {name:9s} {where}")

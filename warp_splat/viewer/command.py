@@ -26,7 +26,7 @@ from warp_splat.viewer.server import Draw, Viewer, free_port
 IDLE = 0.2  # seconds between two looks at Ctrl-C
 
 
-def view(config: ViewConfig) -> int:
+def view_model(config: ViewConfig) -> int:
     """Serve the model that ``config`` names until Ctrl-C; returns the process's exit code.
 
     Raises:
