@@ -289,7 +289,7 @@ for count in itertools.count():
 """
 
 
-@pytest.mark.parametrize("moments", [5, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("moments", [5, pytest.param(50, marks=pytest.mark.long)])
 def test_a_writer_that_is_killed_leaves_a_whole_checkpoint(moments, tmp_path):
     path, moment = tmp_path / LAST, random.Random(0)
     for _ in range(moments):
@@ -308,11 +308,14 @@ def run_main(arguments):
     sys.exit(main(arguments))
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("most", "iterations"),
+    [pytest.param(4, 100, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)],
+)
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes that have loaded torch are forked")
-def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_path):
-    """Killed at 50 random moments, from first line to last picture; a checkpoint is written after every step."""
-    options = [*SHORT, "--iterations", "300", "--checkpoint_interval", "0.00001"]
+def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, iterations, tmp_path):
+    """Killed at random moments, from first line to last picture; a checkpoint is written after every step."""
+    options = [*SHORT, "--iterations", str(iterations), "--checkpoint_interval", "0.00001"]
     assert train(tmp_path / "whole", *options) == 0
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["warp_splat.training.command"])
@@ -322,7 +325,7 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_pa
         start = ["--resume", folder] if (folder / LAST).exists() else ["-s", SCENE, "-m", folder, *options]
         process = processes.Process(target=run_main, args=(["train", *map(str, start)],))
         process.start()
-        process.join(moment.uniform(0.0, 2.5) if kills < 50 else None)
+        process.join(moment.uniform(0.0, 2.5) if kills < most else None)
         if process.exitcode is None:
             process.kill()
             process.join()
@@ -332,8 +335,8 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_pa
                 assert reached >= before
             continue
         assert process.exitcode == 0
-        assert ply_path(folder, 300).read_bytes() == ply_path(tmp_path / "whole", 300).read_bytes()
-        if kills == 50:
+        assert ply_path(folder, iterations).read_bytes() == ply_path(tmp_path / "whole", iterations).read_bytes()
+        if kills == most:
             break
         runs, reached = runs + 1, 0
 

@@ -21,7 +21,13 @@ def recorded():
 
 
 @pytest.mark.skipif(cubins.cuobjdump() is None, reason="cuobjdump is missing (it comes with triton, torch's on Linux)")
-@pytest.mark.parametrize("arch", [90, *(pytest.param(arch, marks=pytest.mark.slow) for arch in (75, 80, 86, 89))])
+@pytest.mark.parametrize(
+    "arch",
+    [
+        pytest.param(90, marks=pytest.mark.slow),
+        *(pytest.param(arch, marks=pytest.mark.long) for arch in (75, 80, 86, 89)),
+    ],
+)
 def test_resources(arch):
     before, seen = recorded(), set()
     for name, module in cubins.modules().items():

@@ -57,7 +57,10 @@ def gradients_of_ranks(scene, trainers, iteration):
     return found
 
 
-@pytest.mark.parametrize("optimizer_type", ["default", pytest.param("sparse_adam", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "optimizer_type",
+    [pytest.param("default", marks=pytest.mark.slow), pytest.param("sparse_adam", marks=pytest.mark.long)],
+)
 def test_a_step_of_two_processes_is_one_of_their_mean_gradient(optimizer_type, scene, tmp_path):
     """Against one process that differentiates both views, averages, and steps by Adam with the rates written out."""
     torchrun(ROOT / "tests" / "torchrun_steps.py", tmp_path, SCENE, optimizer_type)
@@ -125,8 +128,7 @@ def start(folder, *options):
     return run, {int(child.environ()["RANK"]): child for child in children}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("killed", [0, 1])
+@pytest.mark.parametrize("killed", [pytest.param(0, marks=pytest.mark.long), pytest.param(1, marks=pytest.mark.slow)])
 def test_when_a_process_is_killed_the_other_saves_and_stops(killed, tmp_path):
     run, ranks = start(tmp_path)
     ranks[killed].kill()

@@ -27,9 +27,9 @@ def scene():
 @pytest.mark.parametrize(
     ("point", "kinds"),
     [
-        ((200_000, 64, 64), []),
-        ((1000, 1200, 900), []),
-        ((1000, 1200, 900), ["masked", "composited", "linear"]),
+        pytest.param((200_000, 64, 64), [], marks=pytest.mark.slow),
+        pytest.param((1000, 1200, 900), [], marks=pytest.mark.long),  # less than the next
+        pytest.param((1000, 1200, 900), ["masked", "composited", "linear"], marks=pytest.mark.slow),
     ],
     ids=str,
 )

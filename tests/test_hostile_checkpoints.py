@@ -167,7 +167,7 @@ def survive(path, trainer):
     return True
 
 
-@pytest.mark.parametrize("examples", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [60, pytest.param(1000, marks=pytest.mark.long)])
 def test_forged_checkpoints(examples, kept, scene, tmp_path):
     trainer = begin(scene, tmp_path)[0]
     arrays, facts, path = kept[1].arrays, kept[1].facts, tmp_path / LAST
@@ -181,7 +181,7 @@ def test_forged_checkpoints(examples, kept, scene, tmp_path):
     check()
 
 
-@pytest.mark.parametrize("examples", [100, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [100, pytest.param(5000, marks=pytest.mark.long)])
 def test_changed_bytes(examples, tmp_path, kept):
     """A small file with bytes changed, inserted, removed, repeated, cut: most of it is the header."""
     path = tmp_path / LAST

@@ -1,7 +1,7 @@
 """Files from strangers: whatever the bytes, a reader gives finite Gaussians or one sentence, in little memory.
 
 Random bytes, cuts, and changes of valid files: of the bytes, of what is compressed, and of values in the JSON.
-The short run is part of every test run; the long one is marked slow. Both try the same inputs each time, so that they
+The short run is part of every test run; the long one is marked long. Both try the same inputs each time, so that they
 gate a change and nothing else; the long one tries others with ``--hypothesis-seed=N``.
 """
 
@@ -194,7 +194,7 @@ def test_hostile_bytes(tmp_path, valid, kind):
     attack(kind, valid, tmp_path, QUICK)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_bytes_for_long(tmp_path, valid, kind, pytestconfig):
     attack(kind, valid, tmp_path, LONG, pytestconfig.getoption("--hypothesis-seed") is not None)

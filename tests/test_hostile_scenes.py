@@ -139,7 +139,7 @@ def test_hostile_scenes(tmp_path, kind):
     attack(kind, tmp_path / "scene", QUICK)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_hostile_scenes_for_long(tmp_path, kind, pytestconfig):
     attack(kind, tmp_path / "scene", LONG, pytestconfig.getoption("--hypothesis-seed") is not None)

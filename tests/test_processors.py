@@ -16,7 +16,7 @@ import numpy as np, torch
 import warp_splat
 from warp_splat.kernels import compiler
 
-for options in [value for name, value in vars(build).items() if name.isupper() and name[0] != "_"]:  # read later
+for options in [value for name, value in vars(compiler).items() if name.isupper() and name[0] != "_"]:  # read later
     options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", sys.argv[1])
 from warp_splat.training.loss import image_loss
 from scenes import SCENES
@@ -36,9 +36,14 @@ def run(architecture, path):
         return [arrays[name] for name in arrays.files]
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names processors of the x86-64 family")
-@pytest.mark.parametrize("architecture", ["-target-cpu x86-64-v3", "-target-cpu x86-64"])
+@pytest.mark.parametrize(
+    "architecture",
+    [
+        pytest.param("-target-cpu x86-64-v3", marks=pytest.mark.slow),
+        pytest.param("-target-cpu x86-64", marks=pytest.mark.long),
+    ],
+)
 def test_same_results(architecture, tmp_path):
     expected = run("-march=native", tmp_path / "native.npz")
     found = run(architecture, tmp_path / "other.npz")

@@ -89,11 +89,16 @@ def test_the_scene_is_said_to_be_complete(photos, scene, capsys):
     assert sorted(path.name for path in scene.iterdir()) == ["images", "sfm", "sparse"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_stopped_run_goes_on_and_finds_the_same(photos, scene, tmp_path, number):
+@pytest.mark.parametrize(
+    ("number", "times"),
+    [
+        pytest.param(signal.SIGINT, 2, marks=pytest.mark.slow),
+        *(pytest.param(number, 6, marks=pytest.mark.long) for number in (signal.SIGINT, signal.SIGKILL)),
+    ],
+)
+def test_a_stopped_run_goes_on_and_finds_the_same(photos, scene, tmp_path, number, times):
     stopped = 0
-    for delay in np.linspace(1.0, 6.0, 6):
+    for delay in np.linspace(2.0, 6.0, times):
         run = start(photos[0], tmp_path / "scene")
         time.sleep(delay)
         run.send_signal(number)

@@ -59,6 +59,7 @@ def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
     assert (found.gaussians, found.drawn, found.pixels, found.coefficients) == (3000, len(order), 1200, 16)
 
 
+@pytest.mark.long  # half a minute to compile
 def test_multiply_adds_are_done_as_they_are_counted(two_threads):
     values = torch.zeros(3, limits.CHAINS, limits.LANES)
     launch.launch(limits.multiply_add, 3, [2, 1.0], [launch.view(values, limits.vec16)])
@@ -127,8 +128,8 @@ def test_degree_rises_without_a_compilation(monkeypatch, capsys):
     scene, gaussians = gpu_scene.make_scene(48, 32), gpu_scene.make_gaussians(300, "cpu")
     trainer = gpu_scene.trainer_on(scene, gaussians, "cpu", sh_interval=2)
     trainer.warm_up()
-    limits.multiply_add.module.unload()
-    wp.load_module(limits.multiply_add.module, device="cpu")
+    work.count_pairs.module.unload()
+    wp.load_module(work.count_pairs.module, device="cpu")
     assert "Module" in capsys.readouterr().out  # what the test looks for is there
     degrees = set()
     for iteration in range(1, 9):
