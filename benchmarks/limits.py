@@ -23,7 +23,7 @@ import torch
 import warp as wp
 
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.runtime import launch
 from warp_splat.runtime.launch import view
 

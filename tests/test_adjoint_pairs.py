@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MIN, T_MIN
 from warp_splat.kernels import splat
-from warp_splat.kernels.lanes import vec16
+from warp_splat.kernels.simd import vec16
 
 PAIRS = {
     name: (getattr(splat, name), getattr(splat, f"adj_{name}")) for name in dir(splat) if hasattr(splat, f"adj_{name}")

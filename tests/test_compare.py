@@ -14,7 +14,7 @@ from warp_splat.compare import adjoints, knobs, oracle, plots, source, truth, wo
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
-from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project

@@ -7,7 +7,7 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLU
 
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop: the adjoint is Warp's.
 
-Written out in numbers, because a number may be sixteen (:mod:`warp_splat.kernels.numbers`): against vectors and
+Written out in numbers, because a number may be sixteen (:mod:`warp_splat.kernels.simd`): against vectors and
 matrices of one Gaussian, 12.0 -> 3.5 ms and, the adjoint, 25.3 -> 8.2 (194,000 Gaussians, one thread); since then 2.2
 and 4.2, with fewer divisions and without gradients that nobody asks for. Tried: columns instead of rows in memory,
 which no processor reads ahead in sixty places at once; a function for the products of three (an adjoint of 12.9 ms);
@@ -28,7 +28,26 @@ import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR, OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.compiler import DIFFERENTIABLE_LANES, IN_ORDER
-from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
+from warp_splat.kernels.simd import (
+    LANES,
+    TYPES,
+    columns,
+    equal,
+    fill,
+    inverse,
+    less,
+    over,
+    pick,
+    real,
+    root,
+    rounded_down,
+    rounded_up,
+    rows,
+    some,
+    times,
+    vec16,
+    whole,
+)
 from warp_splat.kernels.splat import reach_of
 
 wp.set_module_options(IN_ORDER)
@@ -60,22 +79,32 @@ class CameraView:
     alpha_min: float
 
 
+@wp.func
+def reaches(opacity: float, alpha_min: float):
+    """:func:`reach_of` in every lane."""
+    return reach_of(opacity, alpha_min)
+
+
+@wp.func
+def reaches(opacity: vec16, alpha_min: float):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = reach_of(opacity[lane], alpha_min)
+    return r
+
+
 @functools.cache
 def make_project(lanes: int) -> wp.Kernel:
     """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU. Its adjoint is Warp's."""
-    number, integer, fill, less, equal, some, pick, root, inverse, up, down, real, whole = make_numbers(lanes)
-    pair, _, join2 = make_rows2(lanes)
-    triple, split3, join3 = make_rows3(lanes)
-    quadruple, split4, _ = make_rows4(lanes)
-    mul, div = wp.cw_mul, wp.cw_div
+    number, integer, row2, row3, row4 = TYPES[lanes]
 
     @wp.func
-    def turn(camera: CameraView, row: int, column: int):
+    def turn(camera: CameraView, row: int, column: int, like: number):
         """An entry of the camera's rotation, without a gradient, which would take a quarter of the adjoint."""
-        return number(camera.rotation[row, column])
+        return fill(camera.rotation[row, column], like)
 
     @wp.func_grad(turn)
-    def adj_turn(camera: CameraView, row: int, column: int, adj_ret: number):
+    def adj_turn(camera: CameraView, row: int, column: int, like: number, adj_ret: number):
         pass
 
     @wp.func
@@ -90,11 +119,13 @@ def make_project(lanes: int) -> wp.Kernel:
     @wp.func
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
         """Half sides of the box where alpha >= alpha_min, its farthest point's distance, rounded up [px]."""
-        reach = number()
-        for lane in range(lanes):
-            reach[lane] = reach_of(opacity[lane], alpha_min)
-        widest = (xx + yy + root(mul(xx - yy, xx - yy) + mul(xy, xy) * 4.0)) * 0.5  # variance of the long axis
-        return root(mul(reach, xx)), root(mul(reach, yy)), wp.min(up(root(mul(reach, widest))), fill(1.0e9))
+        reach = reaches(opacity, alpha_min)
+        widest = (xx + yy + root(times(xx - yy, xx - yy) + times(xy, xy) * 4.0)) * 0.5  # variance of the long axis
+        return (
+            root(times(reach, xx)),
+            root(times(reach, yy)),
+            wp.min(rounded_up(root(times(reach, widest))), fill(1.0e9, opacity)),
+        )
 
     @wp.func_grad(support)
     def adj_support(
@@ -105,9 +136,9 @@ def make_project(lanes: int) -> wp.Kernel:
     @wp.func
     def covers_pixel(mean: number, extent: number, size: float):
         """Mask: a pixel centre of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
-        first = wp.max(up(mean - extent - number(0.5)), number(0.0))
-        last = wp.min(down(mean + extent - number(0.5)), number(size - 1.0))
-        return number(1.0) - less(last, first)
+        first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
+        last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
+        return fill(1.0, mean) - less(last, first)
 
     @wp.func_grad(covers_pixel)
     def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
@@ -117,162 +148,170 @@ def make_project(lanes: int) -> wp.Kernel:
     def project(
         first: int,  # group of Gaussians of this slice
         camera: CameraView,
-        means: wp.array[triple],  # [N / lanes] world
-        quats: wp.array[quadruple],  # wxyz, any norm
-        scales: wp.array[triple],  # world
+        means: wp.array[row3],  # [N / lanes] world
+        quats: wp.array[row4],  # wxyz, any norm
+        scales: wp.array[row3],  # world
         opacities: wp.array[number],  # 0..1
         # out: zero where culled; the caller clears them, all but the radii
-        means2d_out: wp.array[pair],  # px
-        conics_out: wp.array[triple],  # 1/px^2, (xx, xy, yy)
+        means2d_out: wp.array[row2],  # px
+        conics_out: wp.array[row3],  # 1/px^2, (xx, xy, yy)
         opacities_out: wp.array[number],  # after antialiasing
         depths_out: wp.array[number],  # z in the camera
-        extents_out: wp.array[pair],  # px, half sides of the box where alpha >= alpha_min
+        extents_out: wp.array[row2],  # px, half sides of the box where alpha >= alpha_min
         radii_out: wp.array[integer],  # px, farthest point where alpha >= alpha_min; CULLED, INVALID if not; read first
     ):
         g = first + wp.tid()
-        zero = fill(0.0)
-        one = fill(1.0)
-        mx, my, mz = split3(means[g])
-        qw, qx, qy, qz = split4(quats[g])
-        sx, sy, sz = split3(scales[g])
+        mx, my, mz = columns(means[g])
+        qw, qx, qy, qz = columns(quats[g])
+        sx, sy, sz = columns(scales[g])
         opacity = opacities[g]
+        zero = fill(0.0, opacity)
+        one = fill(1.0, opacity)
         # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
-        nought = mul(mx, zero) + mul(my, zero) + mul(mz, zero) + mul(opacity, zero)
-        nought = nought + mul(qw, zero) + mul(qx, zero) + mul(qy, zero) + mul(qz, zero)
-        finite = equal(nought + mul(sx, zero) + mul(sy, zero) + mul(sz, zero), zero)
+        nought = times(mx, zero) + times(my, zero) + times(mz, zero) + times(opacity, zero)
+        nought = nought + times(qw, zero) + times(qx, zero) + times(qy, zero) + times(qz, zero)
+        finite = equal(nought + times(sx, zero) + times(sy, zero) + times(sz, zero), zero)
         size = largest(qw, qx, qy, qz)
-        valid = mul(finite, less(zero, size))
+        valid = times(finite, less(zero, size))
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
-        here = mul(valid, less(zero, real(radii_out[g])))
+        here = times(valid, less(zero, real(radii_out[g])))
         radii_out[g] = whole(valid - one)  # CULLED or INVALID
-        ox = (pick(here, mx, zero) - fill(camera.center[0])) - fill(camera.center_low[0])
-        oy = (pick(here, my, zero) - fill(camera.center[1])) - fill(camera.center_low[1])
-        oz = (pick(here, mz, zero) - fill(camera.center[2])) - fill(camera.center_low[2])
-        r20 = turn(camera, 2, 0)
-        r21 = turn(camera, 2, 1)
-        r22 = turn(camera, 2, 2)
-        depth = mul(r20, ox) + mul(r21, oy) + mul(r22, oz)
-        here = mul(here, less(fill(NEAR), depth))
+        ox = (pick(here, mx, zero) - fill(camera.center[0], one)) - fill(camera.center_low[0], one)
+        oy = (pick(here, my, zero) - fill(camera.center[1], one)) - fill(camera.center_low[1], one)
+        oz = (pick(here, mz, zero) - fill(camera.center[2], one)) - fill(camera.center_low[2], one)
+        r20 = turn(camera, 2, 0, one)
+        r21 = turn(camera, 2, 1, one)
+        r22 = turn(camera, 2, 2, one)
+        depth = times(r20, ox) + times(r21, oy) + times(r22, oz)
+        here = times(here, less(fill(NEAR, one), depth))
         if not some(here):
             return
         # harmless numbers take the place of those that are left out
         z = pick(here, depth, one)
         size = pick(here, size, one)
-        scale = pick(less(size, fill(SMALL)), fill(ENLARGED), pick(less(fill(LARGE), size), fill(REDUCED), one))
-        w = mul(pick(here, qw, one), scale)
-        x = mul(pick(here, qx, zero), scale)
-        y = mul(pick(here, qy, zero), scale)
-        q = mul(pick(here, qz, zero), scale)
-        per_norm = inverse(root(mul(w, w) + mul(x, x) + mul(y, y) + mul(q, q)))
-        w = mul(w, per_norm)
-        x = mul(x, per_norm)
-        y = mul(y, per_norm)
-        q = mul(q, per_norm)
+        scale = pick(
+            less(size, fill(SMALL, one)),
+            fill(ENLARGED, one),
+            pick(less(fill(LARGE, one), size), fill(REDUCED, one), one),
+        )
+        w = times(pick(here, qw, one), scale)
+        x = times(pick(here, qx, zero), scale)
+        y = times(pick(here, qy, zero), scale)
+        q = times(pick(here, qz, zero), scale)
+        per_norm = inverse(root(times(w, w) + times(x, x) + times(y, y) + times(q, q)))
+        w = times(w, per_norm)
+        x = times(x, per_norm)
+        y = times(y, per_norm)
+        q = times(q, per_norm)
         # R
-        two = fill(2.0)
-        m00 = one - mul(two, mul(y, y) + mul(q, q))
-        m01 = mul(two, mul(x, y) - mul(w, q))
-        m02 = mul(two, mul(x, q) + mul(w, y))
-        m10 = mul(two, mul(x, y) + mul(w, q))
-        m11 = one - mul(two, mul(x, x) + mul(q, q))
-        m12 = mul(two, mul(y, q) - mul(w, x))
-        m20 = mul(two, mul(x, q) - mul(w, y))
-        m21 = mul(two, mul(y, q) + mul(w, x))
-        m22 = one - mul(two, mul(x, x) + mul(y, y))
+        two = fill(2.0, one)
+        m00 = one - times(two, times(y, y) + times(q, q))
+        m01 = times(two, times(x, y) - times(w, q))
+        m02 = times(two, times(x, q) + times(w, y))
+        m10 = times(two, times(x, y) + times(w, q))
+        m11 = one - times(two, times(x, x) + times(q, q))
+        m12 = times(two, times(y, q) - times(w, x))
+        m20 = times(two, times(x, q) - times(w, y))
+        m21 = times(two, times(y, q) + times(w, x))
+        m22 = one - times(two, times(x, x) + times(y, y))
         sx = pick(here, sx, one)
         sy = pick(here, sy, one)
         sz = pick(here, sz, one)
         # the mean in the image
-        r00 = turn(camera, 0, 0)
-        r01 = turn(camera, 0, 1)
-        r02 = turn(camera, 0, 2)
-        r10 = turn(camera, 1, 0)
-        r11 = turn(camera, 1, 1)
-        r12 = turn(camera, 1, 2)
-        fx = fill(camera.focal[0])
-        fy = fill(camera.focal[1])
-        u = div(mul(r00, ox) + mul(r01, oy) + mul(r02, oz), z)
-        v = div(mul(r10, ox) + mul(r11, oy) + mul(r12, oz), z)
-        px = mul(fx, u) + fill(camera.principal[0])
-        py = mul(fy, v) + fill(camera.principal[1])
+        r00 = turn(camera, 0, 0, one)
+        r01 = turn(camera, 0, 1, one)
+        r02 = turn(camera, 0, 2, one)
+        r10 = turn(camera, 1, 0, one)
+        r11 = turn(camera, 1, 1, one)
+        r12 = turn(camera, 1, 2, one)
+        fx = fill(camera.focal[0], one)
+        fy = fill(camera.focal[1], one)
+        u = over(times(r00, ox) + times(r01, oy) + times(r02, oz), z)
+        v = over(times(r10, ox) + times(r11, oy) + times(r12, oz), z)
+        px = times(fx, u) + fill(camera.principal[0], one)
+        py = times(fy, v) + fill(camera.principal[1], one)
         if camera.ellipsoid == 0:  # the linearization is worthless far outside the image; the outline is not
-            u_min = fill(camera.slope_min[0])
-            u_max = fill(camera.slope_max[0])
-            v_min = fill(camera.slope_min[1])
-            v_max = fill(camera.slope_max[1])
+            u_min = fill(camera.slope_min[0], one)
+            u_max = fill(camera.slope_max[0], one)
+            v_min = fill(camera.slope_min[1], one)
+            v_max = fill(camera.slope_max[1], one)
             u = pick(less(u, u_min), u_min, pick(less(u_max, u), u_max, u))
             v = pick(less(v, v_min), v_min, pick(less(v_max, v), v_max, v))
         # J W
         per_z = inverse(z)
-        kx = mul(fx, per_z)
-        ky = mul(fy, per_z)
-        j00 = mul(kx, r00 - mul(u, r20))
-        j01 = mul(kx, r01 - mul(u, r21))
-        j02 = mul(kx, r02 - mul(u, r22))
-        j10 = mul(ky, r10 - mul(v, r20))
-        j11 = mul(ky, r11 - mul(v, r21))
-        j12 = mul(ky, r12 - mul(v, r22))
+        kx = times(fx, per_z)
+        ky = times(fy, per_z)
+        j00 = times(kx, r00 - times(u, r20))
+        j01 = times(kx, r01 - times(u, r21))
+        j02 = times(kx, r02 - times(u, r22))
+        j10 = times(ky, r10 - times(v, r20))
+        j11 = times(ky, r11 - times(v, r21))
+        j12 = times(ky, r12 - times(v, r22))
         # a1, a2; scaled last, or needles would lose digits of the scales' gradients
-        a10 = mul(sx, mul(j00, m00) + mul(j01, m10) + mul(j02, m20))
-        a11 = mul(sy, mul(j00, m01) + mul(j01, m11) + mul(j02, m21))
-        a12 = mul(sz, mul(j00, m02) + mul(j01, m12) + mul(j02, m22))
-        a20 = mul(sx, mul(j10, m00) + mul(j11, m10) + mul(j12, m20))
-        a21 = mul(sy, mul(j10, m01) + mul(j11, m11) + mul(j12, m21))
-        a22 = mul(sz, mul(j10, m02) + mul(j11, m12) + mul(j12, m22))
+        a10 = times(sx, times(j00, m00) + times(j01, m10) + times(j02, m20))
+        a11 = times(sy, times(j00, m01) + times(j01, m11) + times(j02, m21))
+        a12 = times(sz, times(j00, m02) + times(j01, m12) + times(j02, m22))
+        a20 = times(sx, times(j10, m00) + times(j11, m10) + times(j12, m20))
+        a21 = times(sy, times(j10, m01) + times(j11, m11) + times(j12, m21))
+        a22 = times(sz, times(j10, m02) + times(j11, m12) + times(j12, m22))
         if camera.ellipsoid != 0:
-            outline = fill(OUTLINE)
-            near = div(outline, z)
-            a30 = mul(mul(near, sx), mul(r20, m00) + mul(r21, m10) + mul(r22, m20))
-            a31 = mul(mul(near, sy), mul(r20, m01) + mul(r21, m11) + mul(r22, m21))
-            a32 = mul(mul(near, sz), mul(r20, m02) + mul(r21, m12) + mul(r22, m22))
-            rest = one - (mul(a30, a30) + mul(a31, a31) + mul(a32, a32))
-            here = mul(here, less(fill(LEAST_REST), rest))
+            outline = fill(OUTLINE, one)
+            near = over(outline, z)
+            a30 = times(times(near, sx), times(r20, m00) + times(r21, m10) + times(r22, m20))
+            a31 = times(times(near, sy), times(r20, m01) + times(r21, m11) + times(r22, m21))
+            a32 = times(times(near, sz), times(r20, m02) + times(r21, m12) + times(r22, m22))
+            rest = one - (times(a30, a30) + times(a31, a31) + times(a32, a32))
+            here = times(here, less(fill(LEAST_REST, one), rest))
             rest = pick(here, rest, one)
-            shift1 = mul(a10, a30) + mul(a11, a31) + mul(a12, a32)
-            shift2 = mul(a20, a30) + mul(a21, a31) + mul(a22, a32)
-            px = px - mul(div(outline, rest), shift1)
-            py = py - mul(div(outline, rest), shift2)
+            shift1 = times(a10, a30) + times(a11, a31) + times(a12, a32)
+            shift2 = times(a20, a30) + times(a21, a31) + times(a22, a32)
+            px = px - times(over(outline, rest), shift1)
+            py = py - times(over(outline, rest), shift2)
             shrink = root(rest)
-            shift1 = div(shift1, rest + shrink)
-            shift2 = div(shift2, rest + shrink)
-            a10 = div(a10 + mul(shift1, a30), shrink)
-            a11 = div(a11 + mul(shift1, a31), shrink)
-            a12 = div(a12 + mul(shift1, a32), shrink)
-            a20 = div(a20 + mul(shift2, a30), shrink)
-            a21 = div(a21 + mul(shift2, a31), shrink)
-            a22 = div(a22 + mul(shift2, a32), shrink)
-        c0 = mul(a11, a22) - mul(a12, a21)
-        c1 = mul(a12, a20) - mul(a10, a22)
-        c2 = mul(a10, a21) - mul(a11, a20)
-        xx = mul(a10, a10) + mul(a11, a11) + mul(a12, a12)
-        xy = mul(a10, a20) + mul(a11, a21) + mul(a12, a22)
-        yy = mul(a20, a20) + mul(a21, a21) + mul(a22, a22)
-        sharp = mul(c0, c0) + mul(c1, c1) + mul(c2, c2)
-        blur = fill(BLUR)
-        det = sharp + mul(blur, xx + yy) + mul(blur, blur)
+            shift1 = over(shift1, rest + shrink)
+            shift2 = over(shift2, rest + shrink)
+            a10 = over(a10 + times(shift1, a30), shrink)
+            a11 = over(a11 + times(shift1, a31), shrink)
+            a12 = over(a12 + times(shift1, a32), shrink)
+            a20 = over(a20 + times(shift2, a30), shrink)
+            a21 = over(a21 + times(shift2, a31), shrink)
+            a22 = over(a22 + times(shift2, a32), shrink)
+        c0 = times(a11, a22) - times(a12, a21)
+        c1 = times(a12, a20) - times(a10, a22)
+        c2 = times(a10, a21) - times(a11, a20)
+        xx = times(a10, a10) + times(a11, a11) + times(a12, a12)
+        xy = times(a10, a20) + times(a11, a21) + times(a12, a22)
+        yy = times(a20, a20) + times(a21, a21) + times(a22, a22)
+        sharp = times(c0, c0) + times(c1, c1) + times(c2, c2)
+        blur = fill(BLUR, one)
+        det = sharp + times(blur, xx + yy) + times(blur, blur)
         xx = xx + blur
         yy = yy + blur
         opacity = pick(here, opacity, one)
         if camera.antialiasing != 0:  # before any test of the opacity
-            least = fill(COMPENSATION_MIN)
-            share = div(sharp, det)
-            opacity = mul(opacity, root(pick(less(least, share), share, least)))
-        bounded = equal(mul(det, zero), zero)  # else too large for float32 numbers, about 4e9 px
-        code = valid - one - mul(here, one - bounded)
+            least = fill(COMPENSATION_MIN, one)
+            share = over(sharp, det)
+            opacity = times(opacity, root(pick(less(least, share), share, least)))
+        bounded = equal(times(det, zero), zero)  # else too large for float32 numbers, about 4e9 px
+        code = valid - one - times(here, one - bounded)
         radii_out[g] = whole(code)
-        here = mul(mul(here, bounded), one - less(opacity, fill(camera.alpha_min)))
+        here = times(times(here, bounded), one - less(opacity, fill(camera.alpha_min, one)))
         extent_x, extent_y, farthest = support(opacity, camera.alpha_min, xx, xy, yy)
-        here = mul(here, mul(covers_pixel(px, extent_x, camera.size[0]), covers_pixel(py, extent_y, camera.size[1])))
+        here = times(
+            here, times(covers_pixel(px, extent_x, camera.size[0]), covers_pixel(py, extent_y, camera.size[1]))
+        )
         if not some(here):
             return
-        means2d_out[g] = join2(pick(here, px, zero), pick(here, py, zero))
+        means2d_out[g] = rows(pick(here, px, zero), pick(here, py, zero))
         per_det = inverse(det)
-        conics_out[g] = join3(
-            pick(here, mul(yy, per_det), zero), pick(here, mul(-xy, per_det), zero), pick(here, mul(xx, per_det), zero)
+        conics_out[g] = rows(
+            pick(here, times(yy, per_det), zero),
+            pick(here, times(-xy, per_det), zero),
+            pick(here, times(xx, per_det), zero),
         )
         opacities_out[g] = pick(here, opacity, zero)
         depths_out[g] = pick(here, depth, zero)
-        extents_out[g] = join2(pick(here, extent_x, zero), pick(here, extent_y, zero))
+        extents_out[g] = rows(pick(here, extent_x, zero), pick(here, extent_y, zero))
         radii_out[g] = whole(pick(here, farthest, code))
 
     return project

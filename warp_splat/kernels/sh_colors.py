@@ -15,8 +15,8 @@ import warp as wp
 
 from warp_splat.kernels.compiler import LANES_IN_ORDER
 from warp_splat.kernels.harmonics import C0, make_harmonics
-from warp_splat.kernels.numbers import make_numbers
 from warp_splat.kernels.project import INVALID, CameraView
+from warp_splat.kernels.simd import TYPES, lane_of, pick
 
 mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
 mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
@@ -27,19 +27,23 @@ OPTIONS = {**LANES_IN_ORDER, "max_unroll": 15}  # unrolls all loops but those ov
 @functools.cache
 def make_offsets(lanes: int) -> wp.Function:
     """From the camera to ``lanes`` Gaussians; beyond the last one, that one's."""
-    number = make_numbers(lanes).number
+    number = TYPES[lanes].number
 
     @wp.func
     def offsets(camera: CameraView, means: wp.array[wp.vec3], first: int):
-        x = number()
-        y = number()
-        z = number()
-        for lane in range(lanes):
-            mean = means[wp.min(first + lane, means.shape[0] - 1)]
-            x[lane] = (mean[0] - camera.center[0]) - camera.center_low[0]
-            y[lane] = (mean[1] - camera.center[1]) - camera.center_low[1]
-            z[lane] = (mean[2] - camera.center[2]) - camera.center_low[2]
-        return x, y, z
+        if wp.static(lanes == 1):
+            offset = (means[first] - camera.center) - camera.center_low
+            return offset[0], offset[1], offset[2]
+        else:
+            x = number()
+            y = number()
+            z = number()
+            for lane in range(lanes):
+                mean = means[wp.min(first + lane, means.shape[0] - 1)]
+                x[lane] = (mean[0] - camera.center[0]) - camera.center_low[0]
+                y[lane] = (mean[1] - camera.center[1]) - camera.center_low[1]
+                z[lane] = (mean[2] - camera.center[2]) - camera.center_low[2]
+            return x, y, z
 
     return offsets
 
@@ -102,8 +106,7 @@ def make_shade(lanes: int) -> wp.Kernel:
 def make_adj_shade(lanes: int) -> wp.Kernel:
     """The adjoint of :func:`make_shade`'s kernel."""
     table, evaluate, weigh = make_harmonics(lanes)
-    numbers = make_numbers(lanes)
-    number, pick = numbers.number, numbers.pick
+    number = TYPES[lanes].number
     offsets = make_offsets(lanes)
 
     @wp.kernel(module="unique", module_options=dict(OPTIONS))
@@ -128,7 +131,7 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         x, y, z = offsets(camera, means, group)
         functions = evaluate(x, y, z)
         weights = table()
-        drawn = number()
+        drawn = number(0.0)
         for lane in range(lanes):
             i = group + lane
             if i < radii.shape[0]:
@@ -137,7 +140,10 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
                 adj2 = mat53()
                 adj3 = mat73()
                 if radii[i] > 0:
-                    drawn[lane] = 1.0
+                    if wp.static(lanes == 1):
+                        drawn = 1.0
+                    else:
+                        drawn[lane] = 1.0
                     for channel in range(3):
                         if colors[i][channel] > 0.0:  # not cut to 0
                             adj[channel] = adj_colors[i][channel]
@@ -169,6 +175,6 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         for lane in range(lanes):
             i = group + lane
             if i < radii.shape[0]:
-                means_out[i] = wp.vec3(adj_x[lane], adj_y[lane], adj_z[lane])
+                means_out[i] = wp.vec3(lane_of(adj_x, lane), lane_of(adj_y, lane), lane_of(adj_z, lane))
 
     return adj_shade

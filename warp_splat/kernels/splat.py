@@ -28,7 +28,7 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MAX
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.lanes import exp2_exact, fill, fraction, halved, over, times, where_less, whole
+from warp_splat.kernels.simd import exp2_exact, fill, fraction, halved, over, times, where_less, whole
 
 wp.set_module_options(FORWARD_ONLY)
 

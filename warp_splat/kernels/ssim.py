@@ -29,7 +29,7 @@ import math
 import warp as wp
 
 from warp_splat.kernels.compiler import LANES_IN_ORDER
-from warp_splat.kernels.lanes import LANES, fill, over, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANES, fill, over, times, total, vec16, where_less
 
 wp.set_module_options(LANES_IN_ORDER)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.lanes import fill, inner, times, vec16, where_less
+from warp_splat.kernels.simd import fill, inner, times, vec16, where_less
 from warp_splat.kernels.splat import (
     LN_2,
     LOG2_E,

@@ -17,7 +17,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.kernels.cpu.adjoint import make_reverse
 from warp_splat.kernels.cpu.blend import BLOCKS, make_blend, make_upstream
 from warp_splat.kernels.cpu.taped import make_walk, rows_of_copies
-from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.bin import room_for_states
 from warp_splat.raster.data import Bins, Pixels, limits_of

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels.lanes import LANES
+from warp_splat.kernels.simd import LANES
 from warp_splat.raster import bin, cpu, cuda
 from warp_splat.raster.data import Bins, Pixels, Splats2D
 

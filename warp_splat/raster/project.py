@@ -12,9 +12,9 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
-from warp_splat.kernels.numbers import make_numbers, make_rows2, make_rows3, make_rows4
 from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade, mat53, mat73
+from warp_splat.kernels.simd import TYPES
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import SMALLEST_SLICE, even_slices, in_slices, launch, stage, torch_slices, view
@@ -92,13 +92,13 @@ def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
 
 def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> None:
     """See :func:`_project_geometry`; N is a multiple of ``lanes``."""
-    number, integer, *_ = make_numbers(lanes)
-    pair, triple, quadruple = (make_rows(lanes).row for make_rows in (make_rows2, make_rows3, make_rows4))
-    types_in, types_out = (triple, quadruple, triple, number), (pair, triple, number, number, pair, integer)
+    number, integer, row2, row3, row4 = TYPES[lanes]
+    types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
 
     def in_groups(tensors, types):
         sizes = [wp.types.type_size_in_bytes(dtype) // 4 for dtype in types]
-        return [view(t.view(-1, size), dtype) for t, size, dtype in zip(tensors, sizes, types, strict=False)]
+        shapes = [(-1, size) if size > 1 else (-1,) for size in sizes]
+        return [view(t.view(shape), dtype) for t, shape, dtype in zip(tensors, shapes, types, strict=False)]
 
     adjoint = {}
     if adj_inputs:

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
-from warp_splat.kernels.lanes import LANES, vec16
+from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.raster.drivers import DRIVERS, driver_of
 from warp_splat.runtime.launch import even_slices, launch, stage, view
 

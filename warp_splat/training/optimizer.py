@@ -13,7 +13,7 @@ from warp_splat.config import TrainConfig
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import make_adam
-from warp_splat.kernels.lanes import LANES
+from warp_splat.kernels.simd import LANES
 from warp_splat.runtime.launch import in_slices, launch, torch_slices, view
 
 BETAS = (0.9, 0.999)

@@ -10,7 +10,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
-from warp_splat.kernels.lanes import LANES, times, vec16
+from warp_splat.kernels.simd import LANES, times, vec16
 from warp_splat.kernels.splat import Splat2D, exponent
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
 

@@ -22,7 +22,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
-from warp_splat.kernels.lanes import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
 from warp_splat.kernels.splat import Splat2D, advance, alpha_of, exponent, make_exp, weight
 
 BLOCKS = TILE * TILE // LANES  # per tile

@@ -23,7 +23,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, reach
-from warp_splat.kernels.lanes import LANE_X, LANE_Y, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANE_X, LANE_Y, times, total, vec16, where_less
 from warp_splat.kernels.splat import Splat2D, alpha_of, exponent, make_exp, odds_of
 from warp_splat.kernels.step import conic_from_root, exp2_known, opaque
 

@@ -1,0 +1,486 @@
+"""Numbers side by side: the one vocabulary in which kernels for one number and for sixteen are written.
+
+Every operation has an overload for ``float`` and one for ``vec16``, under one name. A CPU runs ``vec16``: Warp's CPU
+backend is scalar C++, and LLVM turns sixteen lanes into one AVX-512 register (two of AVX2, four of NEON) if the code
+has no branch per lane and no libm call. A GPU's thread runs ``float``. What else there is, ``+``, ``-``, ``wp.min`` and
+``wp.max``, takes either.
+
+Kernels that Warp differentiates need operations that know their derivative. The generated one is slow in lanes:
+
+- of a choice: a branch per lane;
+- of a constant: a sum over the lanes, one after the other (an adjoint twice as slow);
+- of a division: two more divisions.
+
+(Where ``wp.grad`` differentiates a function, what is called two levels below it needs a derivative by hand, too: Warp
+1.19 silently leaves out the generated one.)
+
+Masks are 1 or 0. Masks, constants, whole and rounded numbers have no derivative.
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+from warp_splat.kernels.compiler import FORWARD_ONLY
+
+wp.set_module_options(FORWARD_ONLY)
+
+LANES = 16
+vec16 = wp.types.vector(length=LANES, dtype=float)
+vec16i = wp.types.vector(length=LANES, dtype=int)
+#: Rows of 2, 3 and 4 numbers of sixteen Gaussians, as they lie in memory.
+vec32 = wp.types.vector(length=2 * LANES, dtype=float)
+vec48 = wp.types.vector(length=3 * LANES, dtype=float)
+vec64 = wp.types.vector(length=4 * LANES, dtype=float)
+
+
+class Types(NamedTuple):
+    """The types of a kernel for a number of lanes."""
+
+    number: type
+    integer: type
+    row2: type  # two numbers of each lane, as they lie in memory: see `columns`
+    row3: type
+    row4: type
+
+
+TYPES = {1: Types(wp.float32, wp.int32, wp.vec2, wp.vec3, wp.vec4), LANES: Types(vec16, vec16i, vec32, vec48, vec64)}
+
+#: Pixel offsets of the lanes in their 4 x 4 block, row by row.
+LANE_X = wp.constant(vec16(*[float(lane % 4) for lane in range(LANES)]))
+LANE_Y = wp.constant(vec16(*[float(lane // 4) for lane in range(LANES)]))
+
+
+@wp.func
+def fill(value: float, like: float):
+    """``value`` in every lane of a variable shaped as ``like``; a constant, without a gradient."""
+    return value
+
+
+@wp.func
+def fill(value: float, like: vec16):
+    return vec16(value)
+
+
+@wp.func_grad(fill)
+def adj_fill(value: float, like: float, adj_ret: float):
+    pass
+
+
+@wp.func_grad(fill)
+def adj_fill(value: float, like: vec16, adj_ret: vec16):
+    pass
+
+
+@wp.func
+def lane_of(x: float, lane: int):
+    """The number of one lane."""
+    return x
+
+
+@wp.func
+def lane_of(x: vec16, lane: int):
+    return x[lane]
+
+
+@wp.func
+def times(a: float, b: float):
+    return a * b
+
+
+@wp.func
+def times(a: vec16, b: vec16):
+    return wp.cw_mul(a, b)
+
+
+@wp.func
+def times(a: vec16, b: float):
+    return a * b
+
+
+@wp.func
+def over(a: float, b: float):
+    return a / b
+
+
+@wp.func
+def over(a: vec16, b: vec16):
+    return wp.cw_div(a, b)
+
+
+@wp.func
+def inverse(x: float):
+    """1 / x."""
+    return 1.0 / x
+
+
+@wp.func
+def inverse(x: vec16):
+    return wp.cw_div(vec16(1.0), x)
+
+
+@wp.func_grad(inverse)
+def adj_inverse(x: float, adj_ret: float):
+    r = inverse(x)
+    wp.adjoint[x] -= adj_ret * r * r
+
+
+@wp.func_grad(inverse)
+def adj_inverse(x: vec16, adj_ret: vec16):
+    r = inverse(x)
+    wp.adjoint[x] -= wp.cw_mul(wp.cw_mul(adj_ret, r), r)
+
+
+@wp.func
+def root(x: float):
+    """Square root."""
+    return wp.sqrt(x)
+
+
+@wp.func
+def root(x: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.sqrt(x[lane])
+    return r
+
+
+@wp.func_grad(root)
+def adj_root(x: float, adj_ret: float):
+    wp.adjoint[x] += adj_ret / (root(x) * 2.0)
+
+
+@wp.func_grad(root)
+def adj_root(x: vec16, adj_ret: vec16):
+    wp.adjoint[x] += wp.cw_div(adj_ret, root(x) * 2.0)
+
+
+@wp.func
+def less(a: float, b: float):
+    """Mask: a < b."""
+    return wp.where(a < b, 1.0, 0.0)
+
+
+@wp.func
+def less(a: vec16, b: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.where(a[lane] < b[lane], 1.0, 0.0)
+    return r
+
+
+@wp.func_grad(less)
+def adj_less(a: vec16, b: vec16, adj_ret: vec16):
+    pass
+
+
+@wp.func
+def equal(a: float, b: float):
+    """Mask: a == b."""
+    return wp.where(a == b, 1.0, 0.0)
+
+
+@wp.func
+def equal(a: vec16, b: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.where(a[lane] == b[lane], 1.0, 0.0)
+    return r
+
+
+@wp.func_grad(equal)
+def adj_equal(a: vec16, b: vec16, adj_ret: vec16):
+    pass
+
+
+@wp.func
+def some(mask: float):
+    """Whether a mask is set in any lane."""
+    return mask > 0.0
+
+
+@wp.func
+def some(mask: vec16):
+    s = int(0)  # a sum of floats would be taken in order
+    for lane in range(LANES):
+        s += int(mask[lane])
+    return s > 0
+
+
+@wp.func
+def pick(mask: float, a: float, b: float):
+    """``a`` where a mask is set, else ``b``."""
+    return wp.where(mask > 0.0, a, b)
+
+
+@wp.func
+def pick(mask: vec16, a: vec16, b: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.where(mask[lane] > 0.0, a[lane], b[lane])
+    return r
+
+
+@wp.func_grad(pick)
+def adj_pick(mask: vec16, a: vec16, b: vec16, adj_ret: vec16):
+    zero = vec16(0.0)
+    wp.adjoint[a] += pick(mask, adj_ret, zero)
+    wp.adjoint[b] += pick(mask, zero, adj_ret)
+
+
+@wp.func
+def where_less(a: float, b: float, x: float, y: float):
+    """``x`` where ``a < b``, else ``y``: compared and picked at once, for kernels that keep no mask."""
+    if a < b:  # not wp.where, which cannot be called from Python
+        return x
+    return y
+
+
+@wp.func
+def where_less(a: vec16, b: vec16, x: vec16, y: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.where(a[lane] < b[lane], x[lane], y[lane])
+    return r
+
+
+@wp.func
+def whole(x: float):
+    """To an integer, towards 0."""
+    return int(x)
+
+
+@wp.func
+def whole(x: vec16):
+    r = vec16i()
+    for lane in range(LANES):
+        r[lane] = int(x[lane])
+    return r
+
+
+@wp.func
+def real(x: int):
+    """From an integer."""
+    return float(x)
+
+
+@wp.func
+def real(x: vec16i):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = float(x[lane])
+    return r
+
+
+@wp.func
+def rounded_up(x: float):
+    return wp.ceil(x)
+
+
+@wp.func
+def rounded_up(x: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.ceil(x[lane])
+    return r
+
+
+@wp.func
+def rounded_down(x: float):
+    return wp.floor(x)
+
+
+@wp.func
+def rounded_down(x: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.floor(x[lane])
+    return r
+
+
+@wp.func
+def fraction(x: float, n: int):
+    """``x`` without its whole part ``n``."""
+    return x - float(n)
+
+
+@wp.func
+def fraction(x: vec16, n: vec16i):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = x[lane] - float(n[lane])
+    return r
+
+
+@wp.func
+def halved(x: float, n: int):
+    """``x`` times 2^-n by the exponent's bits; neither x nor the result may be denormal."""
+    return wp.cast(wp.cast(x, int) - (n << 23), float)
+
+
+@wp.func
+def halved(x: vec16, n: vec16i):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.cast(wp.cast(x[lane], int) - (n[lane] << 23), float)
+    return r
+
+
+@wp.func_grad(halved)
+def adj_halved(x: vec16, n: vec16i, adj_ret: vec16):  # bits have no derivative that Warp could find
+    wp.adjoint[x] += times(adj_ret, halved(vec16(1.0), n))
+
+
+@wp.func
+def exp2_exact(x: float):
+    """2^x by the C library: a call per lane."""
+    return wp.exp(x * 0.6931471805599453)
+
+
+@wp.func
+def exp2_exact(x: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.exp(x[lane] * 0.6931471805599453)
+    return r
+
+
+@wp.func
+def inner(a: float, b: float):
+    """Sum over the lanes of the product."""
+    return a * b
+
+
+@wp.func
+def inner(a: vec16, b: vec16):
+    return wp.dot(a, b)
+
+
+@wp.func
+def total(x: vec16):
+    """Sum of the lanes, in a fixed order."""
+    s = float(0.0)
+    for lane in range(LANES):
+        s += x[lane]
+    return s
+
+
+@wp.func
+def columns(row: wp.vec2):
+    """The numbers of a row one by one: rows of sixteen Gaussians become columns of sixteen lanes.
+
+    Tried: one function for any width, a column at a time: projection and adjoint take half as long again.
+    """
+    return row[0], row[1]
+
+
+@wp.func
+def columns(row: vec32):
+    x = vec16()
+    y = vec16()
+    for lane in range(LANES):
+        x[lane] = row[2 * lane]
+        y[lane] = row[2 * lane + 1]
+    return x, y
+
+
+@wp.func
+def columns(row: wp.vec3):
+    return row[0], row[1], row[2]
+
+
+@wp.func
+def columns(row: vec48):
+    x = vec16()
+    y = vec16()
+    z = vec16()
+    for lane in range(LANES):
+        x[lane] = row[3 * lane]
+        y[lane] = row[3 * lane + 1]
+        z[lane] = row[3 * lane + 2]
+    return x, y, z
+
+
+@wp.func
+def columns(row: wp.vec4):
+    return row[0], row[1], row[2], row[3]
+
+
+@wp.func
+def columns(row: vec64):
+    w = vec16()
+    x = vec16()
+    y = vec16()
+    z = vec16()
+    for lane in range(LANES):
+        w[lane] = row[4 * lane]
+        x[lane] = row[4 * lane + 1]
+        y[lane] = row[4 * lane + 2]
+        z[lane] = row[4 * lane + 3]
+    return w, x, y, z
+
+
+@wp.func
+def rows(x: float, y: float):
+    """Columns back to a row."""
+    return wp.vec2(x, y)
+
+
+@wp.func
+def rows(x: vec16, y: vec16):
+    row = vec32()
+    for lane in range(LANES):
+        row[2 * lane] = x[lane]
+        row[2 * lane + 1] = y[lane]
+    return row
+
+
+@wp.func
+def rows(x: float, y: float, z: float):
+    return wp.vec3(x, y, z)
+
+
+@wp.func
+def rows(x: vec16, y: vec16, z: vec16):
+    row = vec48()
+    for lane in range(LANES):
+        row[3 * lane] = x[lane]
+        row[3 * lane + 1] = y[lane]
+        row[3 * lane + 2] = z[lane]
+    return row
+
+
+@wp.func
+def rows(w: vec16, x: vec16, y: vec16, z: vec16):
+    row = vec64()
+    for lane in range(LANES):
+        row[4 * lane] = w[lane]
+        row[4 * lane + 1] = x[lane]
+        row[4 * lane + 2] = y[lane]
+        row[4 * lane + 3] = z[lane]
+    return row
+
+
+@wp.func_grad(columns)
+def adj_columns(row: vec48, adj_x: vec16, adj_y: vec16, adj_z: vec16):
+    wp.adjoint[row] += rows(adj_x, adj_y, adj_z)
+
+
+@wp.func_grad(columns)
+def adj_columns(row: vec64, adj_w: vec16, adj_x: vec16, adj_y: vec16, adj_z: vec16):
+    wp.adjoint[row] += rows(adj_w, adj_x, adj_y, adj_z)
+
+
+@wp.func_grad(rows)
+def adj_rows(x: vec16, y: vec16, adj_ret: vec32):
+    adj_x, adj_y = columns(adj_ret)
+    wp.adjoint[x] += adj_x
+    wp.adjoint[y] += adj_y
+
+
+@wp.func_grad(rows)
+def adj_rows(x: vec16, y: vec16, z: vec16, adj_ret: vec48):
+    adj_x, adj_y, adj_z = columns(adj_ret)
+    wp.adjoint[x] += adj_x
+    wp.adjoint[y] += adj_y
+    wp.adjoint[z] += adj_z
