@@ -1,4 +1,4 @@
-"""What ``benchmarks/step.py`` and ``savings.py`` count and compare is right."""
+"""What ``benchmarks/step.py``, ``savings.py`` and ``derivatives.py`` count and compare is right."""
 
 import sys
 from dataclasses import replace
@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from warp_splat import RasterOptions
-from warp_splat.config import ALPHA_MIN, T_MIN
+from warp_splat.config import ADJOINTS, ALPHA_MIN, T_MIN
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch
@@ -18,6 +18,7 @@ from warp_splat.runtime import launch
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
+import derivatives  # noqa: E402
 import gpu_scene  # noqa: E402
 import limits  # noqa: E402
 import savings  # noqa: E402
@@ -57,6 +58,12 @@ def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
     assert found.pairs == pytest.approx(pairs, rel=1e-4)  # a pair at the threshold may round to either side
     assert found.pairs < found.looked_at < 16 * found.pairs
     assert (found.gaussians, found.drawn, found.pixels, found.coefficients) == (3000, len(order), 1200, 16)
+
+
+def test_derivative_lines_are_counted_for_every_mode():
+    counts = {mode: derivatives.derivative_lines(mode) for mode in (*ADJOINTS, "generated", "plain")}
+    assert all(rules > 0 and plumbing > 0 for rules, plumbing in counts.values())
+    assert counts["stepwise"][0] < counts["manual"][0]
 
 
 @pytest.mark.long  # half a minute to compile

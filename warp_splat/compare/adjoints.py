@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.compare.source import derivative_lines
 from warp_splat.compare.trained import CAPS
 from warp_splat.compare.truth import Error, Truth, compute_truth, errors_of, gradients_of
 from warp_splat.compare.workloads import Workload
@@ -59,8 +58,6 @@ class Measurement:
     backward: list[float] = field(default_factory=list)  # s, of its adjoint
     stages: dict[str, float] = field(default_factory=dict)  # s of all stages of rendering and differentiating
     memory: int | None = None  # bytes at the peak of a forward and backward pass, by torch's allocator
-    rules: int | None = None  # lines that state a derivative or an inverse, see derivative_lines
-    plumbing: int | None = None  # lines that restate the loop or carry values
     note: str = ""
     extrapolated: bool = False  # the time
 
@@ -83,7 +80,7 @@ def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[
     """Every variant on every workload, and central differences."""
     results = []
     if any(workload.device.type != "cpu" for workload in workloads):
-        say(f"Left out: {', '.join(ON_CPU)} and the count of lines, which the CPU's kernels alone have.")
+        say(f"Left out: {', '.join(ON_CPU)}, which the CPU's kernels alone have.")
     for workload in workloads:
         start = time.perf_counter()
         truth = compute_truth(workload)
@@ -97,8 +94,6 @@ def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[
 def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement:
     """Error and memory; compiles and warms up the kernels."""
     result = Measurement(workload.name, variant.name, len(workload.gaussians.means))
-    if workload.device.type == "cpu":
-        result.rules, result.plumbing = derivative_lines(variant.adjoint)
     options = variant.options(workload)
     try:
         image, gradients = gradients_of(workload, truth, variant.adjoint, options)
@@ -204,8 +199,6 @@ def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:
             "backward_seconds": median(item.backward),
             "backward_spread": spread(item.backward),
             "peak_memory": item.memory,
-            "rules": item.rules,
-            "plumbing": item.plumbing,
             "note": item.note,
         }
         for item in measurements

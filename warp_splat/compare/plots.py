@@ -33,7 +33,7 @@ STAGES = ("project", "bin", "blend", "adjoint of blend", "adjoint of project")
 
 
 def adjoint_table(measurements: Sequence[Measurement]) -> str:
-    """A row per scene and variant: the worst parameter's error, times, memory, lines."""
+    """A row per scene and variant: the worst parameter's error, times, memory."""
     rows = []
     for item in measurements:
         manual = next(other for other in measurements if (other.scene, other.variant) == (item.scene, "manual"))
@@ -49,10 +49,9 @@ def adjoint_table(measurements: Sequence[Measurement]) -> str:
                 _milliseconds(item.backward) + " extrapolated" * item.extrapolated,
                 _number(ratio, "{:.2f}" if ratio and ratio < 100 else "{:.0e}"),
                 _number(item.memory and item.memory / 2**20, "{:.1f}"),
-                "-" if item.rules is None else f"{item.rules} + {item.plumbing}",
             )
         )
-    headers = ("scene", "variant", "error", "of", "forward ms", "backward ms", "x manual", "peak MiB", "lines")
+    headers = ("scene", "variant", "error", "of", "forward ms", "backward ms", "x manual", "peak MiB")
     return format_table(headers, rows)
 
 

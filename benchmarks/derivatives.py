@@ -1,11 +1,15 @@
-"""How many lines a person had to write for the derivative of the pixel loop, counted in the source."""
+"""How many lines a person had to write for the derivative of the pixel loop, counted in the source.
 
-from __future__ import annotations
+``python benchmarks/derivatives.py --out docs/benchmarks`` writes the table.
+"""
 
+import argparse
 import ast
 from pathlib import Path
 
-KERNELS = Path(__file__).parents[1] / "kernels"
+from common import write_table
+
+KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
 
 _CLAMP = ("splat.adj_alpha_of",)
 _EXP = ("step.adj_exp2_known", "step.adj_opaque", *_CLAMP)
@@ -76,3 +80,17 @@ class _Specialize(ast.NodeTransformer):
             return node
         taken = eval(ast.unparse(test.args[0]), {}, self.known)
         return node.body if taken else node.orelse
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, help="folder for derivatives.md and .json")
+    counts = {mode: derivative_lines(mode) for mode in RULES}
+    rows = [[mode, *lines, sum(lines)] for mode, lines in counts.items()]
+    note = "Lines of Python that state a derivative or an inverse, and that restate the loop or carry values."
+    data = {mode: {"rules": rules, "plumbing": plumbing} for mode, (rules, plumbing) in counts.items()}
+    write_table("derivatives", parser.parse_args().out, ["mode", "rules", "plumbing", "lines"], rows, note, data)
+
+
+if __name__ == "__main__":
+    main()
