@@ -9,11 +9,10 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import TrainConfig
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
 from warp_splat.scene.types import Scene, View
-from warp_splat.training.densify import Densifier
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 RADIUS = 4.0  # world units, of the ball that the Gaussians fill; the orbit lies outside
@@ -76,7 +75,7 @@ def trainer_on(scene: Scene, gaussians: GaussianModel, device: str, **options) -
     nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
     added = {name: tensor.detach() for name, tensor in gaussians.parameters.items()}
     trainer.optimizer.replace(nobody, added)
-    trainer.densifier = Densifier(trainer.model, trainer.optimizer, trainer.config, scene.extent)
+    trainer.growth.clear()
     return trainer
 
 

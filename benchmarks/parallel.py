@@ -14,8 +14,8 @@ from pathlib import Path
 
 from common import machine, write_table
 
-from warp_splat.config import TrainConfig
 from warp_splat.presets import EMBEDDED_DEFAULTS
+from warp_splat.training.options import TrainConfig
 
 ROOT = Path(__file__).parents[1]
 #: name: processes, threads of each, factor of the schedule
@@ -38,10 +38,10 @@ SCHEDULE = (
 
 def flags_of(iterations: int) -> list[str]:
     """The embedded scene's flags, the schedule stretched or compressed to ``iterations``."""
-    defaults = TrainConfig(**EMBEDDED_DEFAULTS[""])
-    share = iterations / defaults.iterations
-    schedule = [(f"--{name}", str(round(getattr(defaults, name) * share))) for name in SCHEDULE]
-    return [word for pair in schedule for word in pair] + ["--max_gaussians", str(defaults.max_gaussians), "--eval"]
+    defaults = TrainConfig(**EMBEDDED_DEFAULTS[""]).flat()
+    share = iterations / defaults["iterations"]
+    schedule = [(f"--{name}", str(round(defaults[name] * share))) for name in SCHEDULE]
+    return [word for pair in schedule for word in pair] + ["--max_gaussians", str(defaults["max_gaussians"]), "--eval"]
 
 
 def run(model: Path, processes: int, threads: int, iterations: int) -> tuple:

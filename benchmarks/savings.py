@@ -54,7 +54,17 @@ def options(**changes) -> Callable[[Trainer], AbstractContextManager]:
 
 
 def config(**changes) -> Callable[[Trainer], AbstractContextManager]:
-    return lambda trainer: patch.multiple(trainer.config, **changes)
+    @contextmanager
+    def context(trainer: Trainer) -> Iterator[None]:
+        changed = trainer.config.changed(**changes)
+        with (
+            patch.object(trainer, "config", changed),
+            patch.object(trainer.optimizer, "options", changed.learn),
+            patch.object(trainer.growth, "options", changed.plugins[changed.grow.growth]),
+        ):
+            yield
+
+    return context
 
 
 def white(trainer: Trainer) -> AbstractContextManager:
@@ -69,7 +79,7 @@ def flat(interval: int) -> Callable[[Trainer], AbstractContextManager]:
         rest = trainer.model.parameters["sh_rest"]
         values = rest.detach().clone()
         rest.detach().zero_()
-        with patch.multiple(trainer.config, sh_interval=interval):
+        with config(sh_interval=interval)(trainer):
             yield
         rest.detach().copy_(values)
 

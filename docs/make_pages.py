@@ -8,13 +8,13 @@
 """
 
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import make_architecture
 import sentences
 
 from warp_splat.cli import COMMANDS
+from warp_splat.flags import default_of, flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
 DOCS = Path(__file__).parent
@@ -51,10 +51,10 @@ def flags() -> str:
     parts = [INTRODUCTION]
     for name, (config_type, _, help) in COMMANDS.items():
         parts.append(f"\n## warp-splat {name}\n{help[0].upper()}{help[1:]}.\n")
-        defaults, heading = config_type(), None
-        for item in fields(config_type):
+        heading = None
+        for item in flags_of(config_type):
             what = item.metadata["help"].replace("|", "\\|")
-            if item.metadata["positional"]:
+            if item.metadata["group"] is None:
                 parts.append(f"\n`{item.name.upper()}`: {what}.\n")
                 continue
             if item.metadata["group"] != heading:
@@ -64,16 +64,16 @@ def flags() -> str:
             names = ", ".join(f"`{flag}`" for flag in (f"--{item.name}", *item.metadata["names"]))
             choices = [str(choice) for choice in item.metadata["choices"] or () if choice != ""]
             note = f" ({', '.join(choices)})" if choices else ""
-            parts.append(f"| {names} | {_shown(getattr(defaults, item.name))} | {what}{note} |\n")
+            parts.append(f"| {names} | {_shown(default_of(item))} | {what}{note} |\n")
     parts.append(PRESET_TEXT)
     columns = {"fast": PRESETS["fast"], "embedded": EMBEDDED_DEFAULTS[""]}
     columns["embedded, fast"] = {**EMBEDDED_DEFAULTS[""], **PRESETS["fast"], **EMBEDDED_DEFAULTS["fast"]}
     changed = list(dict.fromkeys(name for values in columns.values() for name in values))
     parts.append("\n| flag | default | " + " | ".join(columns) + " |\n" + "| --- " * (2 + len(columns)) + "|\n")
-    train = COMMANDS["train"][0]()
+    train = COMMANDS["train"][0]().flat()
     for name in changed:
         cells = [_shown(values.get(name, "")) for values in columns.values()]
-        parts.append(f"| `--{name}` | {_shown(getattr(train, name))} | {' | '.join(cells)} |\n")
+        parts.append(f"| `--{name}` | {_shown(train[name])} | {' | '.join(cells)} |\n")
     return "".join(parts)
 
 

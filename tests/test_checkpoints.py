@@ -21,13 +21,14 @@ from test_distributed import Pretended, torchrun
 from test_train import ROOT, SCENE, SHORT, fails, train
 
 from warp_splat.cli import main, parse
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.checkpoint import LAST, load_checkpoint, load_options, save_checkpoint
+from warp_splat.formats.checkpoint import LAST, load_checkpoint, save_checkpoint
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.splats import SplatFile
+from warp_splat.training.config_file import load_options
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import Run, keep, restore
 from warp_splat.training.trainer import Trainer
 
@@ -180,7 +181,8 @@ def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
     )
     assert main(["train", "--resume", str(whole), *options.split()]) == 0
     config = parse(["train", "--resume", str(whole)])
-    assert (config.resolution, config.adjoint, config.max_gaussians, config.sh_interval) == (2, "stepwise", 40000, 15)
+    assert (config.data.resolution, config.model.adjoint, config.grow.max_gaussians) == (2, "stepwise", 40000)
+    assert config.learn.sh_interval == 15
     assert len(load_ply(ply_path(whole, 120)).means) <= 40000
 
 
@@ -203,7 +205,7 @@ def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
         interrupt(patch, 1)
         assert main([*begin, "parts", "--iterations", "60"]) == 130
     before = (tmp_path / "parts" / "input.ply").read_bytes()
-    assert (load_options("parts")["viewer"], load_options("parts")["port"]) == (False, TrainConfig().port)
+    assert (load_options("parts")["viewer"], load_options("parts")["port"]) == (False, TrainConfig().report.port)
     if gone:
         (tmp_path / "start.ply").unlink()
     capsys.readouterr()
@@ -255,16 +257,16 @@ def test_other_numbers_of_processes(scene, tmp_path):
         assert float(one.optimizer.adam.state[one.model.parameters["means"]]["step"]) * 2 == len(
             [i for i in range(1, STOP) if i % 10 or i <= 10]
         )
-    assert torch.equal(pair[0].densifier.gradient, trainer.densifier.gradient)
-    assert not pair[1].densifier.gradient.any() and len(pair[1].densifier.gradient) == len(trainer.model)
+    assert torch.equal(pair[0].growth.gradient, trainer.growth.gradient)
+    assert not pair[1].growth.gradient.any() and len(pair[1].growth.gradient) == len(trainer.model)
     rows = {name: np.repeat(checkpoint.arrays[f"statistics.{name}"], 3, 0) for name in ("gradient", "views", "radius")}
     arrays = {**checkpoint.arrays, **{f"statistics.{name}": values for name, values in rows.items()}}
     save_checkpoint(tmp_path / LAST, arrays, checkpoint.facts)
     other, _ = begin(scene, tmp_path)
     other.restore(load_checkpoint(tmp_path))
-    assert torch.allclose(other.densifier.gradient, 3 * trainer.densifier.gradient, rtol=1e-6)
-    assert torch.equal(other.densifier.views, 3 * trainer.densifier.views)
-    assert torch.equal(other.densifier.radius, trainer.densifier.radius)
+    assert torch.allclose(other.growth.gradient, 3 * trainer.growth.gradient, rtol=1e-6)
+    assert torch.equal(other.growth.views, 3 * trainer.growth.views)
+    assert torch.equal(other.growth.radius, trainer.growth.radius)
 
 
 @pytest.mark.slow

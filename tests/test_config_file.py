@@ -2,32 +2,32 @@
 
 import re
 import tomllib
-from dataclasses import asdict, fields
 
 import pytest
 
 from warp_splat.cli import COMMANDS, main, make_parser, parse
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.config_file import OF_ONE_RUN, read_config, write_config
+from warp_splat.flags import flags_of
+from warp_splat.training.config_file import OF_ONE_RUN, read_config, write_config
+from warp_splat.training.options import TrainConfig
 
 
 def test_flags_go_before_the_file_which_goes_before_presets(tmp_path):
     file = tmp_path / "a.toml"
     file.write_text('preset = "fast"\nopacity_lr = 0.125\niterations = 77\nsource_path = "x"\n')
     config = parse(["train", "--config", str(file), "--iterations", "88"])
-    assert (config.iterations, config.opacity_lr, config.coarse, config.source_path) == (88, 0.125, 4, "x")
-    assert config.sh_degree == TrainConfig().sh_degree
+    learn = config.learn
+    assert (learn.iterations, learn.opacity_lr, learn.coarse, config.data.source_path) == (88, 0.125, 4, "x")
+    assert config.model.sh_degree == TrainConfig().model.sh_degree
 
 
 def test_every_option_survives_the_file(tmp_path):
     """Also texts that need escapes, and floats; read by the standard library alone."""
     strange = TrainConfig(
         source_path='a "quoted"\\path\n\x7f\x01 é 😀', opacity_lr=1.0 / 3.0, position_lr_final=1e-300, quiet=True
-    )
-    strange.checkpoint_iterations, strange.seed = [3, 5], 2**62
+    ).changed(checkpoint_iterations=[3, 5], seed=2**62)
     write_config(tmp_path, strange)
-    expected = {name: value for name, value in asdict(strange).items() if name not in OF_ONE_RUN}
+    expected = {name: value for name, value in strange.flat().items() if name not in OF_ONE_RUN}
     assert tomllib.loads((tmp_path / "config.toml").read_text(encoding="utf-8")) == expected
     assert read_config(tmp_path / "config.toml") == expected
 
@@ -72,7 +72,7 @@ def test_help_begins_with_the_flags_that_matter(capsys):
     expected = "help source_path model_path sfm eval resolution preset iterations max_gaussians resume start_checkpoint"
     assert names == {*expected.split(), "quiet"}
     listed = set(re.findall(r"^  (?:-\w[^-]*, )?--(\w+)", "\n".join(rest), re.MULTILINE))
-    others = {item.name for item in fields(TrainConfig) if item.metadata["group"]}
+    others = {item.name for item in flags_of(TrainConfig) if item.metadata["group"]}
     assert len(others) > 30 and others <= listed | names
 
 

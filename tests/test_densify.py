@@ -1,16 +1,19 @@
 """Growing, pruning and Adam's moments, against what the reference prescribes (torch's own Adam where it decides)."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from warp_splat.config import TrainConfig
 from warp_splat.gaussians import GaussianModel, along_curve
-from warp_splat.training.densify import Densifier, rotate
+from warp_splat.runtime.distributed import ALONE
+from warp_splat.training.growth.reference import Reference, rotate
 from warp_splat.training.optimizer import Optimizer
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.seams import Setting, Step
 
 EXTENT = 10.0
 
@@ -19,16 +22,20 @@ def setup(count=6, **options):
     rng = np.random.default_rng(0)
     config = TrainConfig(**options)
     model = GaussianModel.from_points(rng.uniform(-1, 1, (count, 3)), rng.integers(0, 255, (count, 3)), sh_degree=1)
-    optimizer = Optimizer(model, config, EXTENT)
-    return model, optimizer, Densifier(model, optimizer, config, EXTENT)
+    optimizer = Optimizer(model, config.learn, EXTENT)
+    background = torch.full((3,), float(config.data.white_background))
+    scene: Any = SimpleNamespace(extent=EXTENT)
+    setting = Setting(scene, model, background, ALONE, config.learn.seed, config.grow.max_gaussians)
+    return model, optimizer, Reference(config.plugins["reference"], setting, optimizer)
 
 
 def observe(densifier, gradients, width=100, height=50):
     """One view in which Gaussian i has the 2D gradient (gradients[i], 0) and is drawn where that is not None."""
     drawn = torch.tensor([value is not None for value in gradients])
     grad = torch.tensor([[value or 0.0, 0.0] for value in gradients])
-    out = SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=drawn.int() * 7)
-    densifier.observe(out, width, height)
+    image = torch.empty(height, width, 3)
+    out = SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=drawn.int() * 7, image=image)
+    densifier.observe(out, Step(1, None))
 
 
 def set_rows(model, **rows):

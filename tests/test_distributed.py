@@ -1,6 +1,5 @@
 """Two processes that torchrun starts: the same model in both, the step of their mean gradient, and how they end."""
 
-import copy
 import json
 import math
 import os
@@ -17,11 +16,11 @@ import pytest
 import torch
 from torchrun_steps import CONFIG, STEPS
 
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
 from warp_splat.runtime.distributed import ALONE, Processes, join
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
@@ -66,7 +65,7 @@ def test_a_step_of_two_processes_is_one_of_their_mean_gradient(optimizer_type, s
     torchrun(ROOT / "tests" / "torchrun_steps.py", tmp_path, SCENE, optimizer_type)
     load = lambda rank, step, what: dict(np.load(tmp_path / f"rank{rank}_step{step}_{what}.npz"))  # noqa: E731
     config = TrainConfig(optimizer_type=optimizer_type, **CONFIG)
-    trainers = [Trainer(scene, copy.copy(config), Pretended(rank, 2)) for rank in (0, 1)]
+    trainers = [Trainer(scene, config, Pretended(rank, 2)) for rank in (0, 1)]
     moments = dict.fromkeys(trainers[0].model.NAMES, (0.0, 0.0))
     for step in range(1, STEPS + 1):
         before = {name: leaf.detach().clone() for name, leaf in trainers[0].model.parameters.items()}
@@ -105,7 +104,7 @@ def adam(config, extent, step, name, value, gradient, moments, shown):
         "scales": 0.005,
         "quats": 0.001,
     }
-    beta1, beta2, sparse = 0.9**2, 0.999**2, config.optimizer_type == "sparse_adam"
+    beta1, beta2, sparse = 0.9**2, 0.999**2, config.learn.optimizer_type == "sparse_adam"
     mean = beta1 * moments[0] + (1 - beta1) * gradient
     square = beta2 * moments[1] + (1 - beta2) * gradient**2
     bias1, bias2 = (1.0, 1.0) if sparse else (1 - beta1**step, 1 - beta2**step)
@@ -232,7 +231,7 @@ def test_schedules_count_images(scene):
         ]
     config = TrainConfig(device="cpu", densify_from_iter=50, densification_interval=100, densify_until_iter=700)
     for count in (1, 2, 3, 7):
-        densifier, due = Trainer(scene, config, Pretended(0, count)).densifier, []
+        densifier, due = Trainer(scene, config, Pretended(0, count)).growth, []
         densifier._densify = lambda prune_large, due=due: due.append(0)
         calls = [(end, len(due)) for end in range(count, 1000, count) if densifier.update(end) is None]
         rises = [end for (end, now), (_, before) in zip(calls[1:], calls, strict=False) if now > before]

@@ -6,11 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_distributed import Pretended
 
 from warp_splat.camera import Camera
-from warp_splat.config import TrainConfig
 from warp_splat.scene.types import Scene, View
 from warp_splat.training import memory
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -54,7 +56,7 @@ def test_forecast_is_what_a_step_takes(point, kinds):
     ],
 )
 def test_grounds(scene, options, count, reason):
-    told = memory.describe(scene, TrainConfig(**options), len(scene.points))
+    told = memory.describe(Trainer(scene, TrainConfig(device="cpu", **options)))
     assert told.startswith("About ") and f" at {count} Gaussians (" in told and reason in told
 
 
@@ -62,10 +64,12 @@ def test_what_does_not_fit_is_told(scene, monkeypatch):
     pair = memory.step_memory(10**6, 16, 3 * 10**6, 600 * 400) * 2
     own = memory.GIB
     monkeypatch.setattr(memory.psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=own)))
-    config = TrainConfig(max_gaussians=10**6)
+    trainer = Trainer(scene, TrainConfig(device="cpu", max_gaussians=10**6))
+    trainer.processes = Pretended(0, 2)
+    trainer.processes.local_count = 2
     for available, fits in ((pair, True), (pair - 2, False)):
         monkeypatch.setattr(memory, "available_memory", lambda device, available=available: available)
-        told = memory.describe(scene, config, len(scene.points), processes=2)
+        told = memory.describe(trainer)
         assert "in each of 2 processes" in told and f"{(own + pair / 2) / memory.GIB:.1f} GiB" in told
         assert ("(-r)" not in told and "Only" not in told) if fits else ("(-r)" in told and "Only" in told)
 

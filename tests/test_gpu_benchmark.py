@@ -61,7 +61,7 @@ def test_trainer_of_the_benchmark_trains():
     for iteration in range(10, 13):
         trainer.differentiate(iteration)
         trainer.update(iteration)
-    assert len(trainer.model) == 500 and trainer.degree == 3 and int(trainer.densifier.views.max()) == 3
+    assert len(trainer.model) == 500 and trainer.degree == 3 and int(trainer.growth.views.max()) == 3
     assert all((trainer.model.parameters[name] != tensor).any() for name, tensor in before.items())
 
 

@@ -17,9 +17,10 @@ from test_checkpoints import begin, steps
 from test_hostile_files import changed, changed_json
 from test_train import fails
 
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
-from warp_splat.formats.checkpoint import LAST, load_checkpoint, load_options, save_checkpoint
+from warp_splat.formats.checkpoint import LAST, load_checkpoint, save_checkpoint
+from warp_splat.training.config_file import load_options
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import Run, keep, restore
 
 
@@ -116,15 +117,15 @@ def test_impossible_options(option, value, kept, tmp_path):
     assert option in one_sentence(error, tmp_path / LAST)
     del facts["options"][option]  # an older program may not have known it
     save_checkpoint(tmp_path / LAST, {}, facts)
-    assert load_options(tmp_path).get(option) == getattr(TrainConfig(), option, None)
+    assert load_options(tmp_path).get(option) == TrainConfig().flat().get(option)
 
 
 def test_a_generator_that_would_read_beyond_its_words(kept, tmp_path):
     """Torch itself takes this state."""
-    state = kept[1].arrays["random.background"].copy()
+    state = kept[1].arrays["random.densification"].copy()
     struct.pack_into("<iiQ", state, 8, 624, 1, 624)
     torch.Generator().set_state(torch.from_numpy(state.copy()))
-    save_checkpoint(tmp_path / LAST, {**kept[1].arrays, "random.background": state}, kept[1].facts)
+    save_checkpoint(tmp_path / LAST, {**kept[1].arrays, "random.densification": state}, kept[1].facts)
     with pytest.raises(InputError, match="generator"):
         kept[0].restore(load_checkpoint(tmp_path))
 

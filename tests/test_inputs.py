@@ -17,10 +17,10 @@ from scene_files import (
 )
 from splat_files import some_file
 
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.training.loss import image_loss
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 

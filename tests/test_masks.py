@@ -16,12 +16,12 @@ from scene_files import (
 )
 from test_losses import oracle
 
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS, psnr, ssim
 from warp_splat.evaluation.views import evaluate_views
 from warp_splat.scene.images import read_mask
 from warp_splat.training.loss import LossByConvolution, image_loss
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 

@@ -1,16 +1,16 @@
 """The preset, and training from coarse images to fine ones."""
 
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from warp_splat.cli import parse
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
+from warp_splat.flags import flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
@@ -26,11 +26,11 @@ def test_flags_go_before_the_preset_and_the_preset_before_defaults():
     assert parse(["train", "-s", "x", "--preset", "fast"]) == TrainConfig(
         source_path="x", **{"preset": "fast", **PRESETS["fast"]}
     )
-    assert parse(["train", "-s", "x", "--preset", "fast", "--coarse", "2"]).coarse == 2
+    assert parse(["train", "-s", "x", "--preset", "fast", "--coarse", "2"]).learn.coarse == 2
     embedded = parse(["train", "--preset", "fast", "--sh_interval", "7"])
-    assert embedded.sh_interval == 7 and embedded.eval
-    assert embedded.coarse == PRESETS["fast"]["coarse"]
-    assert embedded.iterations == EMBEDDED_DEFAULTS["fast"]["iterations"]
+    assert embedded.learn.sh_interval == 7 and embedded.data.eval
+    assert embedded.learn.coarse == PRESETS["fast"]["coarse"]
+    assert embedded.learn.iterations == EMBEDDED_DEFAULTS["fast"]["iterations"]
 
 
 @pytest.mark.parametrize("flag", ["-s", "-m", "--resume", "--config"])
@@ -40,7 +40,7 @@ def test_empty_paths_are_refused(flag):
 
 
 def test_presets_are_made_of_documented_flags():
-    documented = {item.name for item in fields(TrainConfig) if item.metadata["help"]}
+    documented = {item.name for item in flags_of(TrainConfig) if item.metadata["help"]}
     for values in (*EMBEDDED_DEFAULTS.values(), *PRESETS.values()):
         assert set(values) <= documented
 

@@ -17,7 +17,7 @@ from scene_files import texture, write_blender, write_image
 from scipy.ndimage import gaussian_filter
 
 from warp_splat.cli import main
-from warp_splat.config import SfmConfig, TrainConfig
+from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
@@ -212,10 +212,9 @@ def test_training_on_photographs_alone_names_the_command(photos, tmp_path):
 
 def test_training_with_sfm_makes_the_scene_once(photos, capsys):
     source, made = str(photos[0]), f"{photos[0]}_scene"
-    config = TrainConfig(source_path=source, sfm=True, quiet=True)
-    assert scene_for(config, 1) == made and len(load_scene(made).train) == COUNT
-    assert scene_for(TrainConfig(source_path=made, sfm=True), 1) == made
-    cannot(lambda: scene_for(config, 2), "one process", "warp-splat sfm")
+    assert scene_for(source, 1, quiet=True) == made and len(load_scene(made).train) == COUNT
+    assert scene_for(made, 1) == made
+    cannot(lambda: scene_for(source, 2), "one process", "warp-splat sfm")
 
 
 def test_the_sharpest_frame_of_each_span_is_taken(tmp_path):

@@ -11,13 +11,15 @@ import torch
 import warp as wp
 
 from warp_splat import Camera, rasterize
-from warp_splat.config import TrainConfig
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project import quarantine
 from warp_splat.raster import bin, project
 from warp_splat.runtime import launch
-from warp_splat.training.densify import Densifier
+from warp_splat.runtime.distributed import ALONE
+from warp_splat.training.growth.reference import Reference
 from warp_splat.training.optimizer import EPS, Optimizer
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.seams import Setting, Step
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -64,7 +66,7 @@ def test_slices_cover_everything_in_whole_widths(threads):
 
 def test_steps_are_those_of_adam_in_torch(threads, model):
     """The coefficients of higher degrees get no gradients at first: zeros to torch."""
-    optimizer = Optimizer(model, TrainConfig(), extent=2.0)
+    optimizer = Optimizer(model, TrainConfig().learn, extent=2.0)
     copies = {name: tensor.detach().clone().requires_grad_() for name, tensor in model.parameters.items()}
     groups = [{"params": [copies[group["name"]]], "lr": group["lr"]} for group in optimizer.adam.param_groups]
     expected = torch.optim.Adam(groups, eps=EPS, fused=True)
@@ -107,11 +109,13 @@ def test_activations_in_any_mode_of_torch(threads, model, mode):
 
 def test_statistics_are_those_of_all_rows(threads, model):
     config = TrainConfig()
-    densifier = Densifier(model, Optimizer(model, config, 1.0), config, 1.0)
+    setting = Setting(SimpleNamespace(extent=1.0), model, torch.zeros(3), ALONE, seed=0, max_gaussians=0)
+    densifier = Reference(config.plugins["reference"], setting, Optimizer(model, config.learn, 1.0))
     grad = torch.randn(COUNT, 2, generator=torch.Generator().manual_seed(3))
     grad[7] = torch.inf
     radii = (grad[:, 0] > 0).int()
-    densifier.observe(SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=radii), 100, 50)
+    out = SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=radii, image=torch.empty(50, 100, 3))
+    densifier.observe(out, Step(1, None))
     norms = torch.hypot(50.0 * grad[:, 0], 25.0 * grad[:, 1])
     norms[7] = 0.0
     assert torch.equal(densifier.gradient, norms) and torch.equal(densifier.views, radii.float())

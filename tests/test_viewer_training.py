@@ -11,8 +11,8 @@ from fake_viser import PHOTO, FakeClient, FakeServer, at_rest, some_scene
 from scene_files import write_colmap
 
 from warp_splat.cli import main
-from warp_splat.config import TrainConfig
 from warp_splat.training.live import TrainingViewer
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import Run, finish
 from warp_splat.training.trainer import Trainer
 from warp_splat.viewer import server

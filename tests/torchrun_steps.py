@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_splat.config import TrainConfig
 from warp_splat.runtime import launch
 from warp_splat.runtime.distributed import GroupError, join
 from warp_splat.scene import load_scene
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 STEPS = 3

@@ -8,24 +8,22 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import fields
 
 from warp_splat import __version__
 from warp_splat.config import (
-    FIXED_OPTIONS,
     CompareConfig,
     ConvertConfig,
     ExportHtmlConfig,
     InspectConfig,
     RenderConfig,
     SfmConfig,
-    TrainConfig,
     ViewConfig,
 )
 from warp_splat.errors import InputError
-from warp_splat.flags import FOREIGN_FLAGS
+from warp_splat.flags import FOREIGN_FLAGS, default_of, flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
+from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
 
 Config = (
     SfmConfig
@@ -64,11 +62,10 @@ COMMANDS = {
 
 def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
     """A flag for each field of the configuration, with its default and help, under the heading of its group."""
-    defaults = config_type()
     groups = {"": parser}  # the few that matter first stand beside --help
-    for item in fields(config_type):
-        default = getattr(defaults, item.name)
-        if item.metadata["positional"]:
+    for item in flags_of(config_type):
+        title, default = item.metadata["group"], default_of(item)
+        if title is None:
             parser.add_argument(item.name, metavar=item.name.upper(), help=item.metadata["help"])
             continue
         note = "" if default in ("", [], False) else f" (default: {default})"
@@ -83,7 +80,6 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
                 options["metavar"] = f"{{{','.join(str(choice) for choice in options['choices'] if choice != '')}}}"
             if item.metadata["many"]:
                 options["nargs"] = "*"
-        title = item.metadata["group"]
         groups[title] = groups.get(title) or parser.add_argument_group(title)
         groups[title].add_argument(*item.metadata["names"], f"--{item.name}", dest=item.name, **options)
 
@@ -96,7 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"warp-splat {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
     for name, (config_type, _, help) in COMMANDS.items():
-        places = [item.name.upper() for item in fields(config_type) if item.metadata["positional"]]
+        places = [item.name.upper() for item in flags_of(config_type) if item.metadata["group"] is None]
         usage = " ".join(["warp-splat", name, *places, "[options]"])  # not all flags before the first line of help
         command = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", usage=usage)
         add_flags(command, config_type)
@@ -117,7 +113,7 @@ def parse(arguments: list[str]) -> Config:
     known, unknown = make_parser().parse_known_args(arguments)
     config_type = COMMANDS[known.command][0]
     if unknown:
-        flags = [f"--{item.name}" for item in fields(config_type)]
+        flags = [f"--{item.name}" for item in flags_of(config_type)]
         near = difflib.get_close_matches(unknown[0].split("=")[0], flags, 1)
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
@@ -126,7 +122,7 @@ def parse(arguments: list[str]) -> Config:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             raise InputError(f"--{name}: expected a path, got an empty one; leave the flag out or name one.")
     if values.get("config"):
-        from warp_splat.formats.config_file import read_config  # noqa: PLC0415 - seldom needed
+        from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
 
         values = {**read_config(values["config"]), **values}
     if values.get("start_checkpoint"):
@@ -142,7 +138,7 @@ def parse(arguments: list[str]) -> Config:
 
 def _continued(given: dict) -> dict:
     """Options of the checkpoint to start from, but for those that are given."""
-    from warp_splat.formats.checkpoint import load_options  # noqa: PLC0415 - NumPy takes its time to load
+    from warp_splat.training.config_file import load_options  # noqa: PLC0415 - NumPy takes its time to load
 
     source = given["start_checkpoint"]
     options = load_options(source)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import Field, field
+from dataclasses import MISSING, Field, field, fields
 from functools import partial
 from typing import Any
 
 
 def flag(
-    default: Any, help: str, *names: str, choices: tuple | None = None, many: type | None = None, group: str = ""
+    default: Any,
+    help: str,
+    *names: str,
+    choices: tuple | None = None,
+    many: type | None = None,
+    least: int | None = None,
+    group: str = "",
 ) -> Any:
     """A dataclass field that is also a command-line flag: its default, its help, further names.
 
     Without a ``group`` it is one of the few that ``--help`` lists first.
     """
-    metadata = {"help": help, "names": names, "choices": choices, "many": many, "group": group, "positional": False}
+    metadata = {"help": help, "names": names, "choices": choices, "many": many, "least": least, "group": group}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -22,7 +28,7 @@ def flag(
 
 def argument(help: str) -> Any:
     """A dataclass field that is also an argument of the command line without a flag: known by its place."""
-    return field(default="", metadata={"help": help, "positional": True})
+    return field(default="", metadata={"help": help, "group": None})
 
 
 data = partial(flag, group="what is read")
@@ -34,9 +40,22 @@ film = partial(flag, group="frames along a way")
 machinery = partial(flag, group="where it is computed")
 
 
-def fits(value: Any, item: Field, default: Any) -> bool:
-    """Whether ``value``, read from a file, can be that of an option with this field and this default."""
-    return _is_like(value, default) and (not item.metadata["choices"] or value in item.metadata["choices"])
+def flags_of(config_type: Any) -> list[Field]:
+    """The flags of a configuration, or of its groups, heading by heading."""
+    groups = config_type.groups().values() if hasattr(config_type, "groups") else [config_type]
+    found = [item for group in groups for item in fields(group)]
+    headings = list(dict.fromkeys([None, "", *(item.metadata["group"] for item in found)]))
+    return sorted(found, key=lambda item: headings.index(item.metadata["group"]))
+
+
+def default_of(item: Field) -> Any:
+    """The default of a flag."""
+    return item.default if item.default_factory is MISSING else item.default_factory()
+
+
+def fits(value: Any, item: Field) -> bool:
+    """Whether ``value``, read from a file, can be that of the option with this field."""
+    return _is_like(value, default_of(item)) and (not item.metadata["choices"] or value in item.metadata["choices"])
 
 
 def _is_like(value: Any, default: Any) -> bool:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import psnr, ssim
@@ -33,6 +32,7 @@ from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.scene import Scene, View
 from warp_splat.text import format_table
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 SHORT: dict[str, Any] = {
@@ -170,7 +170,7 @@ def make_trainer(scene: Scene, schedule: Mapping, seed: int, max_steps: int | No
 
 def train_run(trainer: Trainer, result: Run, reference: dict[int, torch.Tensor]) -> Iterator[None]:
     """Train, a step at a time, and note in ``result`` how it goes; ``reference`` keeps parameters of the first run."""
-    last, views, seconds, losses = trainer.config.iterations, _views(trainer.scene), 0.0, []
+    last, views, seconds, losses = trainer.config.learn.iterations, _views(trainer.scene), 0.0, []
     checks = {last * k // EVALUATIONS for k in range(1, EVALUATIONS + 1)}
     for iteration in range(1, last + 1):
         start = time.perf_counter()

@@ -11,11 +11,12 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare.trained import SHORT
-from warp_splat.config import RasterOptions, TrainConfig
+from warp_splat.config import RasterOptions
 from warp_splat.raster.data import Gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 CANDIDATES = (10, 100, 1000, 10_000)  # per pixel of the layered scenes

@@ -12,7 +12,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from warp_splat import __version__
-from warp_splat.config import TrainConfig, check_train
 from warp_splat.errors import InputError
-from warp_splat.flags import fits
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, reading
 
@@ -128,29 +126,15 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     return Checkpoint(path, arrays, facts)
 
 
-def load_options(path: str | Path) -> dict[str, Any]:
-    """The training options in a checkpoint, by name; only the beginning of the file is read.
+def load_header(path: str | Path) -> Checkpoint:
+    """A checkpoint without its arrays; only the beginning of the file is read.
 
     Raises:
-        InputError: as :func:`load_checkpoint`, or if an option is unknown or has an impossible value.
+        InputError: as :func:`load_checkpoint`, but for what follows the header.
     """
     path = find_checkpoint(path)
     with _opened(path) as file:
-        found = _facts(file)[1].get("options")
-        if not isinstance(found, dict):
-            raise Unexpected("one without options")
-        config = TrainConfig()
-        for item in fields(TrainConfig):
-            if item.name in found:
-                value = found.pop(item.name)
-                if not fits(value, item, getattr(config, item.name)):
-                    raise Unexpected(f"{value!r:.50} as its option {item.name}")
-                setattr(config, item.name, value)
-        if found:
-            raise Unexpected(f"an option that it does not have, {next(iter(found))!r:.50}")
-        if problem := check_train(config):
-            raise Unexpected(f"an impossible option ({problem.rstrip('.')})")
-    return asdict(config)
+        return Checkpoint(path, {}, _facts(file)[1])
 
 
 def find_checkpoint(path: str | Path) -> Path:

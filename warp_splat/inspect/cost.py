@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import psutil
 
-from warp_splat.config import CORES, TrainConfig
+from warp_splat.config import CORES
 from warp_splat.presets import PRESETS
 from warp_splat.scene.images import target_size
 from warp_splat.training.memory import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
+from warp_splat.training.options import LearnOptions, ModelOptions
 
 BASE = 0.7 * GIB  # Python, torch, Warp and their kernels
 SECONDS_PER_PIXEL = 6.7e-7  # of a thread, for each step: 1216 s for 7,000 steps of 518,400 px on two
-RUNS = {"--preset fast": PRESETS["fast"]["iterations"], "the default": TrainConfig.iterations}
+RUNS = {"--preset fast": PRESETS["fast"]["iterations"], "the default": LearnOptions.iterations}
 
 
 def forecast(
@@ -29,12 +30,12 @@ def forecast(
     Returns:
         A sentence, and whether this machine has the memory.
     """
-    config = TrainConfig()
     targets = [target_size(*size, -1) for size in sizes]
     areas = [width * height for width, height in targets]
-    gaussians, _ = expected_gaussians(points, max(areas), config)
+    gaussians, _ = expected_gaussians(points, max(areas))
     per_pixel = pixel_floats(masked, False, linear)
-    step = step_memory(gaussians, (config.sh_degree + 1) ** 2, INSTANCES * gaussians, max(areas), per_pixel=per_pixel)
+    coefficients = (ModelOptions.sh_degree + 1) ** 2
+    step = step_memory(gaussians, coefficients, INSTANCES * gaussians, max(areas), per_pixel=per_pixel)
     photographs = sum(areas) * ((3 * FLOAT if linear else 3) + masked + alpha)
     needed, available = BASE + photographs + step, psutil.virtual_memory().available
     seconds = sum(areas) / len(areas) * SECONDS_PER_PIXEL / CORES

@@ -18,7 +18,7 @@ import OpenImageIO  # noqa: F401 - see warp_splat.sfm.stages
 import pycolmap
 from tqdm import tqdm
 
-from warp_splat.config import CORES, SfmConfig, TrainConfig
+from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, reason_of
 from warp_splat.formats.atomic import write_json
 from warp_splat.scene import has_cameras, images
@@ -72,19 +72,18 @@ def sfm(config: SfmConfig) -> int:
     return 0
 
 
-def scene_for(config: TrainConfig, processes: int) -> str:
-    """The scene to train on: the source if it has cameras; otherwise one beside it, made or completed now.
+def scene_for(photos: str, processes: int, **options: Any) -> str:
+    """The scene to train on: ``photos`` if it has cameras; otherwise one beside it, made or completed now.
 
     Raises:
         InputError: as :func:`sfm`; if there are several processes, which would all do the same.
     """
-    source = Path(config.source_path)
-    if not config.source_path or has_cameras(source):
-        return config.source_path
+    if not photos or has_cameras(Path(photos)):
+        return photos
     if processes > 1:
-        raise InputError(f"--sfm: expected one process, found {processes}; {sfm_hint(source)}")
-    scene = str(scene_of(source))
-    sfm(SfmConfig(config.source_path, scene, threads=config.threads, seed=config.seed % 2**31, quiet=config.quiet))
+        raise InputError(f"--sfm: expected one process, found {processes}; {sfm_hint(Path(photos))}")
+    scene = str(scene_of(Path(photos)))
+    sfm(SfmConfig(photos, scene, **options))
     return scene
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,25 +12,19 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warp_splat.config import TrainConfig, check_train
 from warp_splat.errors import InputError
-from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
-from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
-from warp_splat.formats.config_file import write_config
-from warp_splat.formats.ply import save_points
+from warp_splat.formats.checkpoint import Checkpoint, load_checkpoint
 from warp_splat.formats.png import save_png
-from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
-from warp_splat.scene import load_scene
-from warp_splat.scene.embedded import embedded_scene
-from warp_splat.scene.types import Scene
 from warp_splat.training import memory
+from warp_splat.training.opening import Say, open_scene, refuse_other_training, resolve, speaker, write_inputs
+from warp_splat.training.options import ReportOptions, TrainConfig, check_train
 from warp_splat.training.record import Run, finish, how_to_continue, keep, restore, save_model, save_or_warn, warn
-from warp_splat.training.tensorboard import EventLog, check_available
+from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -56,194 +47,132 @@ def train(config: TrainConfig) -> int:
     problem = check_train(config)
     if problem:
         raise InputError(problem)
-    with join(config.device) as processes:
-        if config.viewer and processes.count > 1:
+    with join(config.machine.device) as processes:
+        if config.report.viewer and processes.count > 1:
             raise InputError("--viewer: expected one process, since others would wait for it; leave it out.")
         return _train(config, processes)
 
 
 def _train(config: TrainConfig, processes: Processes) -> int:
-    leads = processes.rank == 0
-    config.quiet |= not leads
-    say = (lambda *_: None) if config.quiet else tqdm.write
-    threads = config.threads or max(1, launch.get_threads() // processes.local_count)
-    choose_metrics(config.lpips_weights)  # what would be missed at the end is said now
-    if config.tensorboard:
-        check_available()
-    checkpoint = load_checkpoint(config.start_checkpoint) if config.start_checkpoint else None
-    begun = checkpoint.count("iteration") if checkpoint else 0
-    if checkpoint and begun > config.iterations:  # at the end, what is written there is written again
-        raise InputError(
-            f"--iterations {config.iterations}: expected at least the {begun} after which {checkpoint.path} was "
-            "written; name a later end."
-        )
-    config.iterations += -(config.iterations - begun) % processes.count  # whole steps
-    folder = _choose_folder(config, checkpoint)
-    device = settle_device(launch.prepare(config.device, threads), config.device, [config.adjoint], say)
-    config.device = device.type
-    if config.data_device == "cuda" and device.type != "cuda":
-        raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
-    if config.sfm:
-        from warp_splat.sfm.command import scene_for  # noqa: PLC0415 - only photographs without cameras need it
+    """Resolve the options, open the scene, make the trainer, restore it or begin, run, and finish."""
+    config, begun = resolve(config, processes)
+    say = speaker(config.report.quiet)
+    run = Run(Path(config.report.model_path), time.perf_counter())
+    scene = open_scene(config, begun, say)
+    trainer = Trainer(scene, config, processes)
+    _tell(trainer, run, say)
+    with model_folder.claimed(run.folder) if processes.rank == 0 else nullcontext(), _memory_explained(trainer):
+        _restore_or_begin(trainer, run, begun, say)
+        with _watched(trainer, run) as viewer:
+            return _run(trainer, run, viewer) or _finish(trainer, run, viewer, say)
 
-        config.source_path = scene_for(config, processes.count)
-    config.source_path = os.path.abspath(config.source_path or embedded_scene())  # render.py may run elsewhere
-    config.start_ply = config.start_ply and os.path.abspath(config.start_ply)
-    started = time.perf_counter()
-    say(f"Scene {config.source_path}")
-    if config.coarse > 1 and config.coarse_until_iter > config.iterations:
-        say(f"Warning: images reach their full size at --coarse_until_iter {config.coarse_until_iter}, after the end.")
-    scene = load_scene(
-        config.source_path,
-        images=config.images,
-        resolution=config.resolution,
-        white_background=config.white_background,
-        eval=config.eval,
-        invert_masks=config.invert_masks,
-        start=config.start_ply if not checkpoint or os.path.isfile(config.start_ply) else "",  # if it has gone
-        report=say,
-    )
-    run = Run(Path(processes.first(str(folder))), started)
+
+def _tell(trainer: Trainer, run: Run, say: Say) -> None:
+    scene, processes = trainer.scene, trainer.processes
     together = f"{processes.count} processes with " * (processes.count > 1)
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
     say(
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
         f"{len(scene.points)} points; {together}{launch.get_threads()} threads; output in {run.folder}"
     )
-    if scene.random_points and not checkpoint:
-        say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
-    if scene.start and not checkpoint and scene.start.antialiased != config.antialiasing:
-        which = "with" if scene.start.antialiased else "without"
-        say(f"Warning: {config.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
-    trainer = Trainer(scene, config, processes)
+    for sentence in trainer.told:
+        say(sentence)
+
+
+def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say: Say) -> None:
+    leads, config = trainer.processes.rank == 0, trainer.config
+    if leads:
+        refuse_other_training(run.folder, begun)  # again: one may have ended meanwhile
     say("Preparing kernels (compiled once on a machine, about 40 s) ...")
     start = time.perf_counter()
-    with model_folder.claimed(run.folder) if leads else nullcontext(), _memory_explained(trainer):
-        if leads:
-            _refuse_other_training(run.folder, checkpoint)  # again: one may have ended meanwhile
-        trainer.warm_up()
-        say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
-        if checkpoint:
-            restore(trainer, run, checkpoint)
-            say(f"Continuing after {run.iteration} iterations, from {checkpoint.path}")
-        else:
-            keep(trainer, run)
-        if leads:  # only now: where a checkpoint is refused, the folder stays as it was
-            _write_inputs(run.folder, config, scene, continues=checkpoint is not None)
-        del checkpoint  # its arrays take as much memory as the trainer's
-        if leads and config.tensorboard:
-            run.events = EventLog.open(run.folder, run.iteration)
-        if device.type == "cpu":
-            say(memory.describe(scene, config, len(trainer.model), processes.local_count))
-        return _run(trainer, run, say)
+    trainer.warm_up()
+    say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
+    if begun:
+        restore(trainer, run, load_checkpoint(begun.path))
+        say(f"Continuing after {run.iteration} iterations, from {begun.path}")
+    else:
+        keep(trainer, run)
+    if leads:  # only now: where a checkpoint is refused, the folder stays as it was
+        write_inputs(run.folder, config, trainer.scene, continues=begun is not None)
+    if leads and config.report.tensorboard:
+        run.events = EventLog.open(run.folder, run.iteration)
+    if config.machine.device == "cpu":
+        say(memory.describe(trainer))
 
 
-def _run(trainer: Trainer, run: Run, say: Callable[[str], None]) -> int:
-    """Train, save, and tell; returns the process's exit code."""
-    processes, end = trainer.processes, trainer.config.iterations
-    saved = None
-    with _watched(trainer, run) as viewer:
-        with interruptible() as interrupted:
-            if viewer:  # only now: who has read it may press Ctrl-C
-                viewer.announce()
-            try:
-                _loop(trainer, run, interrupted, viewer)
-            except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
-                tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
-                return 1
-            finally:  # whatever happened, the model comes first
-                if processes.rank == 0 or processes.lost:
-                    saved = save_model(trainer, run)
-                    print(f"Model after {run.iteration} iterations: {saved}")
-                if run.kept is not None and run.iteration < end:
-                    print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
-        if viewer:
-            viewer.show_end()
-        if processes.rank == 0:
-            finish(trainer, run, say)
-        if viewer and run.iteration == end:
-            viewer.linger()
-    if saved and saved != model_folder.ply_path(run.folder, run.iteration):
-        tqdm.write(f"The model is not in {run.folder}, but in {saved}; see the warning, and move it.", file=sys.stderr)
+def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
+    """Train and save; 1 if another process went away."""
+    processes = trainer.processes
+    with interruptible() as interrupted:
+        if viewer:  # only now: who has read it may press Ctrl-C
+            viewer.announce()
+        try:
+            _loop(trainer, run, interrupted, viewer)
+        except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
+            tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
+            return 1
+        finally:  # whatever happened, the model comes first
+            if processes.rank == 0 or processes.lost:
+                run.saved = save_model(trainer, run)
+                print(f"Model after {run.iteration} iterations: {run.saved}")
+            if run.kept is not None and run.iteration < trainer.config.learn.iterations:
+                print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
+    return 0
+
+
+def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say) -> int:
+    """Evaluate and tell; returns the process's exit code."""
+    end = trainer.config.learn.iterations
+    if viewer:
+        viewer.show_end()
+    if trainer.processes.rank == 0:
+        finish(trainer, run, say)
+    if viewer and run.iteration == end:
+        viewer.linger()
+    if run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration):
+        elsewhere = f"The model is not in {run.folder}, but in {run.saved}; see the warning, and move it."
+        tqdm.write(elsewhere, file=sys.stderr)
         return 1
     return 130 if run.iteration < end else 0
 
 
 def _watched(trainer: Trainer, run: Run) -> AbstractContextManager[TrainingViewer | None]:
     """The viewer, if one is asked for."""
-    if not trainer.config.viewer:
+    if not trainer.config.report.viewer:
         return nullcontext()
     from warp_splat.training.live import watched  # noqa: PLC0415 - viser takes half a second to load
 
     return watched(trainer, run)
 
 
-def _choose_folder(config: TrainConfig, checkpoint: Checkpoint | None) -> Path:
-    """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
-    default = checkpoint.path.parent if checkpoint else model_folder.default_model_path()
-    folder = Path(config.model_path or default)
-    model_folder.check_place(folder)
-    if config.source_path and folder.resolve() == Path(config.source_path).resolve():
-        raise InputError(f"-m {folder}: expected another folder than the scene's; choose a new one.")
-    _refuse_other_training(folder, checkpoint)
-    return folder
-
-
-def _refuse_other_training(folder: Path, checkpoint: Checkpoint | None) -> None:
-    continued = checkpoint and checkpoint.path.resolve() == (folder / LAST).resolve()
-    if not continued and ((folder / LAST).exists() or any(folder.glob("point_cloud/*/*.ply"))):
-        raise InputError(
-            f"{folder}: this folder already holds a training; choose another with -m, move it, or continue where it "
-            f"ended with --resume {folder}."
-        )
-
-
-def _write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: bool) -> None:
-    model_folder.write_cfg_args(
-        folder,
-        {
-            **asdict(config),
-            "model_path": str(folder),
-            "depths": "",
-            "train_test_exp": False,
-            "linear_light": scene.linear,
-        },
-    )
-    write_config(folder, config)
-    model_folder.write_cameras(folder, scene.test, scene.train)
-    remove_leftovers(folder)
-    if not (continues and (folder / "input.ply").exists()):
-        save_points(folder / "input.ply", scene.points, scene.colors)
-
-
 def _memory_explained(trainer: Trainer):
     """See :func:`memory_explained`."""
     fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
-    if trainer.config.data_device == "cuda":
+    if trainer.config.machine.data_device == "cuda":
         fewer.append("--data_device cpu")
     sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
     return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
 
 
 def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
-    config, processes = trainer.config, trainer.processes
-    checks = {config.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
-    whole_checks = {*config.test_iterations, config.iterations}
-    saves = set(config.save_iterations) - {config.iterations}
-    profiled, before_profile = max(config.iterations - config.profile, run.iteration), run.seconds
+    end, report, processes = trainer.config.learn.iterations, trainer.config.report, trainer.processes
+    checks = {end * k // EVALUATIONS for k in range(1, EVALUATIONS)}
+    whole_checks = {*report.test_iterations, end}
+    saves = set(report.save_iterations) - {end}
+    profiled, before_profile = max(end - report.profile, run.iteration), run.seconds
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     bar = tqdm(
-        total=config.iterations,
+        total=end,
         initial=run.iteration,
-        disable=config.quiet,
+        disable=report.quiet,
         unit="it",
         mininterval=pause,
         maxinterval=pause,
         miniters=0,
     )
     trainer.check_identical(run.iteration)
-    with bar, launch.profile(config.profile > 0) as stages:
-        for iteration in range(run.iteration + processes.count, config.iterations + 1, processes.count):
+    with bar, launch.profile(report.profile > 0) as stages:
+        for iteration in range(run.iteration + processes.count, end + 1, processes.count):
             if processes.reaches(iteration, [profiled + 1]):
                 stages.clear()
                 before_profile = run.seconds
@@ -253,10 +182,10 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
             run.losses.append(trainer.differentiate(iteration))
             run.iteration = iteration
             run.seconds += time.perf_counter() - start
-            wish = processes.largest(STOP if interrupted else KEEP if _keeping_is_due(config, run) else 0)
-            stop = wish == STOP or iteration == config.iterations
+            wish = processes.largest(STOP if interrupted else KEEP if _keeping_is_due(report, run) else 0)
+            stop = wish == STOP or iteration == end
             check, whole = (processes.reaches(iteration, marks) for marks in (checks | whole_checks, whole_checks))
-            named = processes.reaches(iteration, config.checkpoint_iterations)
+            named = processes.reaches(iteration, report.checkpoint_iterations)
             if check:
                 _check(trainer, run, bar, whole)
             if stop or wish == KEEP or named:
@@ -272,14 +201,14 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
                 viewer.between_steps(interrupted)
     run.dropped = trainer.quarantine.read(processes)
     steps = -(-(run.iteration - profiled) // processes.count)
-    if config.profile and steps > 0:
+    if report.profile and steps > 0:
         times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
         step = 1e3 * (run.seconds - before_profile) / steps
         run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
 
 
-def _keeping_is_due(config: TrainConfig, run: Run) -> bool:
-    return 0 < 60 * config.checkpoint_interval <= time.perf_counter() - run.kept_at
+def _keeping_is_due(report: ReportOptions, run: Run) -> bool:
+    return 0 < 60 * report.checkpoint_interval <= time.perf_counter() - run.kept_at
 
 
 @launch.profile(False)

@@ -106,7 +106,7 @@ class TrainingViewer:
         self.viewer.refresh()
 
     def _tell(self) -> None:
-        run, end = self.run, self.trainer.config.iterations
+        run, end = self.run, self.trainer.config.learn.iterations
         self._bar.value = 100.0 * run.iteration / end
         lines = [f"iteration {run.iteration:,} of {end:,}" + ", paused" * self.paused]
         if run.seconds:
@@ -128,5 +128,5 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
     def draw(camera: Camera, depth: bool) -> RenderOutput:
         return on_screen(trainer.look(camera, depth), trainer.scene.linear)
 
-    with Viewer(draw, lambda: trainer.model.parameters["means"], trainer.scene, trainer.config.port) as viewer:
+    with Viewer(draw, lambda: trainer.model.parameters["means"], trainer.scene, trainer.config.report.port) as viewer:
         yield TrainingViewer(trainer, run, viewer)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import psutil
 import torch
 
-from warp_splat.config import TILE, TrainConfig
+from warp_splat.config import TILE
 from warp_splat.runtime.launch import available_memory
-from warp_splat.scene.types import Scene
+from warp_splat.training.trainer import Trainer
 
 FLOAT, GIB = 4, 2**30  # bytes
 INSTANCES = 3  # of a Gaussian, guessed: 1.4 to 2.8 on photographs of 270 x 480 and 540 x 960 px
@@ -85,29 +85,24 @@ def step_memory(
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
 
-def describe(scene: Scene, config: TrainConfig, gaussians: int, processes: int = 1) -> str:
-    """What to tell the user once kernels are loaded: memory and the Gaussians assumed, and whether that can be had.
-
-    Args:
-        scene: its photographs are in memory already.
-        config: options of the run.
-        gaussians: that it begins with.
-        processes: that train on this machine, each in memory of its own.
-    """
+def describe(trainer: Trainer) -> str:
+    """What to tell the user once kernels are loaded: memory and the Gaussians assumed, and whether that can be had."""
+    scene, config, processes = trainer.scene, trainer.config, trainer.processes.local_count
     pixels = max(view.camera.width * view.camera.height for view in scene.train)
-    count, reason = expected_gaussians(gaussians, pixels, config)
+    grows, limit = trainer.growth.grows(config.learn.iterations), config.grow.max_gaussians
+    count, reason = expected_gaussians(len(trainer.model), pixels, limit, grows)
     masked = any(view.mask is not None for view in scene.train)
-    composited = config.random_background and any(view.alpha is not None for view in scene.train)
+    composited = any(part.reads_alpha for part in trainer.parts) and any(view.alpha is not None for view in scene.train)
     per_pixel = pixel_floats(masked, composited, scene.linear)
 
     def step(gaussians: int) -> int:
-        coefficients, instances = (config.sh_degree + 1) ** 2, INSTANCES * gaussians
-        return step_memory(gaussians, coefficients, instances, pixels, config.adjoint, per_pixel)
+        coefficients, instances = (config.model.sh_degree + 1) ** 2, INSTANCES * gaussians
+        return step_memory(gaussians, coefficients, instances, pixels, config.model.adjoint, per_pixel)
 
     base, needed = psutil.Process().memory_info().rss, step(count)
     each = f" in each of {processes} processes" if processes > 1 else ""
     text = f"About {(base + needed) / GIB:.1f} GiB of memory{each} at {count} Gaussians ({reason})"
-    if not config.max_gaussians:
+    if not limit:
         text += f", {(step(10**6) - step(0)) / GIB:.1f} GiB more for each further million"
     available = available_memory(torch.device("cpu"))
     if processes * needed > available:
@@ -118,11 +113,11 @@ def describe(scene: Scene, config: TrainConfig, gaussians: int, processes: int =
     return f"{text}."
 
 
-def expected_gaussians(beginning: int, pixels: int, config: TrainConfig) -> tuple[int, str]:
+def expected_gaussians(beginning: int, pixels: int, limit: int = 0, grows: bool = True) -> tuple[int, str]:
     """How many Gaussians there will be of so many at the beginning, and why; ``pixels`` of a view."""
-    if min(config.iterations, config.densify_until_iter) <= config.densify_from_iter:
+    if not grows:
         return beginning, "as at the beginning"
-    if config.max_gaussians:
-        return max(beginning, config.max_gaussians), "--max_gaussians"
+    if limit:
+        return max(beginning, limit), "--max_gaussians"
     guess = max(beginning, pixels // PIXELS)
     return guess, f"guessed: one for {PIXELS} px of a photograph; --max_gaussians limits them"

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 import warp as wp
 from torch.optim.adam import adam
 
-from warp_splat.config import TrainConfig
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.simd import LANES
 from warp_splat.runtime.launch import in_slices, launch, torch_slices, view
+from warp_splat.training.options import LearnOptions
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
@@ -27,21 +28,26 @@ class Optimizer:
 
     Args:
         model: whose parameters are updated in place.
-        config: rates and ``optimizer_type``.
+        options: rates and ``optimizer_type``.
         extent: size of the scene, world units; the means' rate is relative to it.
         batch: images whose mean gradient makes a step. Rates are multiplied by its square root, epsilon is divided by
             that, and the betas are raised to its power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting
             Training"): if gradients of different images are independent, a step then moves the parameters as far,
             and forgets as much, as ``batch`` steps of one image.
+        parts: groups of what parts learn, each with ``name``, ``params`` (one leaf of at least one axis) and ``lr``;
+            they learn in every step, by torch's fused Adam.
     """
 
-    def __init__(self, model: GaussianModel, config: TrainConfig, extent: float, batch: int = 1):
-        self.model, self.config, self.extent, self.scale = model, config, extent, math.sqrt(batch)
-        self.batch = batch
+    def __init__(
+        self, model: GaussianModel, options: LearnOptions, extent: float, batch: int = 1, parts: Sequence[dict] = ()
+    ):
+        self.model, self.options, self.extent, self.scale = model, options, extent, math.sqrt(batch)
+        self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
+        self._part_rates = {group["name"]: group["lr"] for group in parts}
         names = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
         groups = [{"name": name, "params": [model.parameters[name]]} for name in names]
         betas = (BETAS[0] ** batch, BETAS[1] ** batch)
-        self.adam = torch.optim.Adam(groups, lr=0.0, betas=betas, eps=EPS / self.scale)
+        self.adam = torch.optim.Adam([*groups, *parts], lr=0.0, betas=betas, eps=EPS / self.scale)
         self._groups = {group["name"]: group for group in self.adam.param_groups}
         self.set_iteration(0)
 
@@ -50,35 +56,43 @@ class Optimizer:
 
         In the last ``cooldown`` steps all fall to a tenth as well, which settles what constant rates keep in motion.
         """
-        config = self.config
-        share = min(iteration / config.position_lr_max_steps, 1.0)
-        rate = math.exp((1 - share) * math.log(config.position_lr_init) + share * math.log(config.position_lr_final))
+        options = self.options
+        share = min(iteration / options.position_lr_max_steps, 1.0)
+        rate = math.exp((1 - share) * math.log(options.position_lr_init) + share * math.log(options.position_lr_final))
         rates = {
             "means": rate * self.extent,
-            "sh_dc": config.feature_lr,
-            "sh_rest": config.feature_lr / 20.0,
-            "opacities": config.opacity_lr,
-            "scales": config.scaling_lr,
-            "quats": config.rotation_lr,
+            "sh_dc": options.feature_lr,
+            "sh_rest": options.feature_lr / 20.0,
+            "opacities": options.opacity_lr,
+            "scales": options.scaling_lr,
+            "quats": options.rotation_lr,
+            **self._part_rates,
         }
-        cooldown = min(config.cooldown, config.iterations)
-        late = max(iteration - config.iterations + cooldown, 0) / max(cooldown, 1)
+        cooldown = min(options.cooldown, options.iterations)
+        late = max(iteration - options.iterations + cooldown, 0) / max(cooldown, 1)
         for name, rate in rates.items():
             self._groups[name]["lr"] = rate * self.scale * 0.1**late
 
-    def step(self, radii: torch.Tensor) -> None:
-        """Update from the gradients and clear them; ``radii`` [N] int32 tells what the image showed (0: not)."""
-        if self.config.optimizer_type == "sparse_adam":
-            for group in self.adam.param_groups:
+    def step(self, radii: torch.Tensor | None) -> None:
+        """Update from the gradients and clear them.
+
+        Args:
+            radii: [N] int32, what the image showed (0: not); None if the set has just changed, and has no gradients.
+        """
+        gaussians = [group for group in self.adam.param_groups if group["name"] not in self.parts]
+        if radii is not None and self.options.optimizer_type == "sparse_adam":
+            for group in gaussians:
                 self._sparse_step(group, radii)
-        else:
-            self._dense_step()
+        elif radii is not None:
+            self._dense_step(gaussians)
+        for name in self.parts:
+            self._dense_step([self._groups[name]])
         self.adam.zero_grad(set_to_none=True)
 
-    def _dense_step(self) -> None:
+    def _dense_step(self, groups: list[dict]) -> None:
         """The fused Adam of torch, the rows shared among the threads of the CPU."""
-        jobs, steps = [], []
-        for group in self.adam.param_groups:
+        jobs, steps, rows = [], [], len(groups[0]["params"][0])
+        for group in groups:
             parameter, (beta1, beta2) = group["params"][0], group["betas"]
             state = self._state(parameter)
             steps.append(state["step"])
@@ -91,7 +105,7 @@ class Optimizer:
             for tables, step, rates in jobs:
                 adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
 
-        in_slices(run, torch_slices(len(self.model), self.model.device))
+        in_slices(run, torch_slices(rows, self.model.device))
         for step in steps:
             step.add_(1)
 
@@ -156,7 +170,7 @@ class Optimizer:
         Those are steps times ``batch``: bias correction then goes on as it should for any other ``batch``.
         """
         found: dict[str, torch.Tensor] = {}
-        for name, leaf in self.model.parameters.items():
+        for name, leaf in (self.model.parameters | self.parts).items():
             found[f"parameters.{name}"] = leaf.detach()
             if leaf.grad is not None:
                 found[f"gradients.{name}"] = leaf.grad
@@ -168,8 +182,10 @@ class Optimizer:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Take what :meth:`state` gave from a checkpoint. Raises InputError if something does not fit."""
         arrays, count = checkpoint.arrays, len(checkpoint.array("parameters.means", (-1, 3)))
-        for name, old in self.model.parameters.items():
-            shape = (count, *old.shape[1:])
+        for name, old in (self.model.parameters | self.parts).items():
+            if name in self.parts and f"parameters.{name}" not in arrays:  # training went without this part so far
+                continue
+            shape = old.shape if name in self.parts else (count, *old.shape[1:])
             moments = MOMENTS if any(f"{moment}.{name}" in arrays for moment in MOMENTS) else ()
             gradients = ("gradients",) if f"gradients.{name}" in arrays else ()
             tables = {
@@ -178,13 +194,22 @@ class Optimizer:
                 )
                 for kind in ("parameters", *gradients, *moments)
             }
-            self._swap(name, tables["parameters"])
-            leaf = self.model.parameters[name]
+            if name in self.parts:
+                old.detach().copy_(tables["parameters"])  # the part knows this leaf
+            else:
+                self._swap(name, tables["parameters"])
+            leaf = self._groups[name]["params"][0]
             leaf.grad = tables.get("gradients")
             if moments:
                 images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
                 step = torch.tensor(float(images / self.batch), dtype=torch.float32, device=leaf.device)
                 self.adam.state[leaf] = {"step": step, **{moment: tables[moment] for moment in MOMENTS}}
+
+    def part_gradients(self) -> list[torch.Tensor]:
+        """The gradients of what parts learn, zeros where there are none."""
+        for leaf in self.parts.values():
+            leaf.grad = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+        return [leaf.grad for leaf in self.parts.values() if leaf.grad is not None]
 
     def _swap(self, name: str, values: torch.Tensor) -> None:
         """Put a new leaf, without a gradient, in the place of a parameter; its state moves along."""

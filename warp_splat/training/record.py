@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -20,10 +20,10 @@ from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
-from warp_splat.formats.config_file import OF_ONE_RUN
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.text import format_table
+from warp_splat.training.config_file import OF_ONE_RUN
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
 
@@ -41,6 +41,7 @@ class Run:
     iteration: int = 0
     seconds: float = 0.0  # of training steps alone, without evaluations and pictures
     preview: float = 0.0  # when last drawn
+    saved: Path | None = None  # the model, at the end
     kept: int | None = None  # iteration of the last checkpoint
     kept_at: float = 0.0  # when that was written, on time.perf_counter
     stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
@@ -56,7 +57,7 @@ def warn(error: Exception) -> None:
 def save_model(trainer: Trainer, run: Run) -> Path:
     """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
     path = model_folder.ply_path(run.folder, run.iteration)
-    antialiased = trainer.config.antialiasing
+    antialiased = trainer.config.model.antialiasing
     try:
         trainer.model.save(path, antialiased)
     except InputError as error:
@@ -86,9 +87,7 @@ def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
     if trainer.processes.rank == 0:
         if run.losses:
             tensors["losses"] = torch.stack(run.losses)
-        options = asdict(trainer.config)
-        for name in OF_ONE_RUN:
-            del options[name]
+        options = {name: value for name, value in trainer.config.flat().items() if name not in OF_ONE_RUN}
         facts |= {"options": options, "iteration": run.iteration, "history": run.history}
         facts |= {"seconds": run.seconds, "wall": time.perf_counter() - run.start}
         arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
@@ -149,7 +148,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         "peak_memory_mb": peak_memory(),
         "dropped": run.dropped,
     }
-    metrics, absent = choose_metrics(trainer.config.lpips_weights)
+    metrics, absent = choose_metrics(trainer.config.report.lpips_weights)
     for sentence in absent:
         say(sentence)
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics)
@@ -167,7 +166,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    state = "Interrupted" if run.iteration < trainer.config.iterations else "Done"
+    state = "Interrupted" if run.iteration < trainer.config.learn.iterations else "Done"
     print(
         f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
         f"{split} {metrics_line(means)}, {len(trainer.model)} Gaussians"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from warp_splat.camera import Camera
 from warp_splat.color import to_bytes, to_srgb
-from warp_splat.config import TILE, RasterOptions, TrainConfig
+from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.checkpoint import Checkpoint
@@ -24,10 +24,14 @@ from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load, stage
 from warp_splat.scene.types import Scene, View
-from warp_splat.training.densify import Densifier
+from warp_splat.training.growth import GROWTHS
 from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import AUTO, PARTS, choose
+from warp_splat.training.seams import Growth, Part, Setting, Step
 
+T = TypeVar("T")
 LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
 
 
@@ -75,27 +79,32 @@ class Trainer:
                 f"--nproc-per-node: expected at most one process for each of {len(scene.train)} training views, got "
                 f"{processes.count}; start fewer."
             )
-        if config.loss_space != "srgb" and not scene.linear:
+        if config.data.loss_space != "srgb" and not scene.linear:
             raise InputError(
-                f"--loss_space {config.loss_space}: expected photographs in linear light (EXR, HDR, TIFF of floats), "
-                f"found {scene.train[0].name}, which is as a screen shows it; leave this flag out."
+                f"--loss_space {config.data.loss_space}: expected photographs in linear light (EXR, HDR, TIFF of "
+                f"floats), found {scene.train[0].name}, which is as a screen shows it; leave this flag out."
             )
-        self.scene, self.config, self.device = scene, config, choose_device(config.device)
+        used, self.told = choose(config, scene)
+        if config.model.parts == AUTO:
+            config = config.changed(parts=",".join(used))
+        self.scene, self.config, self.device = scene, config, choose_device(config.machine.device)
         self.processes = processes
-        extent = scene.extent
         if scene.start:
-            model = GaussianModel.from_splats(scene.start.splats, config.sh_degree)
+            model = GaussianModel.from_splats(scene.start.splats, config.model.sh_degree)
         else:
-            model = GaussianModel.from_points(scene.points, scene.colors, config.sh_degree)
+            model = GaussianModel.from_points(scene.points, scene.colors, config.model.sh_degree)
         self.model = model.arranged().to(self.device)
-        self.optimizer = Optimizer(self.model, config, extent, processes.count)
-        self.densifier = Densifier(self.model, self.optimizer, config, extent, processes)
+        self.background = torch.full((3,), float(config.data.white_background), device=self.device)
+        seed, limit, growth = config.learn.seed, config.grow.max_gaussians, config.grow.growth
+        setting = Setting(scene, self.model, self.background, processes, seed, limit)
+        self.parts: list[Part] = [PARTS[name].load()(config.plugins[name], setting) for name in used]
+        groups = [group for part in self.parts for group in part.parameters()]
+        self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)
+        self.growth: Growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
         self.quarantine = Quarantine()
-        self.options = RasterOptions(antialiasing=config.antialiasing, projection=config.projection)
-        self.background = torch.full((3,), float(config.white_background), device=self.device)
+        self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0
-        self._views_random = random.Random(config.seed)
-        self._background_random = torch.Generator().manual_seed(config.seed)
+        self._views_random = random.Random(seed)
         self._deck: list[View] = []
         self._shrink = 1  # of the images in this step
         self._photographs: dict[View, Photograph] = {}  # those that were used, at that size
@@ -109,59 +118,62 @@ class Trainer:
         The reference evaluates and saves between this and :meth:`update`: a set that was densified a moment ago is
         unsettled and renders several dB worse.
         """
-        config = self.config
+        learn = self.config.learn
         self._set_iteration(iteration)
-        view = self._next_view()
-        camera, photograph = self._at_size(view, iteration)
-        background = self.background
-        if config.random_background:
-            drawn = torch.rand(self.processes.count, 3, generator=self._background_random)
-            background = drawn[self.processes.rank].to(self.device)
-        out = self._render(camera, background)
+        step = Step(iteration, self._next_view())
+        camera, photograph = self._at_size(step.view, iteration)
+        options = self.growth.asks(self._through("asks", self.options, step), step)
+        camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
+        out = self._render(camera, background, options)
         out.means2d.retain_grad()
-        image, target = out.image, photograph.image
-        if photograph.alpha is not None:  # put there what it was not loaded with
-            values = target / 255.0 if target.dtype == torch.uint8 else target
-            target = values + (1.0 - photograph.alpha / 255.0) * (background - self.background)
+        image = self._through("image", out.image, out, step)
+        target = self._through("photograph", photograph, step).image
         if self.scene.linear:
-            image, target = (LOSS_CURVES[config.loss_space](picture) for picture in (image, target))
+            image, target = (LOSS_CURVES[self.config.data.loss_space](picture) for picture in (image, target))
         # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
-        loss = image_loss(image, target, config.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
+        loss = image_loss(image, target, learn.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
+        loss = self._through("loss", loss, out, step)
         loss.backward()
-        if iteration < config.densify_until_iter:
-            with stage("densify"):
-                self.densifier.observe(out, camera.width, camera.height)
+        with stage("densify"):
+            self.growth.observe(out, step)
         self.quarantine.pixels += out.dropped.pixel_count
         self.quarantine.gradients += out.dropped.gaussian_count
         self.quarantine.gaussians += out.invalid_count
         self._radii, loss = out.radii, loss.detach()
-        if config.optimizer_type == "sparse_adam":
+        if learn.optimizer_type == "sparse_adam":
             self.processes.maximum(self._radii)
-        self.processes.average([*self.model.gradients(self.degree), loss])
+        self.processes.average([*self.model.gradients(self.degree), *self.optimizer.part_gradients(), loss])
         return loss
+
+    def _through(self, method: str, value: T, *arguments: Any) -> T:
+        """What the parts make of ``value``, one after another."""
+        for part in self.parts:
+            value = getattr(part, method)(value, *arguments)
+        return value
 
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
         with stage("densify"):
-            changed = self.densifier.update(iteration)
+            changed = self.growth.update(iteration)
         if changed is not None:
             self.check_identical(iteration)
             self.quarantine.prunings += changed.refused
         with stage("Adam"):
-            if changed is None or changed.refused:
-                self.optimizer.step(self._radii)
+            self.optimizer.step(self._radii if changed is None or changed.refused else None)
+        for part in self.parts:
+            part.after_step(iteration)
 
     def warm_up(self) -> None:
         """Compile and load every kernel of a step, changing nothing."""
         camera = self.scene.train[0].camera.resized(TILE, TILE)
-        out = self._render(camera, self.background)
-        image_loss(out.image, torch.zeros_like(out.image), self.config.lambda_dssim).backward()
+        out = self._render(camera, self.background, self.options)
+        image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.adam.zero_grad(set_to_none=True)
         load(quarantine, self.device)  # launched only where a gradient is not finite
 
     def check_identical(self, iteration: int) -> None:
         """Raise GroupError if the model is not the same, byte for byte, in all processes."""
-        self.processes.check_identical(self.model.parameters.values(), iteration)
+        self.processes.check_identical([*self.model.parameters.values(), *self.optimizer.parts.values()], iteration)
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Tensors by name and values of JSON: all that :meth:`restore` needs to go on as if nothing had happened.
@@ -170,12 +182,9 @@ class Trainer:
         models are saved: a checkpoint holds the same parameters as the model of its iteration, and their gradients.
         """
         places = {view: place for place, view in enumerate(self.scene.train)}
-        tensors = {
-            **self.optimizer.state(),
-            **self.densifier.state(),
-            "radii": self._radii,
-            "random.background": self._background_random.get_state(),
-        }
+        tensors = {**self.optimizer.state(), "radii": self._radii}
+        for plugin in (self.growth, *self.parts):
+            tensors |= plugin.state()
         return tensors, {
             "views": [view.name for view in self.scene.train],
             "extent": self.scene.extent,
@@ -211,14 +220,14 @@ class Trainer:
             dropped = {"prunings": dropped["prunings"]}
         self.quarantine = Quarantine(**dropped)
         self.optimizer.restore(checkpoint)
-        self.densifier.restore(checkpoint)
+        for plugin in (self.growth, *self.parts):
+            plugin.restore(checkpoint)
         self._radii = torch.from_numpy(checkpoint.array("radii", (len(self.model),), np.int32)).to(self.device)
-        self._background_random.set_state(torch.from_numpy(checkpoint.generator("random.background")))
         self._set_iteration(checkpoint.count("iteration"))
 
     def _set_iteration(self, iteration: int) -> None:
         self.optimizer.set_iteration(iteration)
-        self.degree = min(iteration // self.config.sh_interval, self.config.sh_degree)
+        self.degree = min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree)
 
     def _next_view(self) -> View:
         """Views in random order, each once before any comes again; all processes deal, each takes its own."""
@@ -233,9 +242,9 @@ class Trainer:
 
     def _at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
         """Camera and photograph of ``view`` at this iteration's size: coarse to fine, if so configured."""
-        config = self.config
-        doublings = (config.coarse.bit_length() - 1) * iteration // config.coarse_until_iter
-        shrink = max(config.coarse >> doublings, 1)
+        learn = self.config.learn
+        doublings = (learn.coarse.bit_length() - 1) * iteration // learn.coarse_until_iter
+        shrink = max(learn.coarse >> doublings, 1)
         if shrink != self._shrink:
             self._shrink = shrink
             self._photographs.clear()
@@ -248,30 +257,29 @@ class Trainer:
         kept = self._photographs.get(view)
         if kept is None:
             with stage("photographs"):
-                alpha = view.alpha if self.config.random_background else None
+                alpha = view.alpha if any(part.reads_alpha for part in self.parts) else None
                 planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
                 kept = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
             self._photographs[view] = kept
         return Photograph(*(None if p is None else p.to(self.device, non_blocking=True) for p in kept))
 
     def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
-        kept = torch.from_numpy(pixels).to(self.config.data_device)
+        kept = torch.from_numpy(pixels).to(self.config.machine.data_device)
         if kept.shape[:2] != (height, width):
             planes = kept.permute(2, 0, 1)[None].float()
             means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
             kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
         return kept if kept.device.type == self.device.type else kept.pin_memory()
 
-    def _render(self, camera: Camera, background: torch.Tensor, depth: bool = False) -> RenderOutput:
-        options = replace(self.options, sh_degree=self.degree, depth=depth)
+    def _render(self, camera: Camera, background: torch.Tensor, options: RasterOptions) -> RenderOutput:
         with stage("project"):
             gaussians = self.model.activated(self.degree)
-        return render(gaussians, camera, background, options, self.config.adjoint)
+        return render(gaussians, camera, background, replace(options, sh_degree=self.degree), self.config.model.adjoint)
 
     def look(self, camera: Camera, depth: bool = False) -> RenderOutput:
         """The present model seen by ``camera``, without gradients; nothing of the training changes."""
         with torch.no_grad():
-            return self._render(camera, self.background, depth)
+            return self._render(camera, self.background, replace(self.options, depth=depth))
 
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""

@@ -19,7 +19,7 @@ from warp_splat.compare.stability.verdict import (
     count_text,
     relative_error,
 )
-from warp_splat.config import ALPHA_MAX, BLUR, TILE, RasterOptions, TrainConfig
+from warp_splat.config import ALPHA_MAX, BLUR, TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import rasterize
@@ -27,6 +27,7 @@ from warp_splat.raster.bin import MAX_INSTANCES
 from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import EPS as ADAM_EPS
 from warp_splat.training.optimizer import Optimizer
+from warp_splat.training.options import LearnOptions
 
 RATIOS = tuple(10.0**power for power in np.arange(0, 8.5, 0.5))
 SHORT = 0.1  # px, short axis
@@ -178,7 +179,7 @@ def adam(gradient: float, kind: str, _mode: str) -> Outcome:
     count = 3
     shapes = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (3, 3), "opacities": (), "scales": (3,), "quats": (4,)}
     model = GaussianModel({name: torch.zeros(count, *shape) for name, shape in shapes.items()})
-    optimizer = Optimizer(model, TrainConfig(optimizer_type="default" if kind == "adam" else kind), 1.0)
+    optimizer = Optimizer(model, LearnOptions(optimizer_type="default" if kind == "adam" else kind), 1.0)
     for _ in range(STEPS):
         for parameter in model.parameters.values():
             parameter.grad = torch.full_like(parameter, gradient)

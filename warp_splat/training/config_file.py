@@ -1,18 +1,19 @@
-"""Training options as TOML: ``--config`` in, ``config.toml`` in the model folder out."""
+"""Training options in files: ``--config`` and checkpoints in, ``config.toml`` in the model folder out."""
 
 from __future__ import annotations
 
 import difflib
 import json
 import tomllib
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from warp_splat.config import TrainConfig
 from warp_splat.errors import InputError, reason_of
-from warp_splat.flags import fits
+from warp_splat.flags import default_of, fits, flags_of
 from warp_splat.formats.atomic import write_text
+from warp_splat.formats.checkpoint import EXPECTED, load_header
+from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.training.options import TrainConfig, check_train
 
 NAME = "config.toml"
 OF_ONE_RUN = ("model_path", "start_checkpoint", "config", "viewer", "port")  # where it wrote, came from and was seen
@@ -31,18 +32,40 @@ def read_config(path: str | Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         reason = reason_of(getattr(error, "strerror", None) or error)
         raise InputError(f"--config {path}: expected a TOML file with options of training ({reason}).") from error
-    defaults, options = TrainConfig(), {item.name: item for item in fields(TrainConfig) if item.name != "config"}
+    options = {item.name: item for item in flags_of(TrainConfig) if item.name != "config"}
     for name, value in found.items():
         if name not in options:
             near = difflib.get_close_matches(name, options, 1)
             hint = f"did you mean {near[0]}?" if near else "warp-splat train --help lists them."
             raise InputError(f"--config {path}: {name}: no such option; {hint}")
-        item, default = options[name], getattr(defaults, name)
-        if not fits(value, item, default):
+        item = options[name]
+        if not fits(value, item):
             choices = item.metadata["choices"]
-            expected = f"one of {', '.join(map(repr, choices))}" if choices else KINDS[type(default)]
+            expected = f"one of {', '.join(map(repr, choices))}" if choices else KINDS[type(default_of(item))]
             raise InputError(f"--config {path}: {name}: expected {expected}, found {value!r:.60}; change it there.")
     return found
+
+
+def load_options(path: str | Path) -> dict[str, Any]:
+    """The options in a checkpoint, by name; those that an older program did not know have their defaults.
+
+    Raises:
+        InputError: as :func:`load_header`, or if an option is unknown or has an impossible value.
+    """
+    header, options = load_header(path), {item.name: item for item in flags_of(TrainConfig)}
+    with reading(header.path, EXPECTED):
+        found = header.facts.get("options")
+        if not isinstance(found, dict):
+            raise Unexpected("one without options")
+        for name, value in found.items():
+            if name not in options:
+                raise Unexpected(f"an option that it does not have, {name!r:.50}")
+            if not fits(value, options[name]):
+                raise Unexpected(f"{value!r:.50} as its option {name}")
+        config = TrainConfig(**found)
+        if problem := check_train(config):
+            raise Unexpected(f"an impossible option ({problem.rstrip('.')})")
+    return config.flat()
 
 
 def write_config(folder: str | Path, config: TrainConfig) -> None:
@@ -51,14 +74,15 @@ def write_config(folder: str | Path, config: TrainConfig) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
+    values = config.flat()
     lines, group = ["# The options of this training; train.py --config with this file repeats it."], ""
-    for item in fields(config):
+    for item in flags_of(TrainConfig):
         if item.name in OF_ONE_RUN:
             continue
         if item.metadata["group"] != group:
             group = item.metadata["group"]
             lines += ["", f"# {group}"]
         # a text of JSON is one of TOML, but for the one character that JSON does not escape
-        value = json.dumps(getattr(config, item.name), ensure_ascii=False).replace("\x7f", "\\u007f")
+        value = json.dumps(values[item.name], ensure_ascii=False).replace("\x7f", "\\u007f")
         lines.append(f"{item.name} = {value}  # {item.metadata['help']}")
     write_text(Path(folder) / NAME, "\n".join([*lines, ""]))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 
-from warp_splat.config import TrainConfig
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.gaussians import GaussianModel, along_curve
+from warp_splat.gaussians import along_curve
 from warp_splat.raster.api import RenderOutput
-from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import in_slices, torch_slices
+from warp_splat.training.growth import ReferenceOptions
 from warp_splat.training.optimizer import Optimizer
+from warp_splat.training.seams import Change, Growth, Setting, Step
 
 PRUNE_OPACITY = 0.005
 RESET_OPACITY = 0.01
@@ -21,42 +19,26 @@ PRUNE_EXTENT = 0.1  # share of the scene's extent above which a Gaussian is prun
 SPLIT_SHRINK = 1.6  # the children's scales are the parent's divided by this
 
 
-@dataclass
-class Change:
-    """What one densification did, in Gaussians."""
+class Reference(Growth):
+    """Statistics of the gradients of the 2D means, and what follows from them."""
 
-    cloned: int
-    split: int
-    pruned: int
-    refused: bool = False  # pruning would have left nothing, so nothing was pruned
+    def __init__(self, options: ReferenceOptions, setting: Setting, optimizer: Optimizer):
+        super().__init__(options, setting, optimizer)
+        self.model, self.processes, self.extent = setting.model, setting.processes, setting.scene.extent
+        self.random = torch.Generator().manual_seed(setting.seed)
+        self.clear()
 
-
-class Densifier:
-    """Statistics of the gradients of the 2D means, and what follows from them: the same in all ``processes``."""
-
-    def __init__(
-        self,
-        model: GaussianModel,
-        optimizer: Optimizer,
-        config: TrainConfig,
-        extent: float,
-        processes: Processes = ALONE,
-    ):
-        self.model, self.optimizer, self.config, self.extent = model, optimizer, config, extent
-        self.processes = processes
-        self.random = torch.Generator().manual_seed(config.seed)
-        self._clear()
-
-    def _clear(self) -> None:
+    def clear(self) -> None:
+        """Begin to observe the present set."""
         new = self.model.parameters["means"].new_zeros
         self.gradient = new(len(self.model))  # sum over views of |dL/dmean2d|, NDC units
         self.views = new(len(self.model))  # in which the Gaussian was drawn
         self.radius = new(len(self.model), dtype=torch.int32)  # px, largest in any view
 
-    def observe(self, out: RenderOutput, width: int, height: int) -> None:
+    def observe(self, out: RenderOutput, step: Step) -> None:
         """Take in the gradient of one view's 2D means."""
-        grad = out.means2d.grad
-        if grad is None:
+        grad, (height, width) = out.means2d.grad, out.image.shape[:2]
+        if grad is None or step.iteration >= self.options.densify_until_iter:
             return
 
         def run(low: int, high: int) -> None:
@@ -66,20 +48,23 @@ class Densifier:
             self.views[rows] += out.radii[rows] > 0
 
         in_slices(run, torch_slices(len(grad), grad.device))
-        if self.config.prune_screen_size:
+        if self.options.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
 
     def update(self, iteration: int) -> Change | None:
         """Densify, prune and reset opacities if it is time; None if the set did not change."""
-        config, change, step = self.config, None, self.processes.count  # iterations in a step
-        if iteration >= config.densify_until_iter:
+        options, change, step = self.options, None, self.processes.count  # iterations in a step
+        if iteration >= options.densify_until_iter:
             return None
-        if iteration > config.densify_from_iter and iteration % config.densification_interval < step:
-            change = self._densify(prune_large=iteration > config.opacity_reset_interval)
-        at_start = config.white_background and self.processes.reaches(iteration, [config.densify_from_iter])
-        if iteration % config.opacity_reset_interval < step or at_start:
+        if iteration > options.densify_from_iter and iteration % options.densification_interval < step:
+            change = self._densify(prune_large=iteration > options.opacity_reset_interval)
+        at_start = self.processes.reaches(iteration, [options.densify_from_iter]) and self.setting.background.all()
+        if iteration % options.opacity_reset_interval < step or at_start:
             self.optimizer.reset_opacities(RESET_OPACITY)
         return change
+
+    def grows(self, iterations: int) -> bool:
+        return min(iterations, self.options.densify_until_iter) > self.options.densify_from_iter
 
     def state(self) -> dict[str, torch.Tensor]:
         """Statistics since the last densification, [R, N] with a row for each process, and the random state."""
@@ -110,29 +95,29 @@ class Densifier:
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         chosen = self._choose()
         widest = torch.exp(raw["scales"]).amax(1)
-        splits = widest > self.config.percent_dense * self.extent
+        splits = widest > self.options.percent_dense * self.extent
         clone, split = chosen[~splits[chosen]], chosen[splits[chosen]]
         added = self._children(raw, split)
         added = {name: torch.cat([raw[name][clone], added[name]]) for name in raw}
         keep, keep_added = self._survivors(raw, prune_large), self._survivors(added, prune_large)
-        if self.config.prune_screen_size and prune_large:
-            keep &= self.radius <= self.config.prune_screen_size
+        if self.options.prune_screen_size and prune_large:
+            keep &= self.radius <= self.options.prune_screen_size
         keep[split] = False
         pruned = len(keep) + len(keep_added) - int(keep.sum()) - int(keep_added.sum()) - len(split)
         if not bool(keep.any()) and not bool(keep_added.any()):  # an empty scene could never recover
-            self._clear()
+            self.clear()
             return Change(0, 0, 0, refused=True)
         self.optimizer.replace(keep.nonzero()[:, 0], {name: rows[keep_added] for name, rows in added.items()})
         self.optimizer.arrange(along_curve(self.model.parameters["means"]))
-        self._clear()
+        self.clear()
         return Change(len(clone), len(split), pruned)
 
     def _choose(self) -> torch.Tensor:
         """Gaussians whose mean gradient is over the threshold, ascending; the largest first where room is short."""
         mean = self.gradient / self.views.clamp_min(1.0)
-        over = (mean >= self.config.densify_grad_threshold).nonzero()[:, 0]
-        room = max(self.config.max_gaussians - len(self.model), 0)
-        if self.config.max_gaussians and len(over) > room:
+        over = (mean >= self.options.densify_grad_threshold).nonzero()[:, 0]
+        room = max(self.setting.max_gaussians - len(self.model), 0)
+        if self.setting.max_gaussians and len(over) > room:
             largest = torch.sort(mean[over], descending=True, stable=True).indices[:room]
             over = torch.sort(over[largest]).values
         return over

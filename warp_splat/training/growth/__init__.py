@@ -1,0 +1,32 @@
+"""How the set of Gaussians grows and shrinks: the options of each growth, and the table. Standard library only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from warp_splat.flags import growing
+from warp_splat.training.seams import Entry
+
+
+@dataclass(frozen=True)
+class ReferenceOptions:
+    """Densification of the reference (Kerbl et al. 2023), with its names and defaults."""
+
+    densify_from_iter: int = growing(500, "first step of densification")
+    densify_until_iter: int = growing(15_000, "last step of densification")
+    densification_interval: int = growing(100, "steps between two densifications", least=1)
+    densify_grad_threshold: float = growing(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
+    percent_dense: float = growing(
+        0.01, "share of the scene's extent above which a Gaussian splits instead of being cloned"
+    )
+    opacity_reset_interval: int = growing(3000, "steps between two resets of all opacities to 0.01", least=1)
+    prune_screen_size: int = growing(
+        0,
+        "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does",
+        least=0,
+    )
+
+
+GROWTHS: dict[str, Entry] = {
+    "reference": Entry(ReferenceOptions, "warp_splat.training.growth.reference.Reference"),
+}

@@ -1,0 +1,128 @@
+"""Before the first step: options become what holds on this machine, the folder is chosen, the scene is read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from tqdm import tqdm
+
+from warp_splat.errors import InputError
+from warp_splat.evaluation.perceptual import choose_metrics
+from warp_splat.formats import model_folder
+from warp_splat.formats.checkpoint import LAST, Checkpoint, load_header, remove_leftovers
+from warp_splat.formats.ply import save_points
+from warp_splat.raster.selftest import settle_device
+from warp_splat.runtime import launch
+from warp_splat.runtime.distributed import Processes
+from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
+from warp_splat.scene.types import Scene
+from warp_splat.training.config_file import write_config
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.tensorboard import check_available
+
+Say = Callable[[str], None]
+
+
+def speaker(quiet: bool) -> Say:
+    """What prints a line above the progress bar, or nothing."""
+    return (lambda *_: None) if quiet else tqdm.write
+
+
+def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Checkpoint | None]:
+    """The options that hold from now on, and the checkpoint to go on from, without its arrays.
+
+    Raises:
+        InputError: if an option cannot be had here, or the output folder not be used.
+    """
+    data, machine, iterations = config.data, config.machine, config.learn.iterations
+    quiet = config.report.quiet or processes.rank > 0
+    threads = machine.threads or max(1, launch.get_threads() // processes.local_count)
+    choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
+    if config.report.tensorboard:
+        check_available()
+    begun = load_header(data.start_checkpoint) if data.start_checkpoint else None
+    done = begun.count("iteration") if begun else 0
+    if begun and done > iterations:  # at the end, what is written there is written again
+        raise InputError(
+            f"--iterations {iterations}: expected at least the {done} after which {begun.path} was written; name a "
+            "later end."
+        )
+    folder = _choose_folder(config, begun)
+    say = speaker(quiet)
+    device = settle_device(launch.prepare(machine.device, threads), machine.device, [config.model.adjoint], say)
+    if machine.data_device == "cuda" and device.type != "cuda":
+        raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
+    source = data.source_path
+    if data.sfm:
+        from warp_splat.sfm.command import scene_for  # noqa: PLC0415 - only photographs without cameras need it
+
+        options = {"threads": machine.threads, "seed": config.learn.seed % 2**31, "quiet": quiet}
+        source = scene_for(source, processes.count, **options)
+    config = config.changed(
+        quiet=quiet,
+        iterations=iterations + -(iterations - done) % processes.count,  # whole steps
+        model_path=processes.first(str(folder)),
+        device=device.type,
+        source_path=os.path.abspath(source or embedded_scene()),  # render.py may run elsewhere
+        start_ply=data.start_ply and os.path.abspath(data.start_ply),
+    )
+    return config, begun
+
+
+def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
+    """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
+    default = begun.path.parent if begun else model_folder.default_model_path()
+    folder, source = Path(config.report.model_path or default), config.data.source_path
+    model_folder.check_place(folder)
+    if source and folder.resolve() == Path(source).resolve():
+        raise InputError(f"-m {folder}: expected another folder than the scene's; choose a new one.")
+    refuse_other_training(folder, begun)
+    return folder
+
+
+def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
+    """Raise InputError if the folder holds a training that does not go on from here."""
+    continued = begun and begun.path.resolve() == (folder / LAST).resolve()
+    if not continued and ((folder / LAST).exists() or any(folder.glob("point_cloud/*/*.ply"))):
+        raise InputError(
+            f"{folder}: this folder already holds a training; choose another with -m, move it, or continue where it "
+            f"ended with --resume {folder}."
+        )
+
+
+def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene:
+    """Read the scene and tell what may surprise."""
+    data, learn = config.data, config.learn
+    say(f"Scene {data.source_path}")
+    if learn.coarse > 1 and learn.coarse_until_iter > learn.iterations:
+        say(f"Warning: images reach their full size at --coarse_until_iter {learn.coarse_until_iter}, after the end.")
+    scene = load_scene(
+        data.source_path,
+        images=data.images,
+        resolution=data.resolution,
+        white_background=data.white_background,
+        eval=data.eval,
+        invert_masks=data.invert_masks,
+        start=data.start_ply if not begun or os.path.isfile(data.start_ply) else "",  # if it has gone
+        report=say,
+    )
+    if scene.random_points and not begun:
+        say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
+    if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:
+        which = "with" if scene.start.antialiased else "without"
+        say(f"Warning: {data.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
+    return scene
+
+
+def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: bool) -> None:
+    """Write what this training was given: options, cameras, points."""
+    others = {"depths": "", "train_test_exp": False, "linear_light": scene.linear}
+    model_folder.write_cfg_args(folder, {**config.flat(), **others})
+    write_config(folder, config)
+    model_folder.write_cameras(folder, scene.test, scene.train)
+    remove_leftovers(folder)
+    if not (continues and (folder / "input.ply").exists()):
+        save_points(folder / "input.ply", scene.points, scene.colors)

@@ -1,0 +1,211 @@
+"""The options of training, in groups, with units and sources. Standard library only: ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from warp_splat.config import ADJOINTS, LOSS_SPACES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
+from warp_splat.flags import data, flag, flags_of, growing, learning, machinery, rendering, reporting
+from warp_splat.training.growth import GROWTHS
+from warp_splat.training.parts import AUTO, PARTS
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """What is read."""
+
+    source_path: str = flag(
+        "", "scene folder (COLMAP, nerf-synthetic, transforms.json); without it, the embedded scene", "-s"
+    )
+    sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
+    eval: bool = flag(False, "hold out every 8th image (by name) for testing")
+    resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
+    preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
+    start_checkpoint: str = flag(
+        "", "continue a training: its folder, or a checkpoint; options are the same but for those given", "--resume"
+    )
+
+    images: str = data("images", "folder of the photographs inside a COLMAP scene", "-i")
+    white_background: bool = data(False, "composite on white instead of black", "-w")
+    invert_masks: bool = data(False, "of the masks in masks/, the dark part counts, not the bright one")
+    loss_space: str = data(
+        "srgb", "photographs in linear light (EXR, HDR): the curve under which they are compared", choices=LOSS_SPACES
+    )
+    start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
+    config: str = data("", "options from a TOML file, such as a model's config.toml; flags that are given go before")
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """What is learned, and how it is rendered."""
+
+    sh_degree: int = rendering(3, "highest degree of the view-dependent color", choices=(0, 1, 2, 3))
+    adjoint: str = rendering("manual", "how the pixel loop is differentiated", choices=ADJOINTS)
+    projection: str = rendering("affine", "from 3D to 2D Gaussians", choices=PROJECTIONS)
+    antialiasing: bool = rendering(False, "keep small Gaussians from growing brighter (Mip-Splatting)")
+    parts: str = rendering(
+        "", f"what is learned or done besides: names between commas ({', '.join(PARTS)}), or auto: what the scene needs"
+    )
+
+
+@dataclass(frozen=True)
+class LearnOptions:
+    """How it learns; the reference's names and defaults (its train.py of October 2024) where it has them."""
+
+    iterations: int = flag(
+        30_000,
+        "images to train on, one in each step; n in each under torchrun with n processes; schedules count images",
+        least=1,
+    )
+
+    lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss")
+    position_lr_init: float = learning(0.00016, "rate of the means at the start (times the scene's extent)")
+    position_lr_final: float = learning(0.0000016, "rate of the means after position_lr_max_steps")
+    position_lr_max_steps: int = learning(30_000, "steps over which the means' rate decays", least=1)
+    feature_lr: float = learning(0.0025, "rate of the base color; the higher degrees learn 20 times slower")
+    opacity_lr: float = learning(0.025, "rate of the opacity logits")
+    scaling_lr: float = learning(0.005, "rate of the log scales")
+    rotation_lr: float = learning(0.001, "rate of the quaternions")
+    cooldown: int = learning(0, "over so many steps at the end, all rates fall to a tenth", least=0)
+    sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1)
+    optimizer_type: str = learning(
+        "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
+    )
+    coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
+    coarse_until_iter: int = learning(
+        3000, "by this step the size has doubled, at equal intervals, to the full one", least=1
+    )
+    seed: int = learning(0, "seed of everything random", least=0)
+
+
+@dataclass(frozen=True)
+class GrowOptions:
+    """How the set grows; each growth has options of its own."""
+
+    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit", least=0)
+
+    growth: str = growing("reference", f"the rules: {', '.join(GROWTHS)}")
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What is kept and told."""
+
+    model_path: str = flag("", "output folder; default: output/<random name>", "-m")
+    quiet: bool = flag(False, "print only the summary")
+
+    test_iterations: list[int] = reporting(
+        [7_000, 30_000], "evaluate after these steps, and 20 times in all", many=int, least=1
+    )
+    save_iterations: list[int] = reporting(
+        [7_000, 30_000], "save the model after these steps, and the last", many=int, least=1
+    )
+    checkpoint_iterations: list[int] = reporting(
+        [], "keep a checkpoint of these steps, besides the last one", many=int, least=1
+    )
+    checkpoint_interval: float = reporting(
+        5.0, "minutes between two checkpoints, of which the last is kept; 0: one at the start and one at the end"
+    )
+    lpips_weights: str = reporting("", LPIPS_HELP)
+    tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
+    viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
+    port: int = reporting(PORT, PORT_HELP, least=1)
+    profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot", least=0)
+
+
+@dataclass(frozen=True)
+class MachineOptions:
+    """Where it is computed."""
+
+    device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    data_device: str = machinery("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
+    threads: int = machinery(
+        0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)", least=0
+    )
+
+
+@dataclass(frozen=True, init=False)
+class TrainConfig:
+    """All options of a training. Flags, files and ``TrainConfig(NAME=VALUE, ...)`` know them by their names alone."""
+
+    data: DataOptions
+    model: ModelOptions
+    learn: LearnOptions
+    grow: GrowOptions
+    report: ReportOptions
+    machine: MachineOptions
+    plugins: dict[str, Any]  # the options of every growth and part, by its name
+
+    def __init__(self, **values: Any):
+        made = {}
+        for name, group in self.groups().items():
+            made[name] = group(**{item.name: values.pop(item.name) for item in fields(group) if item.name in values})
+        if values:
+            raise TypeError(f"TrainConfig: no such option: {', '.join(values)}")
+        plugins = {name: made.pop(name) for name in (*GROWTHS, *PARTS)}
+        for name, group in (made | {"plugins": plugins}).items():
+            object.__setattr__(self, name, group)
+
+    @staticmethod
+    def groups() -> dict[str, type]:
+        """The type of each group, and of the options of each growth and part."""
+        return {
+            "data": DataOptions,
+            "model": ModelOptions,
+            "learn": LearnOptions,
+            "grow": GrowOptions,
+            "report": ReportOptions,
+            "machine": MachineOptions,
+            **{name: plugin.options for name, plugin in (GROWTHS | PARTS).items()},
+        }
+
+    def flat(self) -> dict[str, Any]:
+        """Every option by its name."""
+        groups = [*(value for name, value in vars(self).items() if name != "plugins"), *self.plugins.values()]
+        return {name: value for group in groups for name, value in vars(group).items()}
+
+    def changed(self, **values: Any) -> TrainConfig:
+        """The same but for these options."""
+        return TrainConfig(**{**self.flat(), **values})
+
+
+#: What cannot change when a training is continued, and why.
+FIXED_OPTIONS = {
+    "sh_degree": "the number of coefficients of a Gaussian is that of its start",
+    "optimizer_type": "the moments of one are not those of the other",
+    "growth": "the statistics of one are not those of the other",
+    "seed": "random numbers continue from the checkpoint's",
+    "preset": "other options are those of the checkpoint; name the ones to change",
+}
+
+
+def check_train(config: TrainConfig) -> str | None:
+    """What is wrong with the values of ``config``, in one sentence, or None."""
+    values = config.flat()
+    for item in flags_of(TrainConfig):
+        name, value, least = item.name, values[item.name], item.metadata["least"]
+        if isinstance(value, list):
+            if min(value, default=least) < least:
+                return f"--{name}: expected numbers of steps, at least {least}, got {min(value)}."
+        elif least is not None and value < least:
+            return f"--{name}: expected at least {least}, got {value}."
+        elif isinstance(value, float) and not 0 <= value < float("inf"):
+            return f"--{name}: expected a finite number, at least 0, got {value}."
+    if config.report.port > 65535:
+        return f"--port: expected 1 to 65535, got {config.report.port}."
+    learn = config.learn
+    if learn.seed >= 2**63:
+        return f"--seed: expected 0 to 2^63 - 1, got {learn.seed}."
+    if learn.lambda_dssim > 1:
+        return f"--lambda_dssim: expected 0 to 1, got {learn.lambda_dssim}."
+    if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:
+        return "--position_lr_init, --position_lr_final: expected more than 0 (the rate decays from one to the other)."
+    for flag_name, names, table in (
+        ("growth", [config.grow.growth], GROWTHS),
+        ("parts", config.model.parts.split(",") if config.model.parts not in ("", AUTO) else [], PARTS),
+    ):
+        for name in names:
+            if name not in table:
+                return f"--{flag_name}: expected one of {', '.join(table)}, got {name!r:.50}."
+    return None

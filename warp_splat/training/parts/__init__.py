@@ -1,0 +1,46 @@
+"""What is learned or done besides the Gaussians: the options of each part, and the table. Standard library only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from warp_splat.flags import rendering
+from warp_splat.training.seams import Entry
+
+if TYPE_CHECKING:
+    from warp_splat.scene.types import Scene
+    from warp_splat.training.options import TrainConfig
+
+AUTO = "auto"  # in --parts: those that the scene needs
+
+
+@dataclass(frozen=True)
+class BackgroundOptions:
+    """A random background."""
+
+    random_background: bool = rendering(False, "a random background color in every step")
+
+    @property
+    def asked(self) -> bool:
+        """Whether the flag asks for it by itself."""
+        return self.random_background
+
+
+#: In this order they act in each step.
+PARTS: dict[str, Entry] = {
+    "background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
+}
+
+
+def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
+    """The names of the parts to use, and a sentence for each that ``--parts auto`` has weighed."""
+    used, told, named = [], [], config.model.parts.split(",")
+    for name, entry in PARTS.items():
+        if name in named or getattr(config.plugins[name], "asked", False):
+            used.append(name)
+        elif named == [AUTO]:
+            verdict = entry.load().needed(scene)
+            told.append(f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}.")
+            used += [name] * verdict.needed
+    return used, told

@@ -1,0 +1,53 @@
+"""A random background in every step, so that what is transparent in photographs has to become so in the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.scene.types import Scene
+from warp_splat.training.parts import BackgroundOptions
+from warp_splat.training.seams import Part, Setting, Step, Verdict
+from warp_splat.training.trainer import Photograph
+
+GENERATOR = "random.background"  # in a checkpoint
+
+
+class RandomBackground(Part):
+    """Renders on a new color in each step and puts it behind the photograph, too."""
+
+    reads_alpha = True
+
+    def __init__(self, options: BackgroundOptions, setting: Setting):
+        super().__init__(options, setting)
+        self.random = torch.Generator().manual_seed(setting.seed)
+        self.color = setting.background
+
+    @classmethod
+    def needed(cls, scene: Scene) -> Verdict:
+        """If photographs are transparent somewhere."""
+        clear = sum(view.alpha is not None and bool((view.alpha < 255).any()) for view in scene.train)
+        return Verdict(clear > 0, clear, f"{clear} of {len(scene.train)} photographs are transparent somewhere")
+
+    def background(self, color: torch.Tensor, step: Step) -> torch.Tensor:
+        processes = self.setting.processes
+        drawn = torch.rand(processes.count, 3, generator=self.random)
+        self.color = drawn[processes.rank].to(color.device)
+        return self.color
+
+    def photograph(self, photograph: Photograph, step: Step) -> Photograph:
+        """Put the color where the photograph was composited on the scene's background."""
+        image, alpha, _ = photograph
+        if alpha is None:
+            return photograph
+        values = image / 255.0 if image.dtype == torch.uint8 else image
+        return photograph._replace(image=values + (1.0 - alpha / 255.0) * (self.color - self.setting.background))
+
+    def state(self) -> Mapping[str, torch.Tensor]:
+        return {GENERATOR: self.random.get_state()}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        if GENERATOR in checkpoint.arrays:  # not, if training went without this part so far
+            self.random.set_state(torch.from_numpy(checkpoint.generator(GENERATOR)))
