@@ -30,11 +30,13 @@ EMBEDDED_DEFAULTS: dict[str, dict[str, Any]] = {
     },
 }
 
-#: What ``--preset`` changes; a flag that is given goes before. Tried: sparse_adam, whose step takes twice as long as
-#: torch's fused one where most Gaussians are in view; rates that decay to a tenth all along, 3.8 dB worse after 1,500
-#: steps at half size, where doubled rates are 0.8 dB better; doubled rates to the end, at full size 31.3 dB after 4,500
-#: steps, and 31.5 after 3,600 if they fall over the last 1,000. Threefold rates are better by 0.8 dB again on the
-#: embedded scene, but worse by 0.2 dB on photographs.
+#: What ``--preset`` changes; a flag that is given takes precedence. Tried:
+#: - 2 x the time of a step where most Gaussians are in view: sparse_adam instead of torch's fused Adam
+#: - 3.8 dB worse after 1,500 steps at half size: rates that decay to a tenth all along
+#: - 0.8 dB better after these: doubled rates
+#: - 31.3 dB after 4,500 steps at full size: doubled rates to the end; 31.5 dB after 3,600 if they fall over the last
+#:   1,000
+#: - 0.8 dB better on the embedded scene, 0.2 dB worse on photographs: threefold rates
 PRESETS: dict[str, dict[str, Any]] = {
     "": {},
     "fast": {

@@ -1,7 +1,7 @@
 """How different people would find two images: FLIP and LPIPS, by the packages of their authors.
 
 FLIP (Andersson et al. 2020) is made for renders and needs no weights. LPIPS (Zhang et al. 2018) needs those of a
-network that was trained on photographs; its package downloads them, here they are read from disk.
+network that was trained on photographs. Its package would download them; here they are read from disk.
 """
 
 from __future__ import annotations

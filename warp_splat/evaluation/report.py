@@ -27,7 +27,7 @@ BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"
 INK, FAINT = "#222222", "#d9d9d9"
 DPI = 200  # sharp on dense displays at the width of a README, about 850 px
 WIDTH = 8.0  # inches
-TALLEST = 4.0  # widths of its cell that a picture of a sheet may be high; one that is steeper is drawn narrower
+TALLEST = 4.0  # height of a picture on a sheet in widths of its cell, at most; a taller one is drawn narrower
 DIFFERENCE_GAIN = 4  # a difference of a quarter of the range is white
 
 

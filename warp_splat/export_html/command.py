@@ -116,7 +116,7 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
     script = "\n".join(_source(file) for file in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return Template(_source("viewer.html")).substitute(
-        # whatever a name or a number of a stranger's file may hold: no other script runs, and nothing is fetched
+        # no other script runs, and nothing is fetched, even if a stranger's file holds one in a name
         policy=f"default-src 'none'; script-src 'sha256-{digest}'; worker-src blob:; style-src 'unsafe-inline'",
         title=escape(name),
         background="#fff" if options["BACKGROUND"] else "#000",

@@ -51,7 +51,7 @@ def shown(splats: SplatArrays, most: int = 0) -> SplatArrays:
 
 
 def texels(coefficients: int) -> int:
-    """How many a Gaussian takes with so many SH coefficients."""
+    """How many a Gaussian of this number of SH coefficients takes."""
     return 2 + -(-(coefficients - 1) // IN_TEXEL)
 
 

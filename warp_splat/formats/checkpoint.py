@@ -1,8 +1,8 @@
 """Checkpoints: a file of safetensors, so that reading one runs no code, whoever wrote it.
 
-Arrays have names; all else is one JSON text in the file's metadata. safetensors proves, before anything is allocated,
-that the arrays fill the file exactly; a CRC-32 of names, shapes, bytes and text finds what was damaged.
-docs/checkpoints.md lists the names.
+Arrays have names. All else is one JSON text in the file's metadata. Before anything is allocated, safetensors proves
+that the arrays fill the file exactly. A CRC-32 of names, shapes, bytes and text finds damage. docs/checkpoints.md lists
+the names.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: M
         header[name] = {"dtype": dtype, "shape": array.shape, "data_offsets": [start, end]}
     encoded = json.dumps(header).encode()
     encoded += b" " * (-len(encoded) % 8)
-    # Tried: safetensors' save_file; what it writes only the owner may read, and if killed it leaves a file of its own
+    # Tried: safetensors' save_file. Only the owner may read what it writes. If killed, it leaves a file of its own.
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(struct.pack("<Q", len(encoded)) + encoded)
         for array in arrays.values():

@@ -53,7 +53,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:
-    """Read Gaussians in the frame of their training, whatever the format.
+    """Read Gaussians of any format, in the frame of their training.
 
     Args:
         path: a file of one of FORMATS.

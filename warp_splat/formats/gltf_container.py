@@ -1,7 +1,7 @@
 """What a glTF 2.0 file is made of, as far as points need it: JSON, buffers, accessors, the tree of nodes.
 
-Written for files of strangers: every number is checked before it is used, nothing is allocated that the file does not
-hold, and no other file is opened than buffers in the folder of the .gltf file or below.
+Written for files of strangers. Every number is checked before it is used. Nothing is allocated that the file does not
+hold. No other files are opened than buffers in the folder of the .gltf file or below.
 
 Own code, plain JSON and NumPy: the libraries for glTF build objects from the JSON without checking it.
 """

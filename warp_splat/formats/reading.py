@@ -1,4 +1,4 @@
-"""What any reader of a stranger's file does alike: one clear sentence for whatever is wrong with it."""
+"""What all readers of strangers' files share: one clear sentence for anything that is wrong with a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians in memory, as every file format reads and writes them, and what they share: activations, axes.
+"""Gaussians in memory, as every file format reads and writes them; what formats share: activations, axes.
 
 The frame is that of the scene's files, as trained (COLMAP: x right, y down, z forward). Formats with axes of their own
 turn the Gaussians on writing and back on reading (:func:`turned`).

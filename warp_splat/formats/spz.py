@@ -2,7 +2,7 @@
 
 Version 2 and 3 are one gzip stream: a header of 16 bytes, then all positions (24-bit fixed point), opacities, colors,
 log scales, rotations, spherical harmonics. Version 4 has a header of 32 bytes, extension records, a table of sizes and
-one Zstandard stream for each of the six. All three are read, version 3, which more viewers know, is written.
+one Zstandard stream for each of the six. All three are read. Version 3 is written, which more viewers know.
 
 The axes are right, up, back (OpenGL's) unless an extension record names others.
 

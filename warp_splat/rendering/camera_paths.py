@@ -1,4 +1,4 @@
-"""Cameras along a way, for videos: an orbit, a spiral, or a smooth path through the cameras of training."""
+"""Cameras for videos: an orbit, a spiral, or a smooth path through the cameras of training."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def focus_orbit(scene: Scene, count: int, lens: Camera = ORBIT_LENS) -> list[Camera]:
-    """``count`` cameras around the point that the scene's cameras look at, level with it and as far from it as they.
+    """``count`` cameras around the point that the scene's cameras look at, level with it and at their mean distance.
 
     Raises:
         InputError: if there is no such point.
@@ -92,8 +92,8 @@ def focus_orbit(scene: Scene, count: int, lens: Camera = ORBIT_LENS) -> list[Cam
 def spiral_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     """A closed spiral before the scene (Mildenhall et al. 2019, LLFF), looking at what the middle camera looks at.
 
-    The middle camera is the one nearest to all; its radii cover nine tenths of the cameras, but are no more than 0.3 of
-    the distance of the points that it sees, so that cameras all around a thing do not lead the spiral through it.
+    The middle camera is the one nearest to all. The radii cover nine tenths of the cameras. They are at most 0.3 of the
+    distance of the points that the middle camera sees: cameras all around a thing shall not lead the spiral through it.
     """
     cameras = [view.camera for view in scene.train]
     centers = np.stack([camera.center for camera in cameras])
@@ -112,8 +112,8 @@ def spiral_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
 def path_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     """A smooth path through the training cameras: cubic splines of place and rotation, at about equal speed.
 
-    The cameras follow each other as named; where that is a much longer way than a tour from each to the nearest, as
-    with photographs of many authors, they follow the tour. It starts at the first and passes every few of them.
+    The cameras follow each other by name. Photographs of many authors have no such order: where a tour from each to the
+    nearest is much shorter, they follow the tour. It starts at the first and passes every few of them.
 
     Raises:
         InputError: if all cameras are at one place and look one way.

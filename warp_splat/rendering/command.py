@@ -1,4 +1,4 @@
-"""Pictures of a trained model: its views with their metrics, or frames along a way, as a video or timed."""
+"""Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed."""
 
 from __future__ import annotations
 

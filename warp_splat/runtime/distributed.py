@@ -1,8 +1,8 @@
 """Processes that train one model together, as ``torchrun`` starts them: what they exchange, and how they end.
 
-Data parallelism: each process holds the whole model and differentiates another view; the mean of the gradients makes
-the same step everywhere. Nothing is sent afterwards: the models stay the same bytes because every decision is made
-from numbers that are, and :meth:`Processes.check_identical` proves it.
+Data parallelism: each process holds the whole model and differentiates another view. The mean of the gradients makes
+the same step everywhere. Nothing else is sent. The models stay the same bytes, because every decision is made from
+numbers that are the same. :meth:`Processes.check_identical` proves it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Processes:
         rank: number of this process; 0 prints, evaluates and saves.
         count: of all processes; images in a step, by which an iteration number grows.
         local_count: of those on this machine.
-        lost: whether another process went away, so that this one saves whatever its rank.
+        lost: whether another process went away. Then this one saves the model, even if its rank is not 0.
     """
 
     rank, count, local_count, lost = 0, 1, 1, False
@@ -159,8 +159,8 @@ def join(device: str) -> Iterator[Processes]:
             f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
             f"({error}); start several processes with torchrun, or unset it."
         ) from error
-    # torch loads this later anyhow, and functions of it have the group that there is then as a default: nothing would
-    # end it, nor the threads of gloo, which abort a process that shuts down around them
+    # torch loads this later anyhow. Its functions would then keep the group of that moment as a default argument.
+    # Nothing would end that group or its gloo threads, which abort a process that shuts down around them.
     import torch.distributed.nn  # noqa: PLC0415 - only of use here
 
     backend = "gloo"

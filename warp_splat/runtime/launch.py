@@ -1,11 +1,11 @@
 """The only place that calls ``wp.launch``: threads, slices, streams, timers, and views of torch tensors.
 
-A Warp launch on the CPU runs on the thread that makes it and releases the interpreter's lock. Every kernel here takes
+On the CPU, a Warp launch runs on the thread that makes it and releases the interpreter's lock. Every kernel here takes
 the first index of its slice, so that a pool of threads can share a launch. A kernel writes each element from one
-index only; hence the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on torch's
+index only, so the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on torch's
 current stream: kernels of Warp and of torch follow each other in the order of the calls.
 
-All memory is torch's, on either device: what a stage frees, its caching allocator gives to the next.
+All memory is torch's, on either device: its caching allocator gives what a stage frees to the next.
 """
 
 from __future__ import annotations
@@ -47,9 +47,11 @@ _seconds: dict[str, float] | None = None
 class _Job:
     """Slices of one launch, or of other work, shared by the threads: whoever is free takes the next one.
 
-    A launch takes tenths of a millisecond, so what a thread costs counts: the caller waits for helpers that are at
-    work, but not for those that have not woken yet (Tried: an executor's futures, 0.1 ms per launch, 2 ms a step;
-    arguments packed once for all slices, no difference).
+    A launch takes tenths of a millisecond, so what a thread costs counts. The caller waits for helpers that are at
+    work, but not for those that have not woken yet. Tried:
+
+    - 0.1 ms more per launch, 2 ms a step: an executor's futures
+    - no difference: arguments packed once for all slices
     """
 
     def __init__(self, slices: list[Callable[[], None]]):
@@ -166,8 +168,8 @@ def prepare(device: str, threads: int) -> torch.device:
     """
     wp.config.log_level = wp.LOG_ERROR  # no list of devices and modules
     chosen = choose_device(device)
-    # torch: one thread. Its sums would depend on the number of threads, and its idle threads would spin beside ours,
-    # which call torch as well and share its work on many rows (torch_slices)
+    # One thread for torch: its sums would depend on the number of threads, and its idle threads would spin beside ours.
+    # Ours call torch, too, and share its work on many rows (torch_slices).
     torch.set_num_threads(1)
     if threads:
         set_threads(threads)
@@ -233,7 +235,7 @@ def launch(
         inputs: Warp arrays, :func:`view` results, structs or scalars.
         outputs: likewise.
         bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
-        beside: other work, done at the same time where threads share the launch, else before it.
+        beside: other work. Where threads share the launch it is done at the same time, otherwise before.
         device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
@@ -290,8 +292,8 @@ def launch_blocks(
     """Launch ``kernel``, which uses tiles of Warp, on ``blocks`` blocks of BLOCK threads; nothing happens for 0.
 
     With ``adj_inputs`` and ``adj_outputs``, the generated adjoint instead.
-    On the CPU that is a check of the kernels and no way to work: only ``wp.config.enable_cpu_blocks`` makes a block of
-    more than one thread there, out of slow fibers.
+    On the CPU that is a check of the kernels, not a way to work: only ``wp.config.enable_cpu_blocks`` makes a block of
+    more than one thread there, and it makes it of slow fibers.
     """
     if blocks == 0:
         return

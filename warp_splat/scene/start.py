@@ -21,8 +21,9 @@ ROUNDS = 20  # of drawing; a pair of cameras with one place to look at needs a f
 def random_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
     """Points in what at least two cameras see, more of them near by; the same for the same cameras.
 
-    Each is drawn along a random ray of a random camera, its depth log-uniform between DEPTHS times the largest distance
-    of a camera from their mean (1 if all stand at one place). Where no two cameras see the same, one is enough.
+    Each is drawn along a random ray of a random camera. Its depth is log-uniform between DEPTHS times the largest
+    distance of a camera from the cameras' mean (times 1 if all stand at one place). Where no two cameras see the same,
+    one is enough.
 
     Returns:
         Points [P, 3] float32, P = 50,000; gray colors [P, 3] uint8.

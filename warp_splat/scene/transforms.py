@@ -1,7 +1,7 @@
 """Scenes whose cameras are in JSON: nerf-synthetic (Mildenhall et al. 2020), nerfstudio and instant-ngp.
 
-Poses are camera-to-world in OpenGL axes (x right, y up, z backward), in the frame of the points: ``applied_transform``,
-which tells how nerfstudio came there from COLMAP's frame, is ignored, so that coordinates stay those of the file.
+Poses are camera-to-world in OpenGL axes (x right, y up, z backward), in the frame of the points. ``applied_transform``
+tells how nerfstudio came there from COLMAP's frame. It is ignored, so coordinates stay those of the file.
 """
 
 import json
@@ -25,7 +25,7 @@ TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
 ALL = "transforms.json"  # nerfstudio, instant-ngp
 POINTS, HALF_WIDTH = 100_000, 1.3  # graphdeco, scene/dataset_readers.py: "inside the bounds of the synthetic scenes"
 TOLERANCE = 1e-3  # of a pose's axes, for files that round their numbers
-JSON_BYTES = 2**24  # of 20,000 frames; no more than a gigabyte once parsed, whatever is in it
+JSON_BYTES = 2**24  # of 20,000 frames; no JSON of this size takes more than a gigabyte once parsed
 LARGEST = 1e9  # of a number that describes a lens
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 FISHEYE = "OPENCV_FISHEYE"
@@ -42,9 +42,9 @@ def read_transforms(
     """Read the cameras in ``source``, and its points or, for nerf-synthetic, random ones.
 
     Returns:
-        Photos of the training set; those of the test set, empty without transforms_test.json or nerfstudio's lists of
-        names; points [P, 3] float32, for nerf-synthetic 100,000, uniform in [-1.3, 1.3]^3, always the same, for others
-        maybe none; colors [P, 3] uint8.
+        Photos of the training set. Those of the test set: none without transforms_test.json or nerfstudio's lists of
+        names. Points [P, 3] float32: for nerf-synthetic 100,000, uniform in [-1.3, 1.3]^3, always the same; for others
+        there may be none. Colors [P, 3] uint8.
 
     Raises:
         InputError: if a file is missing, cannot be parsed, lacks a key, holds a matrix that is not a pose or a lens

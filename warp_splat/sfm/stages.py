@@ -1,7 +1,7 @@
 """The stages of structure from motion, each with its progress: features, matches, cameras and points, undistortion.
 
-What a stage has found is in the database at once, so that a run that was stopped, by Ctrl-C or kill -9, goes on there;
-a model or a folder of images gets its name only when it is complete.
+What a stage has found is in the database at once. So a run that was stopped, by Ctrl-C or kill -9, goes on there. A
+model or a folder of images gets its name only when it is complete.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from warp_splat.runtime.interrupts import interruptible
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
-# Pairs are matched in blocks of BLOCK x BLOCK images, and Ctrl-C is heard in between. Tried: pycolmap's 50, which takes
-# 36 s for 1,225 pairs of 540 x 960 px instead of 42.
+# Pairs are matched in blocks of BLOCK x BLOCK images, and Ctrl-C is heard in between. Tried:
+# - 36 instead of 42 s for 1,225 pairs of 540 x 960 px: pycolmap's 50
 BLOCK = 10
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 
-SAME_ANGLE = 0.002  # rad; closer to a photograph's camera than this, and this share of the distance to what one looks
-SAME_PLACE = 0.002  # at, counts as being there: a pixel of an image that is 500 px wide
+# What is closer to a photograph's camera than these counts as being there: a pixel of an image that is 500 px wide.
+SAME_ANGLE = 0.002  # rad
+SAME_PLACE = 0.002  # of the distance to what one looks at
 USUAL_WINDOW = (16, 9)
 VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
 

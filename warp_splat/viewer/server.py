@@ -1,8 +1,8 @@
 """The server of the page, by viser: its controls, and the frames that they ask for.
 
-Viser answers browsers in threads of its own. They only note that something changed; every frame is drawn by the one
-thread that calls :meth:`Viewer.draw`, because launches of kernels are not to be made from two. (What is async runs in
-viser's event loop, in order: a browser must not leave before it has entered.)
+Viser answers browsers in threads of its own. They only note that something changed. One thread draws every frame, the
+one that calls :meth:`Viewer.draw`, because two must not launch kernels. What is async runs in viser's event loop, in
+order: a browser must not leave before it has entered.
 """
 
 from __future__ import annotations
