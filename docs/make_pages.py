@@ -29,7 +29,7 @@ INTRODUCTION = """# Every flag
 """
 PRESET_TEXT = """
 ## What presets change
-`--preset fast`, and what training the embedded scene (without `-s`) starts from. A flag that is given goes before.
+`--preset fast`, and what training the embedded scene (without `-s`) starts from. A flag that is given takes precedence.
 """
 
 
