@@ -14,7 +14,7 @@ from blend import Lanes
 from common import interleaved_medians, machine, write_table
 from scenes import blend_scene
 
-from warp_splat.compare.adjoints import peak_memory
+from warp_splat.compare.adjoints import peak_of
 from warp_splat.config import ADJOINTS
 from warp_splat.runtime import launch
 
@@ -38,7 +38,7 @@ def main() -> None:
             driver.adjoint()
 
         both()
-        memory[mode] = peak_memory(both, torch.device("cpu"))
+        memory[mode] = peak_of(both, torch.device("cpu"))
         first = drivers["manual"]
         differences = [(a - b).norm() / b.norm() for a, b in zip(driver.grads, first.grads, strict=True)]
         agreement[mode] = float(max(differences))

@@ -112,7 +112,7 @@ def measure_modes(count: int, width: int, height: int, device: str, repeats: int
 
         try:
             times = [f"{milliseconds(run, device, repeats):.2f}" for run in (forward, both)]
-            memory = f"{adjoints.peak_memory(both, torch.device(device)) / 2**20:.0f}"
+            memory = f"{adjoints.peak_of(both, torch.device(device)) / 2**20:.0f}"
         except InputError:  # stored refuses what does not fit
             times, memory = ["-", "-"], "-"
         rows.append([f"{width} x {height}", count, mode, *times, memory])
@@ -121,7 +121,7 @@ def measure_modes(count: int, width: int, height: int, device: str, repeats: int
 
 def measure_errors(layers: tuple[int, ...], device: str, say) -> list[list]:
     """Error of the worst gradient against float64 and time of the pixel loop, as ``warp-splat compare`` measures."""
-    found = adjoints.measure([layered(count).to(torch.device(device)) for count in layers], ADJOINTS, say)
+    found = adjoints.run_adjoints([layered(count).to(torch.device(device)) for count in layers], ADJOINTS, say)
     return [
         [item.scene, item.variant, f"{item.worst[1]:.1e}", item.worst[0], *_milliseconds(item)]
         for item in found

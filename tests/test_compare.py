@@ -68,9 +68,9 @@ def test_generated_is_right_and_plain_is_not():
 def test_truth_at_some_pixels_is_that_of_the_image():
     given = workload()
     scene = SCENES["degree1"]().to("cpu", torch.float64)
-    whole = oracle.render(*scene.parameters(), scene.camera, scene.background)
+    whole = oracle.exact_render(*scene.parameters(), scene.camera, scene.background)
     few = given.pixels[::7]
-    some = oracle.render(*scene.parameters(), scene.camera, scene.background, pixels=few)
+    some = oracle.exact_render(*scene.parameters(), scene.camera, scene.background, pixels=few)
     rows, columns = few.T
     assert torch.allclose(some.image, whole.image[rows, columns], rtol=0, atol=1e-14)
     assert torch.equal(some.fragile, whole.fragile[rows, columns])
@@ -78,11 +78,11 @@ def test_truth_at_some_pixels_is_that_of_the_image():
 
 def test_error_measures():
     exact = torch.tensor([3.0, -4.0], dtype=torch.float64)
-    error = truth.compare(torch.tensor([3.3, -3.6]), exact)
+    error = truth.error_of(torch.tensor([3.3, -3.6]), exact)
     assert error.relative == pytest.approx(0.1, rel=1e-5) and error.largest == pytest.approx(0.1, rel=1e-5)
     assert error.cosine == pytest.approx((9.9 + 14.4) / (5 * np.hypot(3.3, 3.6)), rel=1e-5)
     assert error.bias == pytest.approx(0.35 / 3.5, rel=1e-5)
-    assert np.isnan(truth.compare(torch.tensor([1e-7]), torch.zeros(1, dtype=torch.float64)).relative)
+    assert np.isnan(truth.error_of(torch.tensor([1e-7]), torch.zeros(1, dtype=torch.float64)).relative)
 
 
 def test_layered_scenes_are_as_deep_as_they_say():
@@ -96,7 +96,7 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     monkeypatch.setattr(knobs, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
     monkeypatch.setattr(plots, "KNOB_STYLES", {"t_min": ("k", "o"), "alpha_min": ("b", "s")})
     scenes = [workloads.layered(10), workload()]
-    measured, lines = adjoints.measure(scenes, ["stepwise"], lambda _: None), []
+    measured, lines = adjoints.run_adjoints(scenes, ["stepwise"], lambda _: None), []
     rows = adjoints.records(measured)
     assert {row["variant"] for row in rows} >= {
         "manual",
@@ -115,7 +115,7 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     plots.plot_errors(tmp_path / "errors.png", measured)
     plots.plot_memory(tmp_path / "memory.png", measured)
     plots.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
-    turned = knobs.measure(scenes, lambda _: None)
+    turned = knobs.run_knobs(scenes, lambda _: None)
     plots.plot_knobs(tmp_path / "knobs.png", turned)
     lines += plots.knob_table(turned).splitlines()
     assert len({len(line) for line in lines}) == 2  # two tables, every line as long as its header
@@ -133,7 +133,7 @@ def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     said = []
     with using(CUDA):
-        measured = adjoints.measure([workloads.layered(10)], ADJOINTS, said.append)
+        measured = adjoints.run_adjoints([workloads.layered(10)], ADJOINTS, said.append)
     names = [item.variant for item in measured]
     assert names == [*ADJOINTS, *(f"cap {cap}" for cap in adjoints.CAPS), "central differences"]
     assert "Left out: generated, plain" in said[0]
@@ -146,7 +146,7 @@ def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
     monkeypatch.setattr("warp_splat.raster.bin.available_memory", lambda device: 2**10)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
-    measured = adjoints.measure([workload()], ["stored"], lambda _: None)
+    measured = adjoints.run_adjoints([workload()], ["stored"], lambda _: None)
     row = next(item for item in measured if item.variant == "stored")
     assert "transmittances" in row.note and not row.backward
     assert "stored" in plots.adjoint_table(measured)

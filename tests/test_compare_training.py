@@ -39,7 +39,7 @@ def test_short_schedule_is_whole_within_its_steps():
 
 def test_run_writes_its_files(tiny, scene, tmp_path):
     said = []
-    results = trained.run(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)
+    results = trained.run_trainings(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)
     assert set(json.loads((tmp_path / "new/training.json").read_text())) == set(results)
     assert results["schedule"]["iterations"] == STEPS
     with open(tmp_path / "new/training.csv", newline="") as file:
@@ -70,7 +70,7 @@ def test_modes_train_alike(scene, monkeypatch):
     losses = []
     for mode in ADJOINTS:
         trainer = trained.make_trainer(scene, {**SCHEDULE, "densify_until_iter": 0}, 0, adjoint=mode)
-        list(trained.train_run(trainer, result := trained.Run("", mode, 0), {}))
+        list(trained.train_run(trainer, result := trained.Trained("", mode, 0), {}))
         losses.append([record["loss"] for record in result.history])
     assert np.mean(losses[0][-5:]) < 0.9 * np.mean(losses[0][:5])
     np.testing.assert_allclose(losses[1:], [losses[0]] * 3, rtol=1e-3)
@@ -80,7 +80,7 @@ def test_cap_of_one_entry_costs_quality(scene):
     qualities = []
     for cap in (None, 1):
         trainer = trained.make_trainer(scene, SCHEDULE, 0, max_steps=cap)
-        list(trained.train_run(trainer, result := trained.Run("", "", 0), {}))
+        list(trained.train_run(trainer, result := trained.Trained("", "", 0), {}))
         qualities.append(result.history[-1]["psnr"])
     assert qualities[1] < qualities[0] - 1
 
@@ -88,7 +88,9 @@ def test_cap_of_one_entry_costs_quality(scene):
 def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
     monkeypatch.setattr("warp_splat.raster.bin.available_memory", lambda device: 0)
     said = []
-    results = trained.run(tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append)
+    results = trained.run_trainings(
+        tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append
+    )
     assert {record["scene"] for record in results["summary"]} == {"embedded", "other"}
     record = results["summary"][1]
     assert record["variant"] == "stored" and "take" in record["refused"]

@@ -185,7 +185,7 @@ def test_differences_are_those_of_the_oracle(name):
     found, scene = subject(name, RasterOptions(depth=True)), SCENES[name]().to("cpu", torch.float64)
     leaves = {key: getattr(scene, key).requires_grad_() for key in INPUTS}
     *geometry, background = leaves.values()
-    truth = oracle.render(*geometry, scene.camera, background)
+    truth = oracle.exact_render(*geometry, scene.camera, background)
     found.weights[truth.fragile] = 0
     picture = found._stack(truth.image, truth.alpha, truth.depth)
     for key in INPUTS:

@@ -1,6 +1,7 @@
 """Imports point downwards: walks the package's imports and finds none that points up."""
 
 import ast
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,14 @@ LAYERS = [
     {"compare", "inspect", "export_html"},
     {"cli", "__init__", "__main__"},
 ]
+
+
+#: What may bear one name in several modules, beside the kernels and drivers of the two devices: it means the same.
+SAME_MEANING = {
+    "command",  # what runs a command, in the folder of each
+    "blend",  # its kernels, its drivers, its torch function
+    "project",  # likewise
+}
 
 
 def layer_of(module: str) -> int:
@@ -71,3 +80,19 @@ def test_only_launch_launches():
     for path in PACKAGE.rglob("*.py"):
         text = path.read_text()
         assert not ("wp.launch(" in text or "wp.launch_tiled(" in text) or path.name == "launch.py", path
+
+
+def test_no_name_has_two_meanings():
+    """Of modules, and of public functions and classes."""
+    places = defaultdict(set)
+    for path in PACKAGE.rglob("*.py"):
+        place = module_of(path).replace("cuda", "cpu")
+        if not path.name.startswith("__"):
+            places[path.stem].add(f"module {place}")
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].add(place)
+    modules = {name: {place for place in found if place.startswith("module ")} for name, found in places.items()}
+    for name, found in places.items():
+        for kind in (modules[name], found - modules[name]):
+            assert len(kind) < 2 or name in SAME_MEANING, f"{name}: {sorted(kind)}"

@@ -26,7 +26,7 @@ def ball(z, sigma, opacity, rgb, camera=CENTRED, background=(0, 0, 0)):
     means = [[0, 0, depth] for depth in z]
     sh = [[[(value - 0.5) / scenes.C0 for value in colour]] for colour in rgb]
     quats = [[1.0, 0, 0, 0]] * count
-    return oracle.render(*double(means, quats, [[s] * 3 for s in sigma], opacity, sh), camera, background)
+    return oracle.exact_render(*double(means, quats, [[s] * 3 for s in sigma], opacity, sh), camera, background)
 
 
 def test_one_gaussian_closed_form():
@@ -114,8 +114,8 @@ def scalar_pixel(splats, row, column, background):
 @pytest.mark.parametrize("name", ["saturated", "opaque", "near_and_behind", "inside", "ties"])
 def test_blending_matches_a_scalar_loop(name):
     scene = scenes.SCENES[name]().to("cpu", torch.float64)
-    image = oracle.render(*scene.parameters(), scene.camera, scene.background).image
-    splats = oracle.project(*scene.parameters(), scene.camera)
+    image = oracle.exact_render(*scene.parameters(), scene.camera, scene.background).image
+    splats = oracle.exact_splats(*scene.parameters(), scene.camera)
     rng = np.random.default_rng(0)
     for row, column in zip(rng.integers(0, 30, 25), rng.integers(0, 33, 25), strict=True):
         expected = scalar_pixel(splats, row, column, scene.background)
@@ -127,7 +127,7 @@ def differentiable(scene, **options):
     leaves = [tensor.clone().requires_grad_() for tensor in [*scene.parameters(), scene.background]]
 
     def images(*inputs):
-        out = oracle.render(*inputs[:5], scene.camera, inputs[5], **options)
+        out = oracle.exact_render(*inputs[:5], scene.camera, inputs[5], **options)
         sure = ~out.fragile
         return out.image * sure[..., None], out.alpha * sure, out.depth * sure
 
@@ -168,13 +168,13 @@ def test_means2d_gradient_is_the_images():
     """A shift of every 2D mean is a shift of the principal point: covariance and colours stay."""
     scene = scenes.SCENES["degree1"]().to("cpu", torch.float64)
     _, leaves = differentiable(scene)
-    out = oracle.render(*leaves[:5], scene.camera, leaves[5])
+    out = oracle.exact_render(*leaves[:5], scene.camera, leaves[5])
     out.means2d.retain_grad()
     out.image.square().sum().backward()
     ends = []
     for step in (1e-6, -1e-6):
         shifted = scenes.replace(scene.camera, cx=scene.camera.cx + step)
-        ends.append(oracle.render(*leaves[:5], shifted, leaves[5]).image.square().sum().item())
+        ends.append(oracle.exact_render(*leaves[:5], shifted, leaves[5]).image.square().sum().item())
     assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(out.means2d.grad[:, 0].sum().item(), rel=1e-5)
 
 
@@ -192,8 +192,8 @@ def test_scene_is_the_same_twice_and_its_order_is_sure(name):
 def facts(name):
     """The oracle's render and projection of a scene."""
     scene = scenes.SCENES[name]().to("cpu", torch.float64)
-    out = oracle.render(*scene.parameters(), scene.camera, scene.background)
-    return scene, out, oracle.project(*scene.parameters(), scene.camera)
+    out = oracle.exact_render(*scene.parameters(), scene.camera, scene.background)
+    return scene, out, oracle.exact_splats(*scene.parameters(), scene.camera)
 
 
 def test_scenes_hold_what_their_names_say():

@@ -54,7 +54,7 @@ def truth(name, options):
     scene = SCENES[name]()
     leaves = leaves_of(scene.to("cpu", torch.float64))
     chosen = {key: getattr(options, key) for key in ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")}
-    out = oracle.render(*[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **chosen)
+    out = oracle.exact_render(*[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **chosen)
     generator = torch.Generator().manual_seed(1)
     upstream = {}
     for key in ("image", "alpha", "depth")[: 3 if options.depth else 2]:
@@ -234,7 +234,7 @@ def test_means2d_carries_gradients_of_its_own(device):
     out = rasterize(scene, leaves)
     weight = torch.randn(120, 2, generator=torch.Generator().manual_seed(2)) * (out.radii.cpu() > 0)[:, None]
     (out.means2d * weight.to(device)).sum().backward()
-    splats = oracle.project(*[exact[key] for key in PARAMETERS], scene.camera)
+    splats = oracle.exact_splats(*[exact[key] for key in PARAMETERS], scene.camera)
     (splats.means2d * weight).sum().backward()
     assert relative_error(leaves["means"].grad, exact["means"].grad) < 1e-5
 
@@ -255,7 +255,7 @@ def test_one_output_alone(key, device):
     scene, weight = expected.scene, expected.upstream[key]
     leaves, exact = leaves_of(scene.to(device)), leaves_of(scene.to("cpu", torch.float64))
     gradients = backward(rasterize(scene, leaves, RasterOptions(depth=True)), {key: weight.to(device)}, leaves)
-    out = oracle.render(*[exact[name] for name in PARAMETERS], scene.camera, exact["background"])
+    out = oracle.exact_render(*[exact[name] for name in PARAMETERS], scene.camera, exact["background"])
     for name, value in backward(out, {key: weight}, exact).items():
         if value is not None and value.abs().max() > 0:
             assert relative_error(gradients[name], value) < GRADIENT, name

@@ -36,15 +36,15 @@ def small_truth():
 
 def broken(monkeypatch, change):
     """The outcome of the ordinary case when ``change`` is done to the renderer's output."""
-    draw = verdict.draw
+    draw = verdict.draw_case
 
     def drawn(*arguments):
         out = draw(*arguments)
         change(out)
         return out
 
-    monkeypatch.setattr(verdict, "draw", drawn)
-    return verdict.compare(small_truth(), "manual")
+    monkeypatch.setattr(verdict, "draw_case", drawn)
+    return verdict.judge(small_truth(), "manual")
 
 
 def spoil(value):
@@ -65,14 +65,14 @@ def test_a_wrong_pixel_fails(monkeypatch, value):
 
 
 def test_a_wrong_gradient_fails(monkeypatch):
-    differentiate = verdict.differentiate
+    differentiate = verdict.gradients_by_name
 
     def scaled(*arguments):
         return {name: value * (1.001 if name == "scales" else 1) for name, value in differentiate(*arguments).items()}
 
     truth = small_truth()
-    monkeypatch.setattr(verdict, "differentiate", scaled)
-    failures = verdict.compare(truth, "manual").failures
+    monkeypatch.setattr(verdict, "gradients_by_name", scaled)
+    failures = verdict.judge(truth, "manual").failures
     assert len(failures) == 1 and "scales" in failures[0]
 
 
@@ -90,7 +90,7 @@ def test_a_gaussian_that_should_be_left_out_fails():
     truth = small_truth()
     drawn = int(truth.out.touches.nonzero()[0])
     stated = replace(truth, problem=replace(truth.problem, left_out=(drawn,)))
-    assert any("left out" in failure for failure in verdict.compare(stated, "manual").failures)
+    assert any("left out" in failure for failure in verdict.judge(stated, "manual").failures)
 
 
 def test_the_condition_of_an_ordinary_problem_is_within_the_usual_limits():
@@ -159,7 +159,7 @@ def test_run_writes_and_counts(tmp_path, monkeypatch):
     failing = verdict.Outcome("nothing", 1.0, 0.0, None, 0.0, "-", ("stated, and not so",))
     monkeypatch.setattr(cases, "CASES", (*chains, wrong))
     lines = []
-    assert cases.run(tmp_path / "out", ["manual"], lines.append) == 1
+    assert cases.run_cases(tmp_path / "out", ["manual"], lines.append) == 1
     assert "FAIL" in lines[0] and any("stated, and not so" in line for line in lines)
     verdicts = json.loads((tmp_path / "out/stability.json").read_text())["verdicts"]
     with (tmp_path / "out/stability.csv").open(newline="") as file:

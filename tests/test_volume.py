@@ -225,7 +225,7 @@ def test_run_writes_its_files(tmp_path, monkeypatch):
     monkeypatch.setattr(measure, "SCENES", scenes)
     monkeypatch.setattr(measure, "PICTURED", tuple(scenes))
     said = []
-    results = measure.run(tmp_path / "new", said.append)
+    results = measure.compare_with_physics(tmp_path / "new", said.append)
     assert {record["rung"] for record in results["ladder"]} == set(measure.PARENT)
     assert "unstable" in "\n".join(said)
     assert set(json.loads((tmp_path / "new/volume.json").read_text())) == set(results)

@@ -56,7 +56,7 @@ COMMANDS = {
         "export_html.command.export_html",
         "write a page that shows a model in any browser",
     ),
-    "compare": (CompareConfig, "compare.command.compare", "compare adjoints, knobs and models: error against run time"),
+    "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }
 
 

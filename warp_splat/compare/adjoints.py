@@ -76,7 +76,7 @@ def variants_of(modes: Sequence[str], device: torch.device) -> list[Variant]:
     return found + [Variant(f"cap {cap}", "manual", {"max_steps": cap}) for cap in CAPS]
 
 
-def measure(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[str], None]) -> list[Measurement]:
+def run_adjoints(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[str], None]) -> list[Measurement]:
     """Every variant on every workload, and central differences."""
     results = []
     if any(workload.device.type != "cpu" for workload in workloads):
@@ -104,7 +104,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     result.errors = errors_of(gradients, truth)
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
-    result.memory = peak_memory(lambda: _differentiate(workload, variant), workload.device)
+    result.memory = peak_of(lambda: _differentiate(workload, variant), workload.device)
     return result
 
 
@@ -133,7 +133,7 @@ def _differentiate(workload: Workload, variant: Variant) -> None:
     out.image.backward(torch.ones_like(out.image))
 
 
-def peak_memory(run: Callable[[], object], device: torch.device) -> int:
+def peak_of(run: Callable[[], object], device: torch.device) -> int:
     """Largest sum of bytes on ``device`` that torch allocated and had not yet freed during ``run``."""
     if device.type == "cuda":
         before = torch.cuda.memory_allocated(device)
@@ -195,9 +195,9 @@ def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:
             "bias": error.bias,
             "image_error": item.image_error,
             "forward_seconds": median(item.forward),
-            "forward_spread": spread(item.forward),
+            "forward_spread": half_range(item.forward),
             "backward_seconds": median(item.backward),
-            "backward_spread": spread(item.backward),
+            "backward_spread": half_range(item.backward),
             "peak_memory": item.memory,
             "note": item.note,
         }
@@ -211,6 +211,6 @@ def median(seconds: Sequence[float]) -> float | None:
     return float(np.median(seconds)) if seconds else None
 
 
-def spread(seconds: Sequence[float]) -> float | None:
+def half_range(seconds: Sequence[float]) -> float | None:
     """Half of the range between the quartiles, or None."""
     return float(np.subtract(*np.percentile(seconds, [75, 25])) / 2) if seconds else None

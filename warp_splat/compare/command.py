@@ -24,7 +24,7 @@ from warp_splat.scene.types import Scene
 DIRECTIONS = 4  # per parameter
 
 
-def compare(config: CompareConfig) -> int:
+def run(config: CompareConfig) -> int:
     """Run the comparison that ``config`` asks for; returns the process's exit code (1 if a stability verdict failed).
 
     Raises:
@@ -53,15 +53,15 @@ def compare(config: CompareConfig) -> int:
         log.append(text)
 
     if config.stability:
-        name, code = "stability", 1 if cases.run(out, config.modes, say) else 0
+        name, code = "stability", 1 if cases.run_cases(out, config.modes, say) else 0
     elif config.volume:
         name, code = "volume", 0
-        measure.run(out, say)
+        measure.compare_with_physics(out, say)
     else:
         name, code = "compare", 0
         scenes = named_scenes(config.scene, print)
         _compare_pixel_loops(config, scenes, device, out, say)
-        trained.run(out, config.modes, scenes, config.full, say, device.type)
+        trained.run_trainings(out, config.modes, scenes, config.full, say, device.type)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {launch.get_threads()} threads.")
     with atomic_write(out / f"{name}.txt") as path:
@@ -76,14 +76,14 @@ def _compare_pixel_loops(
     """Adjoints on every workload; knobs on the layered scene and those trained longest."""
     print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
     workloads = all_workloads(scenes, device, say)
-    measured = adjoints.measure(workloads, config.modes, say)
+    measured = adjoints.run_adjoints(workloads, config.modes, say)
     say(f"\n{plots.adjoint_table(measured)}\n")
     _write(out, "adjoints", measured)
     plots.plot_errors(out / "adjoints.png", measured)
     plots.plot_memory(out / "memory.png", measured)
     plots.plot_stages(out / "stages.png", measured, config.modes)
     _check_directions(workloads, out, say)
-    turned = knobs.measure(_for_knobs(workloads), say)
+    turned = knobs.run_knobs(_for_knobs(workloads), say)
     say(f"\n{plots.knob_table(turned)}\n")
     _write(out, "knobs", turned)
     plots.plot_knobs(out / "knobs.png", turned)

@@ -35,7 +35,7 @@ def variants() -> list[Variant]:
     ]
 
 
-def measure(workloads: Sequence[Workload], say: Callable[[str], None]) -> list[Measurement]:
+def run_knobs(workloads: Sequence[Workload], say: Callable[[str], None]) -> list[Measurement]:
     """Every setting on every workload."""
     results = []
     for workload in workloads:

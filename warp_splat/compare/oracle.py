@@ -126,7 +126,7 @@ def outlines(points, sigma, live, camera):
     return centre.clone(), (dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]) / OUTLINE**2
 
 
-def project(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
+def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
     """Gaussians as the camera sees them."""
     world_to_camera = torch.as_tensor(camera.rotation.copy(), dtype=torch.float64)
     translation = torch.as_tensor(camera.translation.copy(), dtype=torch.float64)
@@ -211,7 +211,7 @@ def _culling(splats, alpha, order, camera, alpha_min):
     return touches, inside, reach
 
 
-def render(
+def exact_render(
     means,
     quats,
     scales,
@@ -235,7 +235,7 @@ def render(
     shape = (camera.height, camera.width) if pixels is None else (len(pixels),)
     if pixels is None:
         pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width))
-    splats = project(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing, projection)
+    splats = exact_splats(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing, projection)
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]

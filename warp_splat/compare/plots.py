@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import LogLocator, NullLocator
 
-from warp_splat.compare.adjoints import Measurement, median, spread
+from warp_splat.compare.adjoints import Measurement, half_range, median
 from warp_splat.compare.knobs import KNOBS
 from warp_splat.compare.workloads import CANDIDATES
 from warp_splat.evaluation import report
@@ -202,5 +202,5 @@ def _number(value: float | None, pattern: str) -> str:
 def _milliseconds(seconds: Sequence[float]) -> str:
     if not seconds:
         return "-"
-    value, around = 1e3 * (median(seconds) or 0.0), 1e3 * (spread(seconds) or 0.0)
+    value, around = 1e3 * (median(seconds) or 0.0), 1e3 * (half_range(seconds) or 0.0)
     return f"{value:.2f} ± {around:.2f}" if len(seconds) > 1 else f"{value:.1e}"

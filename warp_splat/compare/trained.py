@@ -63,7 +63,7 @@ COLUMNS = (  # header, key of a summary's record, format
 
 
 @dataclass
-class Run:
+class Trained:
     """One training, or a trained model rendered in another way; NaN where there is no number."""
 
     scene: str
@@ -81,7 +81,7 @@ class Run:
     pictures: list[np.ndarray] = field(default_factory=list)  # of the views, [H, W, 3] uint8; first seed only
 
 
-def run(
+def run_trainings(
     out: Path,
     modes: Sequence[str],
     scenes: Mapping[str, Scene],
@@ -110,7 +110,7 @@ def run(
     variants: dict[str, dict[str, Any]] = {name: {"adjoint": name} for name in names}
     variants |= {f"cap {cap}": {"max_steps": cap} for cap in CAPS} | {"ellipsoid": {"projection": "ellipsoid"}}
     results: dict[str, Any] = {"schedule": schedule, "runs": [], "summary": [], "equality": {}}
-    runs: list[Run] = []
+    runs: list[Trained] = []
     for name, loaded in scenes.items():
         say(f"\nTraining on {name}, {schedule['iterations']} steps\n")
         found = train_all(loaded, name, variants, names, schedule, say)
@@ -127,7 +127,9 @@ def run(
     return results
 
 
-def train_all(scene: Scene, name: str, variants: Mapping, seeded: Sequence[str], schedule: Mapping, say) -> list[Run]:
+def train_all(
+    scene: Scene, name: str, variants: Mapping, seeded: Sequence[str], schedule: Mapping, say
+) -> list[Trained]:
     """Train every variant with the first seed and those ``seeded`` with all.
 
     The variants of a seed take their steps in turn, so that a disturbance of the machine meets all alike.
@@ -137,7 +139,7 @@ def train_all(scene: Scene, name: str, variants: Mapping, seeded: Sequence[str],
         with suppress(InputError):  # the run itself will tell
             make_trainer(scene, schedule, SEEDS[0], **options).warm_up()
     for seed in SEEDS:
-        results = [Run(name, variant, seed) for variant in (variants if seed == SEEDS[0] else seeded)]
+        results = [Trained(name, variant, seed) for variant in (variants if seed == SEEDS[0] else seeded)]
         trainers = [make_trainer(scene, schedule, seed, **variants[result.variant]) for result in results]
         trainings = [train_run(*pair, reference) for pair in zip(trainers, results, strict=True)]
         for _ in range(schedule["iterations"]):
@@ -155,7 +157,7 @@ def train_all(scene: Scene, name: str, variants: Mapping, seeded: Sequence[str],
             say(f"seed {seed}, {result.variant}: {result.refused or f'{result.psnr:.2f} dB'}")
         for cap in CAPS:  # what a cap costs that training knew nothing of
             trainers[0].options = replace(trainers[0].options, max_steps=cap)
-            rendered.append(Run(name, f"cap {cap}, rendering only", seed))
+            rendered.append(Trained(name, f"cap {cap}, rendering only", seed))
             _judge(trainers[0], rendered[-1])
         runs += results
     return runs + rendered
@@ -168,7 +170,7 @@ def make_trainer(scene: Scene, schedule: Mapping, seed: int, max_steps: int | No
     return trainer
 
 
-def train_run(trainer: Trainer, result: Run, reference: dict[int, torch.Tensor]) -> Iterator[None]:
+def train_run(trainer: Trainer, result: Trained, reference: dict[int, torch.Tensor]) -> Iterator[None]:
     """Train, a step at a time, and note in ``result`` how it goes; ``reference`` keeps parameters of the first run."""
     last, views, seconds, losses = trainer.config.learn.iterations, _views(trainer.scene), 0.0, []
     checks = {last * k // EVALUATIONS for k in range(1, EVALUATIONS + 1)}
@@ -190,7 +192,7 @@ def train_run(trainer: Trainer, result: Run, reference: dict[int, torch.Tensor])
         yield
 
 
-def _judge(trainer: Trainer, result: Run) -> None:
+def _judge(trainer: Trainer, result: Trained) -> None:
     """Quality of the present model as the trainer's options render it, and the lengths of its tile lists."""
     views = _views(trainer.scene)
     pictures = [trainer.picture(view.camera) for view in views]
@@ -216,7 +218,7 @@ def _views(scene: Scene) -> list[View]:
     return held_out[:: -(-len(held_out) // VIEWS)]
 
 
-def summarize(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def summarize(runs: Sequence[Trained]) -> list[dict[str, Any]]:
     """A record for each variant: means over its seeds, and its gain and cost against manual with the same seed."""
     manual, records = {r.seed: r for r in runs if r.variant == "manual"}, []
     for variant in dict.fromkeys(r.variant for r in runs):
@@ -239,7 +241,7 @@ def _table(records: Sequence[Mapping[str, Any]]) -> str:
     return format_table(["variant", *(header for header, *_ in COLUMNS)], rows)
 
 
-def compare_modes(runs: Sequence[Run], modes: Sequence[str]) -> dict[str, Any]:
+def compare_modes(runs: Sequence[Trained], modes: Sequence[str]) -> dict[str, Any]:
     """How far modes and how far seeds lie apart; without the modes refused, and empty if that leaves fewer than two."""
     runs = [r for r in runs if r.variant not in {r.variant for r in runs if r.refused}]
     of = {mode: chosen for mode in modes if (chosen := [r for r in runs if r.variant == mode])}
@@ -272,7 +274,7 @@ def _verdict(equality: Mapping[str, Any]) -> str:
     ) + format_table(["steps", "parameters between", "largest difference", "rms difference"], rows)
 
 
-def plot_modes(path: Path, runs: Sequence[Run], modes: Sequence[str]) -> None:
+def plot_modes(path: Path, runs: Sequence[Trained], modes: Sequence[str]) -> None:
     """Draw PSNR over iterations and over seconds of training steps, by scene: mean and range of the seeds."""
     scenes = list(dict.fromkeys(r.scene for r in runs))
     figure = report.new_figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
@@ -291,7 +293,7 @@ def plot_modes(path: Path, runs: Sequence[Run], modes: Sequence[str]) -> None:
     report.save_figure(figure, path)
 
 
-def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Run]) -> None:
+def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Trained]) -> None:
     """Draw the view that the smallest cap hurts most: photograph, render and error without the cap and with it."""
     cap, of = f"cap {CAPS[-1]}", {r.variant: r.pictures for r in runs if r.pictures}
     losses = [psnr(a, v.picture) - psnr(b, v.picture) for a, b, v in zip(of["manual"], of[cap], views, strict=True)]

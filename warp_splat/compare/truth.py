@@ -44,7 +44,7 @@ def compute_truth(workload: Workload) -> Truth:
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
     keys = ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")
     chosen = {key: getattr(options, key) for key in keys}
-    out = oracle.render(*leaves[:5], workload.camera, leaves[5], **chosen, pixels=workload.pixels)
+    out = oracle.exact_render(*leaves[:5], workload.camera, leaves[5], **chosen, pixels=workload.pixels)
     weights = torch.randn(out.image.shape, generator=torch.Generator().manual_seed(1))
     weights[out.fragile] = 0.0
     out.means2d.retain_grad()
@@ -75,10 +75,10 @@ def gradients_of(
 
 def errors_of(found: dict[str, torch.Tensor], truth: Truth) -> dict[str, Error]:
     """The error of each parameter's gradient."""
-    return {name: compare(found[name], exact) for name, exact in truth.gradients.items()}
+    return {name: error_of(found[name], exact) for name, exact in truth.gradients.items()}
 
 
-def compare(found: torch.Tensor, exact: torch.Tensor) -> Error:
+def error_of(found: torch.Tensor, exact: torch.Tensor) -> Error:
     """How far ``found`` is from ``exact``; NaN where the truth is zero but for rounding."""
     found, exact = found.double().flatten(), exact.flatten()
     if exact.norm() < ZERO:

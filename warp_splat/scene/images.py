@@ -39,7 +39,7 @@ class Photo:
     mask: Path | None = None  # an image of what counts
 
 
-class Pixels(NamedTuple):
+class LoadedImage(NamedTuple):
     """A decoded file."""
 
     color: np.ndarray  # [H, W, 3] float32, on the background
@@ -103,7 +103,7 @@ def read_rgb(path: Path, background: float) -> np.ndarray:
     return read_pixels(path, background).color
 
 
-def read_pixels(path: Path, background: float) -> Pixels:
+def read_pixels(path: Path, background: float) -> LoadedImage:
     """Read an image, 0..1 or in linear light; gray becomes RGB, alpha is composited on ``background``.
 
     Raises:
@@ -120,11 +120,11 @@ def read_pixels(path: Path, background: float) -> Pixels:
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
     linear = spec.format.basetype in FLOATS or _text(spec.get_string_attribute, "oiio:ColorSpace").startswith("lin")
     if spec.alpha_channel < 0:
-        return Pixels(color, None, linear)
+        return LoadedImage(color, None, linear)
     alpha = pixels[..., spec.alpha_channel]
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha")
     color = (color * alpha[..., None] if straight else color) + (1 - alpha[..., None]) * np.float32(background)
-    return Pixels(color, alpha if alpha.min() < 1 else None, linear)
+    return LoadedImage(color, alpha if alpha.min() < 1 else None, linear)
 
 
 def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:

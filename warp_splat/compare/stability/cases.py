@@ -39,7 +39,7 @@ class Row:
         return "FAIL" if len(failed) == len(self.outcomes) else f"FAIL {', '.join(failed)}"
 
 
-def run(out: Path, modes: Sequence[str], say: Callable[[str], None] = print) -> int:
+def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = print) -> int:
     """Measure every case in every mode; print the table, write it and the plot.
 
     Args:

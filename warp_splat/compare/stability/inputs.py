@@ -33,7 +33,7 @@ def look(
     return Camera(width, height, focal, focal, **principal, rotation=rotation, translation=-rotation @ np.array(center))
 
 
-def spread(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
+def distinct_depths(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
     """``count`` numbers in random order, no two closer than half an even spacing: depths that cannot swap."""
     step = (high - low) / max(count, 1)
     return low + step * (rng.permutation(count) + rng.uniform(0.25, 0.75, count))
@@ -71,7 +71,7 @@ def cloud(
         aspect: least ratio of the other standard deviations to the largest.
     """
     rng = np.random.default_rng(seed)
-    z = spread(rng, count, *depth) if isinstance(depth, tuple) else depth
+    z = distinct_depths(rng, count, *depth) if isinstance(depth, tuple) else depth
     pixels = rng.uniform(-0.1, 1.1, (count, 2)) * [camera.width, camera.height]
     size = np.exp(rng.uniform(*np.log(sigma), count)) * np.abs(z) / camera.fx
     ratios = np.exp(rng.uniform(np.log(aspect), 0, (count, 3)))

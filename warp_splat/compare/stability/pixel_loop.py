@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from warp_splat.compare.stability import verdict as check
-from warp_splat.compare.stability.inputs import at_pixels, cloud, look, spread, tensors
+from warp_splat.compare.stability.inputs import at_pixels, cloud, distinct_depths, look, tensors
 from warp_splat.compare.stability.verdict import EPS, GRADIENT_LIMIT, Case, Outcome, Problem, rendered, truth
 from warp_splat.config import T_MIN, RasterOptions
 
@@ -31,12 +31,12 @@ def clamp() -> Problem:
     camera = look(8, 8, seed=None, center=(0, 0, 0))
     arrays = cloud(2, 24, camera, opacity=(0.99, 0.99), sigma=(0.8, 1.5))
     pixels = np.stack([np.arange(24) % 8 + 0.5, np.arange(24) // 8 * 2 + 0.5], 1)
-    arrays["means"] = at_pixels(pixels, spread(np.random.default_rng(2), 24, 2, 8), camera)
+    arrays["means"] = at_pixels(pixels, distinct_depths(np.random.default_rng(2), 24, 2, 8), camera)
     arrays["opacities"] = np.float32(0.99) + np.arange(-12, 12) * np.float64(np.spacing(np.float32(0.99)))
     return Problem(tensors(arrays), camera, continuous=True)
 
 
-def opaque() -> Problem:
+def opacity_one() -> Problem:
     """Opacity 1 everywhere: every pixel stops after one or two."""
     camera = look()
     return Problem(tensors(cloud(3, 60, camera, opacity=(1.0, 1.0))), camera)
@@ -84,7 +84,7 @@ def stop_edge(mode: str) -> Outcome:
     chosen, counts = [], [0, 0]
     for steps, builds in EDGES.items():
         asked = edge(steps, 1.0)
-        outcomes = [check.compare(replace(truth(build), problem=asked), mode) for build in builds]
+        outcomes = [check.judge(replace(truth(build), problem=asked), mode) for build in builds]
         decision = int(outcomes[1].value_error < outcomes[0].value_error)
         counts[decision] += 1
         chosen.append(outcomes[decision])
@@ -108,8 +108,8 @@ def huge_upstream() -> Problem:
 def _gradients(upstream: tuple[torch.Tensor, torch.Tensor], mode: str):
     problem = truth(ordinary).problem
     leaves = check.leaves_of(problem, torch.float32)
-    out = check.draw(problem, leaves, mode)
-    return out, check.differentiate(out, upstream, leaves)
+    out = check.draw_case(problem, leaves, mode)
+    return out, check.gradients_by_name(out, upstream, leaves)
 
 
 def zero_upstream(mode: str) -> Outcome:
@@ -148,7 +148,7 @@ def nan_upstream(mode: str) -> Outcome:
 CASES = (
     rendered("logits_100", "blending", "sigmoid saturates; alpha is clamped, or below the cut", logits),
     rendered("clamp_0.99", "blending", "alpha within rounding of the clamp: the image has no step there", clamp),
-    rendered("opacity_1", "blending", "clamped at 0.99, no gradient through the clamp", opaque),
+    rendered("opacity_1", "blending", "clamped at 0.99, no gradient through the clamp", opacity_one),
     *(
         rendered(
             f"chain_{layers}",

@@ -36,7 +36,7 @@ def stretched(power: int, flat: bool, longest: float = 60.0, options: RasterOpti
     return Problem(tensors(arrays), camera, options or RasterOptions())
 
 
-def log_scales() -> Problem:
+def extreme_logs() -> Problem:
     """Logarithms of scales of +100 (exp overflows) and -100 (a point) among ordinary ones."""
     camera = look()
     arrays = cloud(30, 40, camera)
@@ -118,7 +118,7 @@ def not_finite() -> Problem:
     return Problem(tensors(arrays), camera, left_out=tuple(range(12)), invalid=12)
 
 
-def inside(options: RasterOptions) -> Problem:
+def enclosed(options: RasterOptions) -> Problem:
     """The camera within Gaussians of 0.3 to 5 units whose centers are nearer, farther and behind."""
     camera = look(seed=None, center=(0, 0, 0))
     rng = np.random.default_rng(36)
@@ -189,7 +189,7 @@ CASES = (
         "ratio 1e4, 300 px long, antialiased: the ratio of determinants has no cancellation",
         functools.partial(stretched, 4, False, 300.0, ANTIALIASED),
     ),
-    rendered("log_scales_100", "shape", "+100: left out and counted; -100: a point, as in float64", log_scales),
+    rendered("log_scales_100", "shape", "+100: left out and counted; -100: a point, as in float64", extreme_logs),
     rendered("scales_1e38", "shape", "too large to square: left out and counted", too_large),
     rendered("quats_0", "shape", "no direction: left out and counted", zero_quats),
     *(
@@ -207,12 +207,12 @@ CASES = (
     rendered("near_plane", "camera", "at 0.2 and before left out, after drawn", near_plane),
     rendered("behind", "camera", "left out", behind),
     rendered("equal_depths", "camera", "ordered by index", equal_depths),
-    rendered("inside", "camera", "drawn or left out by the center's depth alone", functools.partial(inside, AFFINE)),
+    rendered("inside", "camera", "drawn or left out by the center's depth alone", functools.partial(enclosed, AFFINE)),
     rendered(
         "inside_ellipsoid",
         "camera",
         "left out too where the ellipsoid of three sigma reaches the camera's plane: no outline",
-        functools.partial(inside, ELLIPSOID),
+        functools.partial(enclosed, ELLIPSOID),
     ),
     *(
         rendered(f"fov_{degrees}{kind}", "camera", "as in float64", functools.partial(field_of_view, degrees, options))

@@ -88,7 +88,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class Expected:
     """Float64's answer, on all N rows: zero gradients for what is left out or overflows."""
 
     problem: Problem
@@ -117,7 +117,7 @@ def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> Gaussians:
     return model.activated()
 
 
-def draw(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> api.RenderOutput:
+def draw_case(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> api.RenderOutput:
     """The package's render; without the checks of arguments, as in training, where something is left out."""
     gaussians = activated(problem, leaves)
     if problem.invalid:
@@ -132,7 +132,7 @@ def draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Re
     """The oracle's render of all rows given."""
     *geometry, sh_dc, sh_rest = activated(problem, leaves)
     options = problem.options
-    return oracle.render(
+    return oracle.exact_render(
         *geometry,
         torch.cat([sh_dc, sh_rest], 1),
         problem.camera,
@@ -145,7 +145,7 @@ def draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Re
     )
 
 
-def differentiate(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def gradients_by_name(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Gradients of all leaves and of means2d."""
     wanted = leaves | {"means2d": out.means2d}
     gradients = torch.autograd.grad([out.image, out.alpha], list(wanted.values()), list(upstream))
@@ -162,7 +162,7 @@ def upstream_of(problem: Problem, fragile: torch.Tensor) -> tuple[torch.Tensor, 
 
 
 @functools.cache
-def truth(build: Callable[[], Problem]) -> Truth:
+def truth(build: Callable[[], Problem]) -> Expected:
     """What float64 says of the input, and the limits; computed once per input."""
     problem = build()
     count = len(problem.gaussians["means"])
@@ -171,7 +171,7 @@ def truth(build: Callable[[], Problem]) -> Truth:
     leaves = leaves_of(drawn, torch.float64)
     out = draw_exactly(drawn, leaves)
     upstream = upstream_of(problem, out.fragile)
-    gradients = differentiate(out, tuple(weight.double() for weight in upstream), leaves)
+    gradients = gradients_by_name(out, tuple(weight.double() for weight in upstream), leaves)
     moved_image, moved = _condition(drawn, out, upstream, gradients) if problem.conditioned else (0.0, {})
 
     overflows = torch.zeros(count, dtype=torch.bool)
@@ -184,7 +184,7 @@ def truth(build: Callable[[], Problem]) -> Truth:
     says = _summary(out.image.detach(), gradients)
     for name in problem.gaussians:
         gradients[name][overflows] = 0
-    return Truth(
+    return Expected(
         problem,
         says,
         replace(out, image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach()),
@@ -215,7 +215,7 @@ def _condition(problem: Problem, out, upstream, gradients) -> tuple[float, dict[
         nudged = replace(camera, rotation=rotation, translation=-rotation @ camera.center, **lens)
         other = draw_exactly(replace(problem, camera=nudged), leaves)
         image = max(image, _pixel_errors(other, out)[~out.fragile].max().item())
-        for name, value in differentiate(other, tuple(weight.double() for weight in upstream), leaves).items():
+        for name, value in gradients_by_name(other, tuple(weight.double() for weight in upstream), leaves).items():
             moved[name] = max(moved[name], relative_error(value, gradients[name], problem.gain))
     return image, moved
 
@@ -237,12 +237,12 @@ def _pixel_errors(out, exact: oracle.Render) -> torch.Tensor:
     return torch.maximum((out.image - exact.image).abs().amax(2), (out.alpha - exact.alpha).abs()).detach().double()
 
 
-def compare(expected: Truth, mode: str) -> Outcome:
+def judge(expected: Expected, mode: str) -> Outcome:
     """Render, differentiate and judge."""
     problem, exact = expected.problem, expected.out
     leaves = leaves_of(problem, torch.float32)
-    out = draw(problem, leaves, mode)
-    gradients = differentiate(out, expected.upstream, leaves)
+    out = draw_case(problem, leaves, mode)
+    gradients = gradients_by_name(out, expected.upstream, leaves)
     failures = []
 
     def demand(holds: bool, statement: str) -> None:
@@ -293,4 +293,4 @@ def _summary(image: torch.Tensor, gradients: dict[str, torch.Tensor]) -> str:
 
 def rendered(name: str, group: str, claim: str, build: Callable[[], Problem]) -> Case:
     """A case that compares a render and its gradients with the oracle's."""
-    return Case(name, group, claim, lambda mode: compare(truth(build), mode))
+    return Case(name, group, claim, lambda mode: judge(truth(build), mode))

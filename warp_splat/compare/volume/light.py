@@ -236,7 +236,7 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
     order = np.argsort(volume.means @ camera.forward, kind="stable")
 
     def footprint(projection: str, blur: float) -> np.ndarray:
-        return peak * _falloff(oracle.project(*scene, camera, projection=projection), camera, blur)
+        return peak * _falloff(oracle.exact_splats(*scene, camera, projection=projection), camera, blur)
 
     alphas = {
         "no overlap": -np.expm1(-exact),
@@ -247,7 +247,7 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
         "affine + blur": -np.expm1(-footprint("affine", oracle.BLUR)),
     }
     images = {name: _composite(alpha[:, order], volume, order, camera) for name, alpha in alphas.items()}
-    images["3DGS"] = oracle.render(*scene, camera, background=torch.from_numpy(volume.background)).image.numpy()
+    images["3DGS"] = oracle.exact_render(*scene, camera, background=torch.from_numpy(volume.background)).image.numpy()
     return images
 
 

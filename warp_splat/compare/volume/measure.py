@@ -33,7 +33,7 @@ from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.text import format_table
 
 
-def run(out: Path, say: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
+def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
     """Measure everything; takes about half a minute on one core.
 
     Args:
