@@ -7,20 +7,13 @@ from functools import partial
 from typing import Any
 
 
-def flag(
-    default: Any,
-    help: str,
-    *names: str,
-    choices: tuple | None = None,
-    many: type | None = None,
-    least: int | None = None,
-    group: str = "",
-) -> Any:
+def flag(default: Any, help: str, *names: str, **metadata: Any) -> Any:
     """A dataclass field that is also a command-line flag: its default, its help, further names.
 
-    Without a ``group`` it is one of the few that ``--help`` lists first.
+    ``metadata`` may have ``choices``, a tuple; ``many``, the type of a list's elements; ``least``, the smallest
+    whole number if that is not 0. Without a ``group`` it is one of the few that ``--help`` lists first.
     """
-    metadata = {"help": help, "names": names, "choices": choices, "many": many, "least": least, "group": group}
+    metadata = {"help": help, "names": names, "choices": None, "many": None, "group": "", **metadata}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -42,7 +35,7 @@ machinery = partial(flag, group="where it is computed")
 
 def flags_of(config_type: Any) -> list[Field]:
     """The flags of a configuration, or of its groups, heading by heading."""
-    groups = config_type.groups().values() if hasattr(config_type, "groups") else [config_type]
+    groups = config_type.groups() if hasattr(config_type, "groups") else [config_type]
     found = [item for group in groups for item in fields(group)]
     headings = list(dict.fromkeys([None, "", *(item.metadata["group"] for item in found)]))
     return sorted(found, key=lambda item: headings.index(item.metadata["group"]))

@@ -11,6 +11,7 @@ import torch
 
 from warp_splat.config import TILE
 from warp_splat.runtime.launch import available_memory
+from warp_splat.training.seams import having
 from warp_splat.training.trainer import Trainer
 
 FLOAT, GIB = 4, 2**30  # bytes
@@ -92,7 +93,7 @@ def describe(trainer: Trainer) -> str:
     grows, limit = trainer.growth.grows(config.learn.iterations), config.grow.max_gaussians
     count, reason = expected_gaussians(len(trainer.model), pixels, limit, grows)
     masked = any(view.mask is not None for view in scene.train)
-    composited = any(part.reads_alpha for part in trainer.parts) and any(view.alpha is not None for view in scene.train)
+    composited = any(having(trainer.parts, "reads_alpha")) and any(view.alpha is not None for view in scene.train)
     per_pixel = pixel_floats(masked, composited, scene.linear)
 
     def step(gaussians: int) -> int:

@@ -20,7 +20,9 @@ class DataOptions:
     )
     sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
-    resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r")
+    resolution: int = flag(
+        -1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r", least=-1
+    )
     preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
     start_checkpoint: str = flag(
         "", "continue a training: its folder, or a checkpoint; options are the same but for those given", "--resume"
@@ -67,7 +69,7 @@ class LearnOptions:
     opacity_lr: float = learning(0.025, "rate of the opacity logits")
     scaling_lr: float = learning(0.005, "rate of the log scales")
     rotation_lr: float = learning(0.001, "rate of the quaternions")
-    cooldown: int = learning(0, "over so many steps at the end, all rates fall to a tenth", least=0)
+    cooldown: int = learning(0, "over so many steps at the end, all rates fall to a tenth")
     sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1)
     optimizer_type: str = learning(
         "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
@@ -76,14 +78,14 @@ class LearnOptions:
     coarse_until_iter: int = learning(
         3000, "by this step the size has doubled, at equal intervals, to the full one", least=1
     )
-    seed: int = learning(0, "seed of everything random", least=0)
+    seed: int = learning(0, "seed of everything random")
 
 
 @dataclass(frozen=True)
 class GrowOptions:
     """How the set grows; each growth has options of its own."""
 
-    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit", least=0)
+    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
 
     growth: str = growing("reference", f"the rules: {', '.join(GROWTHS)}")
 
@@ -95,15 +97,9 @@ class ReportOptions:
     model_path: str = flag("", "output folder; default: output/<random name>", "-m")
     quiet: bool = flag(False, "print only the summary")
 
-    test_iterations: list[int] = reporting(
-        [7_000, 30_000], "evaluate after these steps, and 20 times in all", many=int, least=1
-    )
-    save_iterations: list[int] = reporting(
-        [7_000, 30_000], "save the model after these steps, and the last", many=int, least=1
-    )
-    checkpoint_iterations: list[int] = reporting(
-        [], "keep a checkpoint of these steps, besides the last one", many=int, least=1
-    )
+    test_iterations: list[int] = reporting([7_000, 30_000], "evaluate after these steps, and 20 times in all", many=int)
+    save_iterations: list[int] = reporting([7_000, 30_000], "save the model after these steps, and the last", many=int)
+    checkpoint_iterations: list[int] = reporting([], "keep a checkpoint of these steps, besides the last one", many=int)
     checkpoint_interval: float = reporting(
         5.0, "minutes between two checkpoints, of which the last is kept; 0: one at the start and one at the end"
     )
@@ -111,7 +107,7 @@ class ReportOptions:
     tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
     viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
     port: int = reporting(PORT, PORT_HELP, least=1)
-    profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot", least=0)
+    profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot")
 
 
 @dataclass(frozen=True)
@@ -123,6 +119,12 @@ class MachineOptions:
     threads: int = machinery(
         0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)", least=0
     )
+
+
+GROUPS: dict[str, type] = {
+    **{"data": DataOptions, "model": ModelOptions, "learn": LearnOptions},
+    **{"grow": GrowOptions, "report": ReportOptions, "machine": MachineOptions},
+}
 
 
 @dataclass(frozen=True, init=False)
@@ -138,31 +140,23 @@ class TrainConfig:
     plugins: dict[str, Any]  # the options of every growth and part, by its name
 
     def __init__(self, **values: Any):
-        made = {}
-        for name, group in self.groups().items():
-            made[name] = group(**{item.name: values.pop(item.name) for item in fields(group) if item.name in values})
+        def made(group: type) -> Any:
+            return group(**{item.name: values.pop(item.name) for item in fields(group) if item.name in values})
+
+        found = {name: made(group) for name, group in GROUPS.items()}
+        plugins = {name: made(entry.options) for name, entry in (GROWTHS | PARTS).items()}
         if values:
             raise TypeError(f"TrainConfig: no such option: {', '.join(values)}")
-        plugins = {name: made.pop(name) for name in (*GROWTHS, *PARTS)}
-        for name, group in (made | {"plugins": plugins}).items():
-            object.__setattr__(self, name, group)
+        vars(self).update(found, plugins=plugins)
 
     @staticmethod
-    def groups() -> dict[str, type]:
+    def groups() -> list[type]:
         """The type of each group, and of the options of each growth and part."""
-        return {
-            "data": DataOptions,
-            "model": ModelOptions,
-            "learn": LearnOptions,
-            "grow": GrowOptions,
-            "report": ReportOptions,
-            "machine": MachineOptions,
-            **{name: plugin.options for name, plugin in (GROWTHS | PARTS).items()},
-        }
+        return [*GROUPS.values(), *(entry.options for entry in (GROWTHS | PARTS).values())]
 
     def flat(self) -> dict[str, Any]:
         """Every option by its name."""
-        groups = [*(value for name, value in vars(self).items() if name != "plugins"), *self.plugins.values()]
+        groups = [*(getattr(self, name) for name in GROUPS), *self.plugins.values()]
         return {name: value for group in groups for name, value in vars(group).items()}
 
     def changed(self, **values: Any) -> TrainConfig:
@@ -182,30 +176,26 @@ FIXED_OPTIONS = {
 
 def check_train(config: TrainConfig) -> str | None:
     """What is wrong with the values of ``config``, in one sentence, or None."""
-    values = config.flat()
+    learn, values = config.learn, config.flat()
     for item in flags_of(TrainConfig):
-        name, value, least = item.name, values[item.name], item.metadata["least"]
-        if isinstance(value, list):
-            if min(value, default=least) < least:
-                return f"--{name}: expected numbers of steps, at least {least}, got {min(value)}."
-        elif least is not None and value < least:
-            return f"--{name}: expected at least {least}, got {value}."
-        elif isinstance(value, float) and not 0 <= value < float("inf"):
-            return f"--{name}: expected a finite number, at least 0, got {value}."
+        name, value = f"--{item.name}", values[item.name]
+        if isinstance(value, list) and min(value, default=1) < 1:
+            return f"{name}: expected numbers of steps, at least 1, got {min(value)}."
+        if isinstance(value, float) and not 0 <= value < float("inf"):
+            return f"{name}: expected a finite number, at least 0, got {value}."
+        if type(value) is int and value < (least := item.metadata.get("least", 0)):
+            return f"{name}: expected at least {least}, got {value}."
     if config.report.port > 65535:
         return f"--port: expected 1 to 65535, got {config.report.port}."
-    learn = config.learn
     if learn.seed >= 2**63:
         return f"--seed: expected 0 to 2^63 - 1, got {learn.seed}."
     if learn.lambda_dssim > 1:
         return f"--lambda_dssim: expected 0 to 1, got {learn.lambda_dssim}."
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:
         return "--position_lr_init, --position_lr_final: expected more than 0 (the rate decays from one to the other)."
-    for flag_name, names, table in (
-        ("growth", [config.grow.growth], GROWTHS),
-        ("parts", config.model.parts.split(",") if config.model.parts not in ("", AUTO) else [], PARTS),
-    ):
-        for name in names:
-            if name not in table:
-                return f"--{flag_name}: expected one of {', '.join(table)}, got {name!r:.50}."
+    if config.grow.growth not in GROWTHS:
+        return f"--growth: expected one of {', '.join(GROWTHS)}, got {config.grow.growth!r:.50}."
+    for name in config.model.parts.split(",") if config.model.parts else ():
+        if name not in (PARTS if "," in config.model.parts else [*PARTS, AUTO]):
+            return f"--parts: expected {AUTO}, or some of {', '.join(PARTS)} between commas, got {name!r:.50}."
     return None

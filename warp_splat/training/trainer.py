@@ -29,7 +29,7 @@ from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS, choose
-from warp_splat.training.seams import Growth, Part, Setting, Step
+from warp_splat.training.seams import Setting, Step, having
 
 T = TypeVar("T")
 LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
@@ -97,10 +97,10 @@ class Trainer:
         self.background = torch.full((3,), float(config.data.white_background), device=self.device)
         seed, limit, growth = config.learn.seed, config.grow.max_gaussians, config.grow.growth
         setting = Setting(scene, self.model, self.background, processes, seed, limit)
-        self.parts: list[Part] = [PARTS[name].load()(config.plugins[name], setting) for name in used]
-        groups = [group for part in self.parts for group in part.parameters()]
+        self.parts = [PARTS[name].load()(config.plugins[name], setting) for name in used]
+        groups = [group for parameters in having(self.parts, "parameters") for group in parameters()]
         self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)
-        self.growth: Growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
+        self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
         self.quarantine = Quarantine()
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0
@@ -122,7 +122,7 @@ class Trainer:
         self._set_iteration(iteration)
         step = Step(iteration, self._next_view())
         camera, photograph = self._at_size(step.view, iteration)
-        options = self.growth.asks(self._through("asks", self.options, step), step)
+        options = self._through("asks", self.options, step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
         out = self._render(camera, background, options)
         out.means2d.retain_grad()
@@ -146,9 +146,9 @@ class Trainer:
         return loss
 
     def _through(self, method: str, value: T, *arguments: Any) -> T:
-        """What the parts make of ``value``, one after another."""
-        for part in self.parts:
-            value = getattr(part, method)(value, *arguments)
+        """What parts and growth make of ``value``, one after another."""
+        for make in having((*self.parts, self.growth), method):
+            value = make(value, *arguments)
         return value
 
     def update(self, iteration: int) -> None:
@@ -160,8 +160,8 @@ class Trainer:
             self.quarantine.prunings += changed.refused
         with stage("Adam"):
             self.optimizer.step(self._radii if changed is None or changed.refused else None)
-        for part in self.parts:
-            part.after_step(iteration)
+        for after_step in having(self.parts, "after_step"):
+            after_step(iteration)
 
     def warm_up(self) -> None:
         """Compile and load every kernel of a step, changing nothing."""
@@ -183,8 +183,8 @@ class Trainer:
         """
         places = {view: place for place, view in enumerate(self.scene.train)}
         tensors = {**self.optimizer.state(), "radii": self._radii}
-        for plugin in (self.growth, *self.parts):
-            tensors |= plugin.state()
+        for state in having((self.growth, *self.parts), "state"):
+            tensors |= state()
         return tensors, {
             "views": [view.name for view in self.scene.train],
             "extent": self.scene.extent,
@@ -220,8 +220,8 @@ class Trainer:
             dropped = {"prunings": dropped["prunings"]}
         self.quarantine = Quarantine(**dropped)
         self.optimizer.restore(checkpoint)
-        for plugin in (self.growth, *self.parts):
-            plugin.restore(checkpoint)
+        for restore in having((self.growth, *self.parts), "restore"):
+            restore(checkpoint)
         self._radii = torch.from_numpy(checkpoint.array("radii", (len(self.model),), np.int32)).to(self.device)
         self._set_iteration(checkpoint.count("iteration"))
 
@@ -257,7 +257,7 @@ class Trainer:
         kept = self._photographs.get(view)
         if kept is None:
             with stage("photographs"):
-                alpha = view.alpha if any(part.reads_alpha for part in self.parts) else None
+                alpha = view.alpha if any(having(self.parts, "reads_alpha")) else None
                 planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
                 kept = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
             self._photographs[view] = kept

@@ -21,9 +21,7 @@ class ReferenceOptions:
     )
     opacity_reset_interval: int = growing(3000, "steps between two resets of all opacities to 0.01", least=1)
     prune_screen_size: int = growing(
-        0,
-        "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does",
-        least=0,
+        0, "prune Gaussians wider than this radius in px in any view; 0: never, which is what the reference's 20 does"
     )
 
 

@@ -11,7 +11,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime.launch import in_slices, torch_slices
 from warp_splat.training.growth import ReferenceOptions
 from warp_splat.training.optimizer import Optimizer
-from warp_splat.training.seams import Change, Growth, Setting, Step
+from warp_splat.training.seams import Change, Setting, Step
 
 PRUNE_OPACITY = 0.005
 RESET_OPACITY = 0.01
@@ -19,11 +19,11 @@ PRUNE_EXTENT = 0.1  # share of the scene's extent above which a Gaussian is prun
 SPLIT_SHRINK = 1.6  # the children's scales are the parent's divided by this
 
 
-class Reference(Growth):
+class Reference:
     """Statistics of the gradients of the 2D means, and what follows from them."""
 
     def __init__(self, options: ReferenceOptions, setting: Setting, optimizer: Optimizer):
-        super().__init__(options, setting, optimizer)
+        self.options, self.setting, self.optimizer = options, setting, optimizer
         self.model, self.processes, self.extent = setting.model, setting.processes, setting.scene.extent
         self.random = torch.Generator().manual_seed(setting.seed)
         self.clear()
@@ -64,6 +64,7 @@ class Reference(Growth):
         return change
 
     def grows(self, iterations: int) -> bool:
+        """Whether a training of this length densifies."""
         return min(iterations, self.options.densify_until_iter) > self.options.densify_from_iter
 
     def state(self) -> dict[str, torch.Tensor]:

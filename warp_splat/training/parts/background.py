@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.scene.types import Scene
 from warp_splat.training.parts import BackgroundOptions
-from warp_splat.training.seams import Part, Setting, Step, Verdict
+from warp_splat.training.seams import Setting, Step, Verdict
 from warp_splat.training.trainer import Photograph
 
 GENERATOR = "random.background"  # in a checkpoint
 
 
-class RandomBackground(Part):
+class RandomBackground:
     """Renders on a new color in each step and puts it behind the photograph, too."""
 
     reads_alpha = True
 
     def __init__(self, options: BackgroundOptions, setting: Setting):
-        super().__init__(options, setting)
+        self.setting = setting
         self.random = torch.Generator().manual_seed(setting.seed)
         self.color = setting.background
 
@@ -32,6 +30,7 @@ class RandomBackground(Part):
         return Verdict(clear > 0, clear, f"{clear} of {len(scene.train)} photographs are transparent somewhere")
 
     def background(self, color: torch.Tensor, step: Step) -> torch.Tensor:
+        """Draw one for each process; this one's."""
         processes = self.setting.processes
         drawn = torch.rand(processes.count, 3, generator=self.random)
         self.color = drawn[processes.rank].to(color.device)
@@ -45,9 +44,11 @@ class RandomBackground(Part):
         values = image / 255.0 if image.dtype == torch.uint8 else image
         return photograph._replace(image=values + (1.0 - alpha / 255.0) * (self.color - self.setting.background))
 
-    def state(self) -> Mapping[str, torch.Tensor]:
+    def state(self) -> dict[str, torch.Tensor]:
+        """The state of the generator."""
         return {GENERATOR: self.random.get_state()}
 
     def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on drawing."""
         if GENERATOR in checkpoint.arrays:  # not, if training went without this part so far
             self.random.set_state(torch.from_numpy(checkpoint.generator(GENERATOR)))

@@ -1,0 +1,187 @@
+"""A part and a growth of one's own: a class and a line of a table, without a change elsewhere."""
+
+import re
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import pytest
+import torch
+from test_checkpoints import begin, state_of, steps
+from test_distributed import Pretended
+from test_train import SCENE, fails, train
+
+from warp_splat.cli import main
+from warp_splat.flags import growing, learning
+from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.formats.model_folder import ply_path
+from warp_splat.training.config_file import load_options, read_config
+from warp_splat.training.growth import GROWTHS
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import PARTS
+from warp_splat.training.record import keep, restore
+from warp_splat.training.seams import Change, Entry, Verdict
+from warp_splat.training.trainer import Trainer
+
+PACKAGE = Path(__file__).parents[1] / "warp_splat"
+
+
+@dataclass(frozen=True)
+class GainOptions:
+    """Of the part below."""
+
+    gain_lr: float = learning(0.01, "rate of the gain of each photograph")
+
+
+class Gain:
+    """The logarithm of a factor for each photograph, learned by Adam; it also asks for depth and counts steps."""
+
+    def __init__(self, options, setting):
+        self.options, self.steps = options, torch.zeros(1, dtype=torch.int32)
+        self.places = {view: place for place, view in enumerate(setting.scene.train)}
+        self.gains = torch.zeros(len(self.places), device=setting.model.device, requires_grad=True)
+
+    @classmethod
+    def needed(cls, scene):
+        spread = float(torch.tensor([float(view.image.mean()) for view in scene.train]).std())
+        return Verdict(spread > 1.0, spread, f"the brightness of the photographs varies by {spread:.1f}")
+
+    def parameters(self):
+        return [{"name": "gain", "params": [self.gains], "lr": self.options.gain_lr}]
+
+    def asks(self, options, step):
+        return type(options)(**{**vars(options), "depth": True})
+
+    def image(self, image, out, step):
+        assert out.depth is not None
+        return image * torch.exp(self.gains[self.places[step.view]])
+
+    def loss(self, loss, out, step):
+        return loss + 1e-3 * self.gains.square().mean()
+
+    def after_step(self, iteration):
+        self.steps += 1
+
+    def state(self):
+        return {"gain.steps": self.steps}
+
+    def restore(self, checkpoint):
+        if "gain.steps" in checkpoint.arrays:
+            self.steps = torch.from_numpy(checkpoint.array("gain.steps", (1,), "int32").copy())
+
+
+@dataclass(frozen=True)
+class FaintOptions:
+    """Of the growth below."""
+
+    faint_below: float = growing(0.02, "opacity under which to prune")
+
+
+class Faint:
+    """Prunes what is faint every tenth step, and never adds."""
+
+    def __init__(self, options, setting, optimizer):
+        self.options, self.model, self.optimizer = options, setting.model, optimizer
+        self.seen = torch.zeros(1, dtype=torch.int32)
+
+    def observe(self, out, step):
+        self.seen += 1
+
+    def update(self, iteration):
+        if iteration % 10:
+            return None
+        keep = torch.sigmoid(self.model.parameters["opacities"].detach()) >= self.options.faint_below
+        self.optimizer.replace(keep.nonzero()[:, 0], {n: t.detach()[:0] for n, t in self.model.parameters.items()})
+        return Change(0, 0, int((~keep).sum()))
+
+    def grows(self, iterations):
+        return False
+
+    def state(self):
+        return {"faint.seen": self.seen}
+
+    def restore(self, checkpoint):
+        self.seen = torch.from_numpy(checkpoint.array("faint.seen", (1,), "int32").copy())
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch):
+    monkeypatch.setitem(PARTS, "gain", Entry(GainOptions, f"{__name__}.Gain"))
+    monkeypatch.setitem(GROWTHS, "faint", Entry(FaintOptions, f"{__name__}.Faint"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"parts": "gain", "gain_lr": 0.05, "opacity_reset_interval": 100},
+        {"parts": "background,gain", "growth": "faint", "optimizer_type": "sparse_adam", "faint_below": 0.095},
+    ],
+    ids=str,
+)
+def test_own_ones_learn_and_resume_to_the_same_bytes(options, scene, tmp_path):
+    trainer, run = begin(scene, tmp_path, **options)
+    steps(trainer, run, 34)
+    expected, _ = state_of(trainer, run)
+    for name in ("parameters", "exp_avg", "exp_avg_sq", "gradients"):
+        assert expected[f"{name}.gain"][1] == (len(scene.train),)
+    gain = trainer.parts[-1]
+    assert int(gain.steps) == 33 and int((gain.gains != 0).sum()) == 33  # one photograph in each step
+    trainer, run = begin(scene, tmp_path, **options)
+    for stop in (0, 11, 20):
+        steps(trainer, run, stop)
+        keep(trainer, run)
+        trainer, run = begin(scene, tmp_path, **options)
+        trainer.warm_up()
+        restore(trainer, run, load_checkpoint(tmp_path))
+    steps(trainer, run, 34)
+    found, _ = state_of(trainer, run)
+    assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
+    if options.get("growth"):
+        assert int(trainer.growth.seen) == 34 and len(trainer.model) < len(scene.points)
+
+
+def test_what_a_part_learns_is_adams_step_of_the_mean_gradient(scene, monkeypatch):
+    """Against torch's own Adam, with rate, betas and epsilon for two processes; the model's set changes meanwhile."""
+    config = {"device": "cpu", "parts": "gain", "densify_from_iter": 1, "densification_interval": 4}
+    trainer = Trainer(scene, TrainConfig(**config), Pretended(0, 2))
+    exchanged = []
+    monkeypatch.setattr(trainer.processes, "average", exchanged.append)
+    copy = torch.zeros(len(scene.train), requires_grad=True)
+    adam = torch.optim.Adam([copy], 0.01 * 2**0.5, (0.9**2, 0.999**2), 1e-15 / 2**0.5, fused=True)
+    for iteration in (2, 4, 6):
+        trainer.differentiate(iteration)
+        gains = trainer.optimizer.parts["gain"]
+        assert any(tensor is gains.grad for tensor in exchanged[-1])
+        copy.grad = gains.grad.clone()
+        trainer.update(iteration)
+        adam.step()
+        assert torch.equal(gains.detach(), copy.detach()) and gains.grad is None
+
+
+def test_flags_files_and_output_know_them(tmp_path, capsys):
+    """Of those that the scene does not need, the figure is told."""
+    options = "--no-quiet --parts auto --growth faint --gain_lr 0.5 --iterations 12"
+    assert train(tmp_path / "a", *options.split()) == 0
+    out = "".join(capsys.readouterr())
+    assert "Part background: left out, since 0 of 43 photographs are transparent somewhere." in out
+    assert "Part gain: taken, since the brightness of the photographs varies by" in out and "as at the beginning" in out
+    config = read_config(tmp_path / "a" / "config.toml")
+    assert (config["parts"], config["growth"], config["gain_lr"]) == ("gain", "faint", 0.5)
+    assert load_options(tmp_path / "a")["faint_below"] == 0.02
+    assert main(["train", "--resume", str(tmp_path / "a"), "--iterations", "24"]) == 0
+    assert train(tmp_path / "b", "--config", str(tmp_path / "a" / "config.toml"), "--iterations", "24") == 0
+    assert ply_path(tmp_path / "a", 24).read_bytes() == ply_path(tmp_path / "b", 24).read_bytes()
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    assert "--gain_lr FLOAT" in capsys.readouterr().out
+    begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
+    assert "--parts: expected auto, or some of background, gain" in fails(capsys, *begun, "--parts", "sky")
+    assert "--growth: expected one of reference, faint" in fails(capsys, *begun, "--growth", "sky")
+
+
+def test_neither_trainer_nor_command_line_knows_one_by_name():
+    files = ("cli", "training/trainer", "training/command", "training/opening", "training/record")
+    texts = [(PACKAGE / f"{file}.py").read_text() for file in files]
+    words = set(re.findall(r"\w+", re.sub(r'""".*?"""|#[^\n]*', "", "\n".join(texts), flags=re.DOTALL)))
+    for entry in (*PARTS.values(), *GROWTHS.values()):
+        found = words & {*entry.place.split(".")[-2:], *(item.name for item in fields(entry.options))}
+        assert found <= {"background"}  # that is a color, too
