@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import textwrap
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ import room
 from serving import end, served
 
 from warp_splat.cli import COMMANDS, main
+from warp_splat.flags import flags_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -95,7 +95,7 @@ def test_every_picture_is_shown():
 
 @pytest.mark.parametrize("page", [page for page in USERS if page.name != "flags.md"], ids=name_of)
 def test_flags_exist(page):
-    flags = [item for config_type, *_ in COMMANDS.values() for item in fields(config_type)]
+    flags = [item for config_type, *_ in COMMANDS.values() for item in flags_of(config_type)]
     known = {name for item in flags for name in (f"--{item.name}", *item.metadata.get("names", ()))}
     foreign = {"--help", "--version", "--no", "--nproc-per-node", "--logdir", "--with"}  # of torchrun, TensorBoard, uv
     code = " ".join(re.findall(r"`([^`\n]+)`", prose(page)) + [text for kind, text in blocks(page) if not kind])

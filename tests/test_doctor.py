@@ -60,7 +60,7 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
 def test_the_reprojection_error_is_that_of_pycolmap(capsys):
     subject, _ = read_subject(EMBEDDED, "images")
     measured = geometry.Measured()
-    geometry.check_reprojection(subject, measured)
+    list(geometry.check_reprojection(subject, measured))
     errors = np.concatenate(list(measured.errors.values()))
     subject.model.update_point_3d_errors()
     points = subject.model.points3D.values()

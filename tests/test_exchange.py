@@ -197,7 +197,7 @@ def test_round_trip_returns_the_scene(tmp_path, ending, coefficients):
             np.testing.assert_allclose(after.splats.sh[part], before.splats.sh[part], atol=atol, rtol=0)
     again = tmp_path / f"b{ending}"
     save_gaussians(again, after, report=silent)
-    assert "colour" not in str(losses(after, load_gaussians(again)))  # a second time costs nothing
+    assert "color" not in str(losses(after, load_gaussians(again)))  # a second time costs nothing
 
 
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".glb", ".gltf"])
@@ -225,13 +225,13 @@ def test_convert_says_what_is_lost(tmp_path, capsys):
         first, said[ending] = capsys.readouterr().out.splitlines()
         assert first == f"{tmp_path / f'b{ending}'}: 40 Gaussians, SH degree {0 if ending == '.splat' else 3}"
     assert said[".glb"] == said[".gltf"] == "  nothing lost but rounding of float32"
-    for part in ("SH degree 3 became 0", "the mark that", "opacity up to 0.00", "colour of 1 of 40", "rotation up to"):
+    for part in ("SH degree 3 became 0", "the mark that", "opacity up to 0.00", "color of 1 of 40", "rotation up to"):
         assert part in said[".splat"]
     for part in (
         "position up to 0.00012",
         "log scale of 1 of 40",
         "harmonics of 1 of 40",
-        "colour coefficient of 1 of",
+        "color coefficient of 1 of",
     ):
         assert part in said[".spz"]
     for ending in ENDINGS[1:]:

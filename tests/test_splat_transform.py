@@ -20,7 +20,7 @@ from warp_splat.formats.splats import sigmoid
 
 COMMAND = shlex.split(os.environ.get("WARP_SPLAT_TRANSFORM", "")) or [shutil.which("splat-transform") or ""]
 HALF_TURN = ("-r", "180,0,0")
-STEPS = (0.5 / 4096, 0.5 / 16, 0.5 / 255, 0.5 / 255 / 0.15)  # of SPZ: position, log scale, opacity, colour
+STEPS = (0.5 / 4096, 0.5 / 16, 0.5 / 255, 0.5 / 255 / 0.15)  # of SPZ: position, log scale, opacity, color
 
 pytestmark = pytest.mark.skipif(
     not COMMAND[0],
@@ -33,7 +33,7 @@ def transform(source, target, *actions):
 
 
 def assert_same(found, wanted, steps=(0, 0, 0, 0, 0), shape=1e-3):
-    """Equal within bounds: of position, log scale, opacity, colour, harmonics, and (relative) covariances."""
+    """Equal within bounds: of position, log scale, opacity, color, harmonics, and (relative) covariances."""
     bounds = [1.01 * step + 1e-5 for step in steps]
     np.testing.assert_allclose(found.means, wanted.means, atol=bounds[0], rtol=1e-6)
     np.testing.assert_allclose(found.scales, wanted.scales, atol=bounds[1], rtol=0)

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from warp_splat.errors import InputError
 
 NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
+
+
+NAMED = 5  # things that a message names
+
+
+def few(names: Iterable[str]) -> str:
+    """The first names, and how many more there are."""
+    names = list(names)
+    return ", ".join(names[:NAMED]) + f" and {len(names) - NAMED} more" * (len(names) > NAMED)
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

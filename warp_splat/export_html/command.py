@@ -19,7 +19,7 @@ from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.export_html import pack
 from warp_splat.formats import model_folder
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.atomic import write_text
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels import harmonics, splat
 
@@ -53,8 +53,7 @@ def export_html(config: ExportHtmlConfig) -> int:
         "BACKGROUND": float(bool(trained.get("white_background"))),
     }
     page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
-    with atomic_write(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write_text(path, page)
     size, total = len(page) / 1e6, len(splats.means)
     print(
         f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; open it in a browser"

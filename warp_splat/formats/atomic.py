@@ -55,8 +55,17 @@ def write_text(path: str | Path, text: str) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
+    write_bytes(path, text.encode("utf-8", "surrogateescape"))  # names of files may be any bytes
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write bytes, whole or not at all.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
     with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")  # names of files may be any bytes
+        temporary.write_bytes(data)
 
 
 def write_json(path: str | Path, value) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_splat import __version__
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
 from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.formats.splats import (
@@ -69,19 +69,16 @@ def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] =
     document = _describe(attributes, file.antialiased)
     if path.suffix.lower() == ".gltf":
         buffer = path.with_name(f"{path.stem}.{hashlib.sha256(data).hexdigest()[:8]}.bin")
-        with atomic_write(buffer) as temporary:
-            temporary.write_bytes(data)
+        write_bytes(buffer, data)
         document["buffers"][0]["uri"] = buffer.name
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
+        write_text(path, json.dumps(document, indent=1, allow_nan=False))
         return
     text = json.dumps(document, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)  # chunks are padded to four bytes; every attribute is
     chunks = CHUNK.pack(len(text), b"JSON") + text + CHUNK.pack(len(data), b"BIN\0") + data
     if HEADER.size + len(chunks) > GLB_BYTES:
         raise InputError(f"{path}: {len(chunks)} bytes are more than a .glb file can hold; choose a name in .gltf.")
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(HEADER.pack(b"glTF", 2, HEADER.size + len(chunks)) + chunks)
+    write_bytes(path, HEADER.pack(b"glTF", 2, HEADER.size + len(chunks)) + chunks)
 
 
 def load_gltf(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:

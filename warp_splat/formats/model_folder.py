@@ -19,7 +19,7 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.atomic import write_text
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.formats.splats import SplatFile
@@ -159,8 +159,7 @@ def write_cfg_args(folder: str | Path, namespace: Mapping[str, object]) -> None:
     values = {name: str(value) if isinstance(value, Path) else value for name, value in namespace.items()}
     line = f"Namespace({', '.join(f'{name}={value!r}' for name, value in values.items())})"
     _parse_namespace(line, path)
-    with atomic_write(path) as temporary:
-        temporary.write_text(line, encoding="utf-8")
+    write_text(path, line)
 
 
 def read_cfg_args(folder: str | Path) -> dict[str, object]:
@@ -200,8 +199,7 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
         InputError: if the file cannot be written.
     """
     cameras = [_camera_entry(index, view) for index, view in enumerate([*views_test, *views_train])]
-    with atomic_write(Path(folder) / "cameras.json") as temporary:
-        temporary.write_text(json.dumps(cameras, allow_nan=False), encoding="utf-8")
+    write_text(Path(folder) / "cameras.json", json.dumps(cameras, allow_nan=False))
 
 
 def _camera_entry(index: int, view: View) -> dict[str, object]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from warp_splat.camera import Camera
-from warp_splat.inspect.subject import Finding, Subject, few
+from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.scene.images import Photo
 from warp_splat.scene.types import visible
+from warp_splat.text import few
 
 VIEWS = 60  # at most, in checks that take time for each
 POINTS = 20_000  # at most, likewise
@@ -37,10 +39,10 @@ def sample(items: list, count: int) -> list:
     return items[:: -(-len(items) // count)] if items else []
 
 
-def check_reprojection(subject: Subject, measured: Measured) -> list[Finding]:
+def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding]:
     """Points projected into images, against the keypoints from which they were triangulated."""
     if subject.model is None:
-        return []
+        return
     names = {photo.name for photo in subject.photos}
     registered = [subject.model.image(i) for i in sorted(subject.model.reg_image_ids())]
     chosen = sample([image for image in registered if image.name in names], VIEWS)
@@ -60,33 +62,30 @@ def check_reprojection(subject: Subject, measured: Measured) -> list[Finding]:
         widths[image.name] = image.camera.width
     if not measured.errors:
         text = "the model keeps no observations to compare points with; look at the picture."
-        return [Finding("reprojection", "note", text)]
+        yield Finding("reprojection", "note", text)
+        return
     medians = {name: float(np.median(errors)) for name, errors in measured.errors.items()}
     every = np.concatenate(list(measured.errors.values()))
     typical, width = float(np.median(every)), float(np.median(list(widths.values())))
     behind = np.count_nonzero(~np.isfinite(every))
     text = f"median {typical:.2f} px over {len(every)} observations in {len(medians)} images of {width:.0f} px"
-    findings = []
     if not typical <= BAD * width or behind > 0.2 * len(every):
         text += f", {behind} of points behind their camera: poses and points do not belong together."
-        findings.append(Finding("reprojection", "error", text))
+        yield Finding("reprojection", "error", text)
     elif typical > max(GOOD * width, 1.0):
-        findings.append(Finding("reprojection", "warning", f"{text}: the cameras are imprecise and views will blur."))
+        yield Finding("reprojection", "warning", f"{text}: the cameras are imprecise and views will blur.")
     else:
-        findings.append(Finding("reprojection", "ok", f"{text}."))
+        yield Finding("reprojection", "ok", f"{text}.")
     worst = [n for n in sorted(medians, key=lambda n: -medians[n]) if medians[n] > max(WORSE * typical, 1.0)]
     if worst:
         text = ", ".join(f"{name} ({medians[name]:.1f} px)" for name in worst[:3])
-        findings.append(
-            Finding("reprojection", "warning", f"{len(worst)} images are much worse than the others: {text}.")
-        )
-    return findings
+        yield Finding("reprojection", "warning", f"{len(worst)} images are much worse than the others: {text}.")
 
 
-def check_coverage(subject: Subject, measured: Measured) -> list[Finding]:
+def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
     """Points in each image, points in no image, cameras all at one place, sides that nobody photographed."""
     if not subject.photos or not len(subject.points):
-        return []
+        return
     points = np.array(sample(list(subject.points), POINTS))
     counts = np.zeros(len(points), int)
     scale = len(subject.points) / len(points)
@@ -94,48 +93,45 @@ def check_coverage(subject: Subject, measured: Measured) -> list[Finding]:
         inside = visible(photo.camera, points)
         counts += inside
         measured.seen[photo.name] = round(scale * np.count_nonzero(inside))
-    findings = []
     poor = [name for name, seen in measured.seen.items() if seen < FEW_POINTS]
     text = f"{np.median(list(measured.seen.values())):.0f} points lie inside the median image"
     if poor:
-        findings.append(Finding("coverage", "warning", f"{text}, but fewer than {FEW_POINTS} in {few(poor)}."))
+        yield Finding("coverage", "warning", f"{text}, but fewer than {FEW_POINTS} in {few(poor)}.")
     else:
         text += f", each point inside {np.median(counts):.0f} of {len(subject.photos)}"
-        findings.append(Finding("coverage", "ok", f"{text}."))
+        yield Finding("coverage", "ok", f"{text}.")
     unseen = np.count_nonzero(counts == 0) / len(points)
     level = "error" if unseen == 1 else "warning" if unseen > UNSEEN and not subject.random_points else "ok"
-    findings.append(Finding("unseen points", level, f"{100 * unseen:.1f} % of the points lie outside every image."))
-    return findings + _check_spread(subject, points)
+    yield Finding("unseen points", level, f"{100 * unseen:.1f} % of the points lie outside every image.")
+    yield from _check_spread(subject, points)
 
 
-def _check_spread(subject: Subject, points: np.ndarray) -> list[Finding]:
+def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:
     centers = np.array([photo.camera.center for photo in subject.photos])
     middle = np.median(points, axis=0)
     distances = np.linalg.norm(points - middle, axis=1)
-    findings = []
     if np.median(distances) > 0 and distances.max() > FAR * np.median(distances):
         far = np.count_nonzero(distances > FAR * np.median(distances))
         text = f"{far} of {len(points)} points are more than {FAR:.0f} times as far away as most."
-        findings.append(Finding("points", "warning", text))
+        yield Finding("points", "warning", text)
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     reach = np.median(np.linalg.norm(points - centers.mean(axis=0), axis=1))
     if len(centers) > 1 and spread < STILL * reach:
         text = "all cameras stand at one place: depth cannot be seen, and new places cannot be shown."
-        findings.append(Finding("coverage", "warning", text))
+        yield Finding("coverage", "warning", text)
     elif len(centers) > 2:
         _, _, axes = np.linalg.svd(centers - centers.mean(axis=0))
         around = np.sort(np.arctan2(*(axes[:2] @ (centers - middle).T)))
         gap = np.degrees(np.diff(np.append(around, around[0] + 2 * np.pi)).max())
         if gap > GAP:
             text = f"nobody photographed from {gap:.0f} of the 360 degrees around: views from there are guesses."
-            findings.append(Finding("coverage", "note", text))
-    return findings
+            yield Finding("coverage", "note", text)
 
 
-def check_axes(subject: Subject) -> list[Finding]:
+def check_axes(subject: Subject) -> Iterator[Finding]:
     """How many points the images would show if the poses were read in other conventions."""
     if not subject.photos or not len(subject.points):
-        return []
+        return
     points = np.array(sample(list(subject.points), 2000))
     photos = sample(subject.photos, VIEWS)
     seen = {
@@ -147,8 +143,9 @@ def check_axes(subject: Subject) -> list[Finding]:
         text = (
             f"with {best} the images would show more of the points ({shares}); the poses' axes are probably mixed up."
         )
-        return [Finding("axes", "error", text)]
-    return [Finding("axes", "ok", f"the poses show as many points as in no other convention ({shares}).")]
+        yield Finding("axes", "error", text)
+    else:
+        yield Finding("axes", "ok", f"the poses show as many points as in no other convention ({shares}).")
 
 
 def _inverted(camera: Camera) -> Camera:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.atomic import write_text
 from warp_splat.inspect.subject import Finding
 
 STYLE = """
@@ -37,10 +37,9 @@ def write_page(
         f'<figure><figcaption>{escape(caption)}</figcaption><img src="{address}" alt="{escape(caption)}"></figure>'
         for caption, address in pictures
     )
-    with atomic_write(path) as temporary:
-        temporary.write_text(
-            f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-            f"<style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1><p>{escape(verdict)}</p>\n"
-            f"<table>\n{rows}\n</table>\n{figures}\n</body></html>\n",
-            encoding="utf-8",
-        )
+    write_text(
+        path,
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1><p>{escape(verdict)}</p>\n"
+        f"<table>\n{rows}\n</table>\n{figures}\n</body></html>\n",
+    )

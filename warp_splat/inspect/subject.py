@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +17,9 @@ from warp_splat.scene import colmap, images, transforms, with_masks
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_photo, make_sampling
 from warp_splat.scene.photos import ImageFinder
+from warp_splat.text import few
 
 Level = Literal["ok", "note", "warning", "error"]
-NAMED = 3  # things that a finding names
 THUMBNAIL = 240  # px, the longer side
 
 
@@ -47,13 +46,6 @@ class Subject:
     alpha: list[str] = field(default_factory=list)  # names of images with an alpha channel
     linear: list[str] = field(default_factory=list)  # in linear light
     black: list[str] = field(default_factory=list)  # whose masks are black all over
-
-
-def few(names: Iterable[str]) -> str:
-    """The first names, and how many more there are."""
-    names = list(names)
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
 
 
 def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.inspect.cost import forecast
-from warp_splat.inspect.subject import Finding, Subject, few
+from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
 from warp_splat.scene.photos import READABLE, find_files
+from warp_splat.text import few
 
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
@@ -20,9 +22,9 @@ OFF_CENTER = 0.1  # of the image's width or height
 AT_LEAST = 20  # images; fewer train, but show little from new sides
 
 
-def check_cameras(subject: Subject) -> list[Finding]:
+def check_cameras(subject: Subject) -> Iterator[Finding]:
     """Lenses, how many, and whether their numbers are those of a real camera."""
-    findings, lenses = [], Counter()
+    lenses = Counter()
     if subject.model is not None:
         cameras = [subject.model.image(i).camera for i in subject.model.reg_image_ids()]
         lenses = Counter(f"{lens.model_name} {lens.width} x {lens.height}" for lens in cameras)
@@ -32,7 +34,7 @@ def check_cameras(subject: Subject) -> list[Finding]:
     distorted = sum(photo.sampling is not None for photo in subject.photos)
     if distorted:
         text += f"; {distorted} images are undistorted on loading"
-    findings.append(Finding("cameras", "ok" if lenses else "error", f"{text}."))
+    yield Finding("cameras", "ok" if lenses else "error", f"{text}.")
     odd: dict[str, list[str]] = defaultdict(list)
     for photo in subject.photos:
         camera = photo.camera
@@ -45,15 +47,14 @@ def check_cameras(subject: Subject) -> list[Finding]:
         if max(off) > OFF_CENTER:
             odd[f"a principal point {100 * max(off):.0f} % of the image beside its middle"].append(photo.name)
     for what, names in odd.items():
-        findings.append(Finding("intrinsics", "warning", f"{what} is unusual: {few(names)}."))
+        yield Finding("intrinsics", "warning", f"{what} is unusual: {few(names)}.")
     if not odd and subject.photos:
         focal = sorted(photo.camera.fx / photo.camera.width for photo in subject.photos)
         text = f"focal lengths of {focal[0]:.2f} to {focal[-1]:.2f} widths of the image, all plausible."
-        findings.append(Finding("intrinsics", "ok", text))
+        yield Finding("intrinsics", "ok", text)
     if 0 < len(subject.photos) < AT_LEAST:
         text = f"{len(subject.photos)} images are few: new views will be poor where only one or two of them look."
-        findings.append(Finding("cameras", "warning", text))
-    return findings
+        yield Finding("cameras", "warning", text)
 
 
 def check_names(subject: Subject) -> list[Finding]:
@@ -128,11 +129,11 @@ def check_loading(subject: Subject, folder: str) -> list[Finding]:
     return [accepted, *missing, *(Finding("loading", "note", note) for note in notes)]
 
 
-def check_cost(subject: Subject) -> list[Finding]:
+def check_cost(subject: Subject) -> Iterator[Finding]:
     """Memory and time of a training, against what this machine has."""
     if not subject.photos:
-        return []
+        return
     sizes = [(photo.camera.width, photo.camera.height) for photo in subject.photos]
     kinds = bool(subject.linear), any(photo.mask for photo in subject.photos), bool(subject.alpha)
     text, fits = forecast(sizes, len(subject.points), *kinds)
-    return [Finding("forecast", "note" if fits else "warning", text)]
+    yield Finding("forecast", "note" if fits else "warning", text)

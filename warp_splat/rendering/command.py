@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
@@ -175,15 +177,21 @@ def make_picture(
     model: GaussianModel, white_background: bool, options: RasterOptions, linear: bool = False
 ) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to the model's image, [H, W, 3] uint8; ``linear``: its colors are in linear light."""
+    draw = make_renderer(model, white_background, options)
+    return lambda camera: to_bytes(draw(camera).image, linear)
+
+
+def make_renderer(model: GaussianModel, white_background: bool, options: RasterOptions) -> Callable[..., RenderOutput]:
+    """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients."""
     background = torch.full((3,), float(white_background), device=model.device)
     with torch.no_grad():
         gaussians = model.activated()
 
-    def picture(camera: Camera) -> np.ndarray:
-        with torch.no_grad():
-            return to_bytes(render_gaussians(gaussians, camera, background, options).image, linear)
+    @torch.no_grad()
+    def draw(camera: Camera, depth: bool = False) -> RenderOutput:
+        return render_gaussians(gaussians, camera, background, replace(options, depth=depth))
 
-    return picture
+    return draw
 
 
 def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:

@@ -33,12 +33,12 @@ from warp_splat.scene.photos import (
     sfm_hint,
 )
 from warp_splat.sfm import stages
+from warp_splat.text import few
 
 WORK = "sfm"  # the folder of the work inside the scene: what resuming needs
 LEAST = 3  # registered photographs; a scene of fewer shows nothing from another side
 FEW = 0.6  # share of registered photographs below which the user is told what to do
 EXHAUSTIVE_FRAMES = 200  # of a video: 20,000 pairs
-NAMED = 5  # photographs that a message names
 ADVICE = (
     "photographs should overlap by two thirds, show texture, be sharp, and be taken from different places, not by "
     "turning on the spot"
@@ -252,10 +252,8 @@ def _summarize(scene: Path, summary: dict[str, Any]) -> None:
         f"{summary['seconds_of_last_run'] / 60:.1f} min"
     )
     for what in ("unreadable", "unregistered"):
-        names = summary[what]
-        if names:
-            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-            print(f"  {what}: {', '.join(names[:NAMED])}{more}")
+        if names := summary[what]:
+            print(f"  {what}: {few(names)}")
     others = summary["registered_by_model"][1:]
     if others:
         print(f"  the photographs fall apart into {len(others) + 1} models; others have {', '.join(map(str, others))}")

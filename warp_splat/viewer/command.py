@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import torch
-
-from warp_splat.camera import Camera
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.command import is_linear, load_trained_scene, options_of
+from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
@@ -63,17 +56,8 @@ def make_draw(model: GaussianModel, trained: dict, linear: bool = False) -> Draw
         trained: options of the training.
         linear: its colors are in linear light.
     """
-    options = options_of(trained)
-    background = torch.full((3,), float(bool(trained.get("white_background"))), device=model.device)
-    with torch.no_grad():
-        gaussians = model.activated()
-
-    def draw(camera: Camera, depth: bool) -> RenderOutput:
-        with torch.no_grad():
-            out = render_gaussians(gaussians, camera, background, replace(options, depth=depth))
-        return on_screen(out, linear)
-
-    return draw
+    render = make_renderer(model, bool(trained.get("white_background")), options_of(trained))
+    return lambda camera, depth: on_screen(render(camera, depth), linear)
 
 
 def _find_scene(config: ViewConfig, trained: dict) -> Scene | None:
