@@ -12,7 +12,7 @@ ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is skipped the
 ALPHA_MAX = 0.99  # alpha is clamped so that 1 / (1 - alpha) stays bounded
 T_MIN = 1.0e-4  # a pixel stops before the Gaussian that would take its transmittance below this
 T_LEAST = 1.0e-30  # no threshold is lower: a transmittance that underflows could not be recovered by division
-NEAR = 0.2  # world units along the optical axis; Gaussians whose centre is nearer are culled
+NEAR = 0.2  # world units along the optical axis; Gaussians whose center is nearer are culled
 BLUR = 0.3  # px^2, added to both variances of the projected Gaussian (low-pass)
 OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline the projection "ellipsoid" takes
 OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard deviations reach the plane of the camera
@@ -120,7 +120,7 @@ class SfmConfig:
 
     photos: str = argument("folder of photographs, or a video")
     scene: str = argument("the folder to write: images/ without distortion, sparse/0, and the work in sfm/")
-    frames: int = flag(150, "how many frames to take from a video: the sharpest of each of so many equal spans")
+    frames: int = flag(150, "frames to take from a video: the sharpest of each of as many equal spans")
     matching: str = flag(
         "auto",
         "which photographs to compare: exhaustive, all pairs; sequential, neighbors by name; auto: sequential for more "
@@ -155,7 +155,7 @@ class ExportHtmlConfig:
 
     model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
     page: str = argument("the page to write, *.html")
-    max_gaussians: int = flag(0, "keep only so many, by opacity and size; 0: all that can be seen")
+    max_gaussians: int = flag(0, "keep only this many, by opacity and size; 0: all that can be seen")
 
 
 @dataclass
@@ -165,7 +165,7 @@ class CompareConfig:
     scene: str = flag("", "scene (COLMAP, nerf-synthetic, transforms.json) to measure on, besides our own", "-s")
     out: str = flag("output/compare", "folder for tables (CSV, JSON) and plots", "-o")
     modes: list[str] = flag(list(ADJOINTS), "adjoints to compare", many=str)
-    stability: bool = flag(False, "the catalogue of stiff and extreme cases instead")
+    stability: bool = flag(False, "the catalog of stiff and extreme cases instead")
     volume: bool = flag(False, "the physics underneath instead: quadratures, and what splatting approximates")
     full: bool = flag(False, "train by the whole schedule instead of 300 steps")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))

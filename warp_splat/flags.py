@@ -29,7 +29,7 @@ rendering = partial(flag, group="how Gaussians are rendered")
 learning = partial(flag, group="how they learn")
 growing = partial(flag, group="how many they become")
 reporting = partial(flag, group="what is kept and told")
-film = partial(flag, group="frames along a way")
+film = partial(flag, group="frames of a video")
 machinery = partial(flag, group="where it is computed")
 
 

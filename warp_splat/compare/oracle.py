@@ -1,7 +1,7 @@
 """Truth for the renderer: float64 torch, every Gaussian at every pixel, gradients by torch.autograd.
 
-Written from the papers (Kerbl et al. 2023; Zwicker et al. 2001 for the projection), without a look at the kernels:
-no tiles, no early exit (only its effect), no inverse, nothing shared with the package but ``Camera``.
+Written from the papers (Kerbl et al. 2023; Zwicker et al. 2001 for the projection), without a look at the kernels. It
+has no tiles, no early exit (only its effect) and no inverse. It shares nothing with the package but ``Camera``.
 
 A renderer in float32 may decide otherwise where a quantity lies within rounding of a threshold. ``Render.fragile``
 marks the pixels where that could be seen, so that a test can leave them out, and count them.

@@ -1,9 +1,9 @@
 """Training to the same end: every adjoint, the thesis's loop cap and the ellipsoid projection, in quality and time.
 
-The adjoints give one gradient up to rounding, so their models should differ by less than those of two seeds: tested
-here before the first densification and at the end, for rounding may tip decisions. A cap on the entries of a tile's
-list that a pixel looks at (2^11 in the thesis, to bound its tape) costs quality where lists are longer; those of the
-embedded scene hold some hundreds, hence the smaller caps besides.
+The adjoints give one gradient up to rounding. So their models should differ by less than those of two seeds. That is
+tested before the first densification and at the end, because rounding may tip decisions. A cap on the entries of a
+tile's list that a pixel looks at (2^11 in the thesis, to bound its tape) costs quality where lists are longer. Those of
+the embedded scene hold some hundreds, so smaller caps are tried, too.
 
 The short schedule is that of the embedded scene shrunk to 300 steps: densification at steps 100 and 150, the SH degree
 up every 100 steps, the rate of the means at its end at step 300. PSNR is measured 12 times, on 8 held-out views at most

@@ -1,7 +1,7 @@
 """How Warp builds the kernels for the CPU.
 
-The flags name what the compiler may do, not a processor: ``-march=native`` is Warp's way to say "this machine", and the
-width is an upper bound that AVX2 or NEON cut down. No flag lets the compiler assume that NaN or infinity never occur.
+The flags name what the compiler may do, not a processor. ``-march=native`` is Warp's way to say "this machine". The
+width is an upper bound, which AVX2 or NEON cut down. No flag lets the compiler assume that NaN or infinity never occur.
 """
 
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its

@@ -1,12 +1,14 @@
 """The color of a Gaussian from where the camera stands: spherical harmonics (Kerbl et al. 2023), and its adjoint.
 
-The color is linear in the coefficients: their gradient, a product of two vectors, is written down, and stored instead
-of added. How the functions depend on the direction Warp differentiates. (All of it by Warp: the adjoint takes 2.3 times
-as long, 16.5 ms instead of 7.0 for 137,000 Gaussians of degree 3, one at a time, with the same gradients to 1e-7.)
+The color is linear in the coefficients. So their gradient, a product of two vectors, is written down, and stored
+instead of added. Warp differentiates how the functions depend on the direction.
 
-On a CPU, a kernel evaluates the functions for sixteen Gaussians at once, then goes through their coefficients in turn:
-3.7 -> 2.8 ms and, the adjoint, 7.4 -> 5.6 (193,000 Gaussians, degree 3, one thread). Tried: groups of which none is
-drawn, or degree 0, without the functions. Values that may be absent stay in memory: the adjoint takes a fifth longer.
+On a CPU, a kernel evaluates the functions for sixteen Gaussians at once, then goes through their coefficients in turn.
+Tried:
+
+- 3.7 instead of 2.8 ms, adjoint 7.4 instead of 5.6: one Gaussian at a time (193,000 of degree 3, one thread)
+- 2.3 x the adjoint, 16.5 instead of 7.0 ms: all of it by Warp (137,000 of degree 3, one at a time, equal to 1e-7)
+- 1.2 x the adjoint: no functions for groups of which none is drawn, or of degree 0; what may be absent stays in memory
 """
 
 import functools

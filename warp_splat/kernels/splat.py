@@ -2,7 +2,7 @@
 
 A pixel blends Gaussians k = 0..n-1 front to back (Kerbl et al. 2023, eq. 2 and 3):
 
-    q_k     = d' conic_k d / 2,  d = mean_k - pixel centre
+    q_k     = d' conic_k d / 2,  d = mean_k - pixel center
     raw_k   = opacity_k exp(-q_k) = opacity_k 2^-|root_k d|^2,  root_k upper triangular
     alpha_k = 0 if raw_k < alpha_min, else min(raw_k, ALPHA_MAX)
     w_k     = alpha_k T_k,  T_{k+1} = T_k - w_k = T_k (1 - alpha_k)
@@ -15,8 +15,8 @@ behind_k = sum_{j > k} w_j (color_j . u) + T_n dL/dT_n:
     dL/dcolor_k = w_k u
     dL/dalpha_k = T_k (color_k . u) - behind_k / (1 - alpha_k)
 
-The square root of the conic keeps needles right: the terms of d' conic d are as large as (d / short axis)^2 and cancel
-along the long axis, those of root d only as large as d / short axis.
+The square root of the conic keeps needles right. The terms of d' conic d are as large as (d / short axis)^2, and cancel
+along the long axis. Those of root d are only as large as d / short axis.
 
 The gradient is zero where alpha is cut to 0 or clamped to ALPHA_MAX (the reference passes it through the clamp).
 """
@@ -86,7 +86,7 @@ def make_exp(degree: int | None) -> wp.Function:
 
 @wp.func
 def exponent(dx: Any, dy: Any, xx: Any, xy: Any, yy: Any):
-    """The exponent z at offset (dx, dy) [px] from pixel centre to mean, from the entries of the root."""
+    """The exponent z at offset (dx, dy) [px] from pixel center to mean, from the entries of the root."""
     u = times(dx, xx) + times(dy, xy)
     v = times(dy, yy)
     return times(u, u) + times(v, v)

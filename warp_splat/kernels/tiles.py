@@ -1,16 +1,22 @@
 """Which Gaussians touch which tile, in depth order. Forward only.
 
-Splats are the Gaussians that are drawn, on the CPU in the order in which they are stored: most is then read and
-written from one end to the other, and what lies near each other in space does so in the caches. A splat's tiles are
-found once, in floating point, as one span per row of tiles; all that follows is integer work, so that no two kernels
-can round differently. Exact lists without a sort of tile instances: spans are written by depth, so a counting sort by
-tile that keeps their order does it (Tried: radix sort of the tile numbers, 11 ms for 1.14M instances). Random reads
-are left to numpy, whose short loops have many of them under way at a time (Tried: in these kernels, up to 10 ms each
-instead of 2 to 5 for 125,000; a shorter way for splats in a single column of tiles, no faster).
+Splats are the Gaussians that are drawn. On the CPU they keep the order in which they are stored: most is then read and
+written from one end to the other, and what lies near each other in space does so in the caches.
 
-The adjoint writes a row of gradients for each instance, in the order of the lists, and places tell each splat where its
-rows are. (Tried: rows in the order of the splats. Writing here and there waits for memory, where reading here and there
-has many reads under way: full size 20 ms longer on one thread. A row to a line of the cache: no faster.)
+A splat's tiles are found once, in floating point, as one span per row of tiles. All that follows is integer work, so no
+two kernels can round differently. Spans are written by depth. So a counting sort by tile, which keeps their order,
+gives exact lists without a sort of tile instances. Random reads are left to numpy, whose short loops have many of them
+under way at a time. Tried:
+
+- 11 ms for 1.14M instances: a radix sort of the tile numbers
+- up to 10 ms instead of 2 to 5 for 125,000: random reads in these kernels
+- no faster: a shorter way for splats in a single column of tiles
+
+The adjoint writes a row of gradients for each instance, in the order of the lists. Places tell each splat where its
+rows are. Tried:
+
+- 20 ms longer at full size on one thread: rows in the order of the splats; writing here and there waits for memory
+- no faster: a row to a line of the cache
 
 A GPU stores splats by depth and sorts the instances. There one kernel runs twice, first to count a splat's tiles and
 then to write them: it is the same machine code, and rounds alike.
@@ -29,7 +35,7 @@ MARGIN = wp.constant(1.0e-3)  # px, far more than the rounding of a span's ends;
 
 @wp.func
 def pixels(low: float, high: float, size: int):
-    """First and last pixel of a row of ``size`` whose centre lies in [low, high]; empty if first > last."""
+    """First and last pixel of a row of ``size`` whose center lies in [low, high]; empty if first > last."""
     # clamped as floats: a huge extent has no int
     first = wp.clamp(wp.ceil(low - 0.5 - MARGIN), 0.0, float(size))
     last = wp.clamp(wp.floor(high - 0.5 + MARGIN), -1.0, float(size - 1))

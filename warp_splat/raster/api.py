@@ -1,7 +1,7 @@
 """From 3D Gaussians to an image, differentiable in torch: project, bin, blend.
 
-Two autograd functions, the first and the last, so that what lies between them (the 2D means above all, whose gradient
-steers densification) are torch tensors with gradients of their own.
+The first and the last are autograd functions. So what lies between them are torch tensors with gradients of their own:
+above all the 2D means, whose gradient steers densification.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def rasterize(
     """Render Gaussians through a camera (Kerbl et al. 2023), differentiable in every tensor given.
 
     Args:
-        means: centres, [N, 3] float32, world units.
+        means: centers, [N, 3] float32, world units.
         quats: rotations (w, x, y, z), [N, 4], any norm; a Gaussian whose quaternion is zero is left out.
         scales: standard deviations along the axes, [N, 3], positive, world units.
         opacities: [N], in 0..1.

@@ -25,8 +25,8 @@ SHARE = 0.1  # of the time goes into those frames, at most
 class TrainingViewer:
     """What a browser sees of a training, drawn in the thread that trains, between two steps.
 
-    While somebody moves, training waits, so that frames come quickly; while the page is still, a frame is drawn each
-    second; while nobody is there, none is. The model does not depend on any of that.
+    While somebody moves, training waits, so that frames come quickly. While the page is still, a frame is drawn each
+    second. While nobody is there, none is. The model does not depend on any of that.
     """
 
     def __init__(self, trainer: Trainer, run: Run, viewer: Viewer):

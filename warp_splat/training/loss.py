@@ -18,7 +18,7 @@ from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.raster.drivers import DRIVERS, driver_of
 from warp_splat.runtime.launch import even_slices, launch, stage, view
 
-SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbours'
+SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
 FAR_APART = 10.0  # in units of an image's usual range
 
 
@@ -31,9 +31,9 @@ def image_loss(
 ) -> torch.Tensor:
     """(1 - lambda) mean |image - target| + lambda (1 - SSIM) (Kerbl et al. 2023, eq. 7), a scalar.
 
-    With a mask, both images are black where it is 0: nothing there has an influence or a gradient, and windows of SSIM
-    across its border compare what counts alone. The means stay those over all pixels, so that a pixel weighs the same
-    however many are masked, and thresholds of gradients keep their meaning.
+    With a mask, both images are black where it is 0. Nothing there has an influence or a gradient, and windows of SSIM
+    across its border compare only what counts. The means are over all pixels: a pixel weighs the same however many are
+    masked, and thresholds of gradients keep their meaning.
 
     Args:
         image: [H, W, 3] float32, differentiable.
@@ -257,7 +257,7 @@ def _missing(groups: int, length: int) -> torch.Tensor:
 
 
 def _taps(rows: torch.Tensor, dtype=vec16) -> wp.array:
-    """[..., P] numbers as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbours."""
+    """[..., P] numbers as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbors."""
     shape = (*rows.shape[:-1], max(rows.shape[-1] - LANES + 1, 0))
     strides = tuple(rows.element_size() * stride for stride in rows.stride())
     return wp.array(ptr=rows.data_ptr(), dtype=dtype, shape=shape, strides=strides, device="cpu", copy=False)

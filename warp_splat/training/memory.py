@@ -1,7 +1,7 @@
 """How much memory training will take, told before it does: the tensors of a step on the CPU, counted.
 
-They are counted as if few took the place of one that was freed, since the pieces of a heap seldom fit what comes next,
-and one image is added for what such pieces still leave unused: ``benchmarks/scaling.py`` compares with measured peaks.
+Few tensors are assumed to take the place of one that was freed: the pieces of a heap seldom fit what comes next. One
+image is added for what such pieces still leave unused. ``benchmarks/scaling.py`` compares with measured peaks.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def describe(trainer: Trainer) -> str:
 
 
 def expected_gaussians(beginning: int, pixels: int, limit: int = 0, grows: bool = True) -> tuple[int, str]:
-    """How many Gaussians there will be of so many at the beginning, and why; ``pixels`` of a view."""
+    """How many Gaussians there will be, from their number at the beginning, and why; ``pixels`` of a view."""
     if not grows:
         return beginning, "as at the beginning"
     if limit:

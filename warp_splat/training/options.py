@@ -35,7 +35,7 @@ class DataOptions:
         "srgb", "photographs in linear light (EXR, HDR): the curve under which they are compared", choices=LOSS_SPACES
     )
     start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
-    config: str = data("", "options from a TOML file, such as a model's config.toml; flags that are given go before")
+    config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class LearnOptions:
     opacity_lr: float = learning(0.025, "rate of the opacity logits")
     scaling_lr: float = learning(0.005, "rate of the log scales")
     rotation_lr: float = learning(0.001, "rate of the quaternions")
-    cooldown: int = learning(0, "over so many steps at the end, all rates fall to a tenth")
+    cooldown: int = learning(0, "over this many steps at the end, all rates fall to a tenth")
     sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1)
     optimizer_type: str = learning(
         "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")

@@ -69,7 +69,7 @@ def save_model(trainer: Trainer, run: Run) -> Path:
 
 
 def save_or_warn(trainer: Trainer, run: Run) -> None:
-    """Save on the way: training goes on if that fails."""
+    """Save before the end: training goes on if that fails."""
     if trainer.processes.rank > 0:
         return
     try:

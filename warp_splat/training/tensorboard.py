@@ -31,7 +31,7 @@ class EventLog:
                 self.writer.add_scalar("train/loss", loss, first + number * stride)
 
     def write_record(self, record: Mapping[str, float], split: str) -> None:
-        """What an evaluation on the way found, as in ``history.json``."""
+        """What an evaluation before the end found, as in ``history.json``."""
         if self.writer:
             step = int(record["iteration"])
             self.writer.add_scalar(f"{split}/psnr_on_the_way", record["psnr"], step)

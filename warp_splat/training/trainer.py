@@ -178,8 +178,8 @@ class Trainer:
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Tensors by name and values of JSON: all that :meth:`restore` needs to go on as if nothing had happened.
 
-        To be called by all processes before the first step, or between :meth:`differentiate` and :meth:`update`, where
-        models are saved: a checkpoint holds the same parameters as the model of its iteration, and their gradients.
+        All processes call it before the first step, or between :meth:`differentiate` and :meth:`update`, where models
+        are saved. So a checkpoint holds the same parameters as the model of its iteration, and their gradients.
         """
         places = {view: place for place, view in enumerate(self.scene.train)}
         tensors = {**self.optimizer.state(), "radii": self._radii}

@@ -5,7 +5,7 @@ within a limit in relative L2; what is left out counted as stated. Pixels that h
 (:attr:`warp_splat.compare.oracle.Render.fragile`) get no upstream gradient, and there an image may be off by what one
 Gaussian adds.
 
-A limit above the usual one is never chosen but measured, as the condition of the problem: how far the float64 truth
+A limit above the usual one is never chosen. It is measured, as the condition of the problem: how far the float64 truth
 itself moves when its inputs move by half a unit in the last place of float32 (Higham 2002, 1.6).
 """
 

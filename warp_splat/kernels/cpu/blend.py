@@ -1,19 +1,31 @@
 """The CPU driver of the blend: one launch index per 16 x 16 tile, sixteen 4 x 4 blocks of pixels, a block in lanes.
 
-What keeps LLVM vectorising (measured in benchmarks/blend.py; against one scalar thread per pixel more than 20 times):
-state that lives across Gaussians stays in memory, a row of lanes each (phi nodes of 16 scalars defeat the SLP
-vectoriser, loads and stores of 64 bytes do not); no branch per lane; sums over pixels stay in lanes until the end. What
-keeps the loop over blocks short (each measured): that memory is an array made in the kernel over a local matrix, whose
-strides are known (those of other arrays are not, and a local array reloads its own), and begins at a multiple of 64
-bytes, as the matrix does not: by the luck of where the stack lies, rows that cross two lines cost 15 %, and one that
-crosses two pages up to 25 %; ``block & 15``, since an index that may be negative is wrapped; ``while``, since Warp's
-range keeps more state; boxes found for 32 Gaussians at a time, so that their reads overlap and the processor knows how
-many blocks there are before it gets there.
-Tried: rows of 16 pixels instead of blocks, 22 % slower, because fewer blocks can be skipped; a jump over blocks where
-no lane sees the Gaussian, 5 % slower in both directions, because the test costs as much as it saves; one loop over the
-blocks of a box instead of two nested ones, 5 and 20 % slower (adjoint, forward). The ellipse's own end in each row of
-blocks instead of its box: 21 % fewer blocks, but 3 and 7 % slower (forward, adjoint), because the ends cost as much and
-rows of different lengths are not foreseen; the same as a list of blocks without a branch, 40 % slower.
+What keeps LLVM vectorizing (benchmarks/blend.py measures it against one scalar thread per pixel):
+
+- State that lives across Gaussians stays in memory, a row of lanes each. Phi nodes of 16 scalars defeat the SLP
+  vectorizer; loads and stores of 64 bytes do not.
+- No branch per lane.
+- Sums over pixels stay in lanes until the end.
+
+What keeps the loop over blocks short (each measured):
+
+- The memory is an array made in the kernel over a local matrix. Its strides are known. Those of other arrays are not,
+  and a local array reloads its own.
+- It begins at a multiple of 64 bytes, which the matrix does not: rows that cross two lines cost 15 %, one that crosses
+  two pages up to 25 %.
+- ``block & 15``: an index that may be negative is wrapped.
+- ``while``: Warp's range keeps more state.
+- Boxes are found for 32 Gaussians at a time. Their reads overlap, and the processor knows early how many blocks there
+  are.
+
+Tried:
+
+- 22 % slower: rows of 16 pixels instead of blocks; fewer blocks can be skipped
+- 5 % slower in both directions: a jump over blocks where no lane sees the Gaussian; the test costs what it saves
+- 20 % slower, adjoint 5 %: one loop over the blocks of a box instead of two nested ones
+- 3 % slower, adjoint 7 %: the ellipse's own end in each row of blocks instead of its box; 21 % fewer blocks, but the
+  ends cost as much, and rows of different lengths are not foreseen
+- 40 % slower: the same as a list of blocks without a branch
 """
 
 import functools
@@ -40,7 +52,7 @@ def reach(mean: wp.vec2, extent: wp.vec2, x0: float, y0: float):
     y = (mean[1] - y0) * 0.25
     rx = extent[0] * 0.25
     ry = extent[1] * 0.25
-    # block b holds pixel centres x0 + 4 b .. x0 + 4 b + 3; clamp as float: a huge extent has no int
+    # block b holds pixel centers x0 + 4 b .. x0 + 4 b + 3; clamp as float: a huge extent has no int
     return vec4i(
         int(wp.clamp(wp.ceil(x - rx - 0.75), 0.0, 4.0)),
         int(wp.clamp(wp.floor(x + rx), -1.0, 3.0)),
@@ -51,7 +63,7 @@ def reach(mean: wp.vec2, extent: wp.vec2, x0: float, y0: float):
 
 @wp.func
 def offset_x(mean: wp.vec2, x0: float, bx: int):
-    """From the pixel centres of block column ``bx`` to the mean [px]."""
+    """From the pixel centers of block column ``bx`` to the mean [px]."""
     return (vec16(mean[0] - x0) - LANE_X) - vec16(float(4 * bx))
 
 

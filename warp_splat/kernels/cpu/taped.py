@@ -1,19 +1,19 @@
 """The adjoint of the blend by differentiating its whole loop with Warp: ``reversible`` and ``stored``.
 
-In the reverse pass Warp replays the body of a dynamic loop, last iteration first, from whatever the variables that the
-loop carries hold at that moment. Recorded plainly (``plain``) that is silently wrong: stores are not replayed, so that
-T is 0 in every step, and with it every gradient. Two cures:
+In the reverse pass Warp replays the body of a dynamic loop, last iteration first. It starts from what the variables of
+the loop hold at that moment. Recorded plainly (``plain``) that is silently wrong: stores are not replayed, so T is 0 in
+every step, and so is every gradient. Two cures:
 
     reversible  the replay of ``front_of`` undoes the step, T = T / (1 - alpha): no memory
     stored      the replay of ``front_of_kept`` reads the T that the forward pass wrote
 
-A replay cannot follow a break; the loop runs over the instances that some pixel of the tile blended, and ``opaque``
-skips those that a pixel did not. What a loop carries has to be an element of a kernel-local array changed by += and -=
-(whose adjoint is right; that of a[i] = a[i] + x is not).
+A replay cannot follow a break. So the loop runs over the instances that some pixel of the tile blended, and ``opaque``
+skips those that a pixel did not. What a loop carries has to be an element of a kernel-local array, changed by += and
+-=. Their adjoint is right; that of a[i] = a[i] + x is not.
 
 Pieces with a gradient by hand: the clamp (``opaque``), the exponential (``exp2_known``), and the reading of a Gaussian
-(``spread`` into lanes, ``collect`` into its row). ``generated`` does without them: it reads a copy of the Gaussian per
-tile instance, because Warp adds the adjoint of a read to the Gaussian's own, a race between threads.
+(``spread`` into lanes, ``collect`` into its row). ``generated`` does without them. It reads a copy of the Gaussian per
+tile instance: Warp adds the adjoint of a read to the Gaussian's own, which would be a race between threads.
 """
 
 import functools

@@ -1,8 +1,8 @@
 """The adjoint of the blend on CUDA, in all modes of the CPU's: a block walks its tile's list back to front.
 
-The gradients of a Gaussian are summed over the block's pixels before anything is written, into one row per tile
-instance: no atomics, the same bits in every run. ``manual`` and ``stepwise`` are a reverse loop by hand; ``reversible``
-and ``stored`` (:mod:`warp_splat.kernels.cuda.taped`) are the loop that Warp differentiates.
+The gradients of a Gaussian are summed over the block's pixels first, and then written into one row per tile instance.
+So there are no atomics, and every run gives the same bits. ``manual`` and ``stepwise`` are a reverse loop by hand;
+``reversible`` and ``stored`` (:mod:`warp_splat.kernels.cuda.taped`) are the loop that Warp differentiates.
 """
 
 import functools

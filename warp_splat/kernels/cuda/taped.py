@@ -1,8 +1,8 @@
 """The adjoint of the blend on CUDA by differentiating its whole loop with Warp: ``reversible`` and ``stored``.
 
-As on the CPU (:mod:`warp_splat.kernels.cpu.taped`), but T is a variable of the thread, and a Gaussian is read as one
-vector whose custom gradient sums over the block's pixels and writes the instance's row. It is read from global memory
-by all threads alike: the adjoint of a staged element would be added to by all of them.
+As on the CPU (:mod:`warp_splat.kernels.cpu.taped`), with two differences. T is a variable of the thread. A Gaussian is
+read as one vector, whose custom gradient sums over the block's pixels and writes the instance's row. All threads read
+it from global memory: they would all add to the adjoint of a staged element.
 """
 
 import functools

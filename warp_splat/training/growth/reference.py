@@ -135,7 +135,7 @@ class Reference:
 
     def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
         keep = torch.sigmoid(raw["opacities"]) >= PRUNE_OPACITY
-        for tensor in raw.values():  # one that is not finite is left out of every image and would never be pruned else
+        for tensor in raw.values():  # one that is not finite is left out of every image, so nothing else would prune it
             keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
         if prune_large:
             keep &= torch.exp(raw["scales"]).amax(1) <= PRUNE_EXTENT * self.extent
