@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
+from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
+from warp_splat.formats.splats import SH_C0
 
-C0 = 0.28209479177387814  # colour = C0 * sh[0] + 0.5 at degree 0
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -37,35 +38,10 @@ class Scene:
         return [getattr(self, name) for name in PARAMETERS]
 
 
-def make_camera(width, height, fx=None, fy=None, cx=None, cy=None, seed=0, centre=(0.3, -0.2, 0.5)):
-    """A camera in a general pose (``seed=None``: at the origin, axes of the world)."""
-    rotation, centre = np.eye(3), np.asarray(centre, dtype=np.float64)
-    if seed is None:
-        centre = np.zeros(3)
-    else:  # a random rotation: the Q of a random matrix, its determinant made +1
-        rotation, upper = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-        rotation *= np.sign(np.diag(upper))
-        rotation *= np.linalg.det(rotation)
-    fx = fx or 1.1 * width
-    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
-    return Camera(width, height, fx, fy or fx, cx, cy, rotation, -rotation @ centre)
-
-
-def spread(rng, count, low, high):
-    """``count`` numbers in random order, no two closer than half an even spacing: depths that cannot swap."""
-    step = (high - low) / max(count, 1)
-    return low + step * (rng.permutation(count) + rng.uniform(0.25, 0.75, count))
-
-
-def from_camera(points, camera):
-    """Camera points [N, 3] in the world."""
-    return (points - camera.translation) @ camera.rotation
-
-
-def pack(points, scales, opacities, sh, camera, rng, quats=None, background=(0.2, 0.4, 0.7)):
-    """A Scene of NumPy arrays; ``points`` in the camera, random rotations unless given."""
-    quats = rng.normal(size=(len(points), 4)) if quats is None else quats
-    arrays = (from_camera(points, camera), quats, scales, opacities, sh)
+def pack(means, scales, opacities, sh, camera, rng, quats=None, background=(0.2, 0.4, 0.7)):
+    """A Scene of NumPy arrays, with random rotations unless given."""
+    quats = rng.normal(size=(len(means), 4)) if quats is None else quats
+    arrays = (means, quats, scales, opacities, sh)
     tensors = [torch.tensor(np.ascontiguousarray(array), dtype=torch.float32) for array in arrays]
     return Scene(*tensors, camera, torch.tensor(background, dtype=torch.float32))
 
@@ -73,7 +49,7 @@ def pack(points, scales, opacities, sh, camera, rng, quats=None, background=(0.2
 def colours(rng, count, degree, low=0.0, high=1.0, rest=0.15):
     """SH coefficients [N, K, 3]: base colours in low..high, the rest normal."""
     sh = rng.normal(size=(count, (degree + 1) ** 2, 3)) * rest
-    sh[:, 0] = (rng.uniform(low, high, (count, 3)) - 0.5) / C0
+    sh[:, 0] = (rng.uniform(low, high, (count, 3)) - 0.5) / SH_C0
     return sh
 
 
@@ -85,16 +61,14 @@ def cloud(
     ``sigma``: range of the largest standard deviation on the image [px]; ``aspect``: least ratio of the others to it.
     """
     rng = np.random.default_rng(seed)
-    depth = spread(rng, count, *z)
+    depth = distinct_depths(rng, count, *z)
     pixels = rng.uniform(-frame, 1 + frame, (count, 2)) * [camera.width, camera.height]
-    slopes = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = np.concatenate([slopes * depth[:, None], depth[:, None]], 1)
     size = np.exp(rng.uniform(*np.log(sigma), count)) * np.abs(depth) / camera.fx
     ratios = np.exp(rng.uniform(np.log(aspect), 0, (count, 3)))
     ratios[np.arange(count), rng.integers(0, 3, count)] = 1
     opacities = rng.uniform(*opacity, count)
     sh = colours(rng, count, degree, **sh_options)
-    return pack(points, size[:, None] * ratios, opacities, sh, camera, rng)
+    return pack(at_pixels(pixels, depth, camera), size[:, None] * ratios, opacities, sh, camera, rng)
 
 
 def near_and_behind():
@@ -107,12 +81,12 @@ def near_and_behind():
 def inside():
     """A wide camera in the middle of a cloud: Gaussians beyond the frame reach in, the Jacobian's clamp is active."""
     camera, rng, count = make_camera(45, 37, fx=14, fy=16, seed=3), np.random.default_rng(23), 160
-    z = spread(rng, count, 0.25, 3)
+    z = distinct_depths(rng, count, 0.25, 3)
     angle = rng.uniform(0, 2 * np.pi, count)
     slope = rng.uniform(0, 5, count)  # the image ends at 1.6, the clamp at 2.1
     points = np.stack([slope * np.cos(angle) * z, slope * np.sin(angle) * z, z], 1)
     scales = np.exp(rng.uniform(np.log(0.05), np.log(0.5), (count, 3))) * z[:, None]
-    return pack(points, scales, rng.uniform(0.1, 0.7, count), colours(rng, count, 2), camera, rng)
+    return pack(to_world(points, camera), scales, rng.uniform(0.1, 0.7, count), colours(rng, count, 2), camera, rng)
 
 
 def join(first, second):
@@ -127,15 +101,16 @@ def needles(stretch=1):
     The longer, the more digits the conic's quadratic form cancels off the axis: errors grow tenfold at 10.
     """
     camera, rng, count = make_camera(47, 41, seed=None), np.random.default_rng(24), 48
-    z = spread(rng, count, 3, 6)
+    z = distinct_depths(rng, count, 3, 6)
     pixels = rng.uniform(0.1, 0.9, (count, 2)) * [47, 41]
-    points = np.concatenate([(pixels - [23.5, 20.5]) / camera.fx * z[:, None], z[:, None]], 1)
     length = stretch * rng.uniform(3, 9, count) / camera.fx * z
     scales = length[:, None] * np.array([1, 1e-4, 1e-4])
     half = np.linspace(0, np.pi, count, endpoint=False) / 2
     quats = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
     quats[::6] = rng.normal(size=quats[::6].shape)
-    return pack(points, scales, rng.uniform(0.3, 0.9, count), colours(rng, count, 0), camera, rng, quats)
+    return pack(
+        at_pixels(pixels, z, camera), scales, rng.uniform(0.3, 0.9, count), colours(rng, count, 0), camera, rng, quats
+    )
 
 
 def pancakes():
@@ -181,11 +156,10 @@ def dense_tile():
     camera = make_camera(48, 35)
     scene = cloud(31, 250, camera, degree=1, opacity=(0.02, 0.4))
     rng = np.random.default_rng(32)
-    z = spread(rng, 450, 1, 1.9)
+    z = distinct_depths(rng, 450, 1, 1.9)
     pixels = rng.uniform(1, 15, (450, 2))
-    points = np.concatenate([(pixels - [camera.cx, camera.cy]) / camera.fx * z[:, None], z[:, None]], 1)
     scales = rng.uniform(0.3, 1.5, (450, 3)) / camera.fx * z[:, None]
-    tile = pack(points, scales, rng.uniform(0.02, 0.2, 450), colours(rng, 450, 1), camera, rng)
+    tile = pack(at_pixels(pixels, z, camera), scales, rng.uniform(0.02, 0.2, 450), colours(rng, 450, 1), camera, rng)
     return join(scene, tile)
 
 
@@ -229,6 +203,6 @@ SCENES = {
     "single": lambda: cloud(16, 1, make_camera(21, 19), degree=3, sigma=(3, 4), opacity=(0.8, 0.9), frame=-0.4),
     "dense_tile": dense_tile,
     "quat_norms": quat_norms,
-    "far_world": lambda: cloud(17, 100, make_camera(41, 34, seed=8, centre=(1000.3, -900.7, 1100.2)), degree=1),
+    "far_world": lambda: cloud(17, 100, make_camera(41, 34, seed=8, center=(1000.3, -900.7, 1100.2)), degree=1),
     "negative_colour": lambda: cloud(18, 120, make_camera(39, 28), degree=1, low=-1.0, high=1.0, rest=0.4),
 }

@@ -7,10 +7,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import scenes
 import torch
 
-from warp_splat.compare.stability import arithmetic, cases, inputs, pixel_loop, verdict
+from warp_splat.compare import scenes
+from warp_splat.compare.stability import arithmetic, cases, pixel_loop, verdict
 from warp_splat.config import ADJOINTS, BLUR
 
 VERDICTS = [(case, mode) for case in cases.CASES for mode in cases.modes_of(case, ADJOINTS)]
@@ -138,16 +138,16 @@ def test_exact_adam_is_torchs():
 def test_needles_point_where_they_are_asked_to():
     camera = scenes.make_camera(20, 16)
     angles, tilts = np.linspace(0, np.pi, 9, endpoint=False), np.linspace(0, 1.5, 9)
-    quats = torch.from_numpy(inputs.facing(camera, angles, tilts))
+    quats = torch.from_numpy(scenes.facing(camera, angles, tilts))
     axis = verdict.oracle.rotation_matrices(quats)[:, :, 0].numpy() @ camera.rotation.T
     expected = np.stack([np.cos(tilts) * np.cos(angles), np.cos(tilts) * np.sin(angles), np.sin(tilts)], 1)
     assert np.abs(axis - expected).max() < 1e-12
 
 
 def test_a_point_is_placed_at_its_pixel():
-    camera = inputs.look(30, 20, fov=70, seed=3)
+    camera = scenes.look(30, 20, fov=70, seed=3)
     pixels, depth = np.array([[4.5, 17.0], [29.0, 0.5]]), np.array([2.0, 7.0])
-    points = inputs.at_pixels(pixels, depth, camera) @ camera.rotation.T + camera.translation
+    points = scenes.at_pixels(pixels, depth, camera) @ camera.rotation.T + camera.translation
     shown = points[:, :2] / points[:, 2:] * camera.fx + [camera.cx, camera.cy]
     assert np.abs(shown - pixels).max() < 1e-9 and np.abs(points[:, 2] - depth).max() < 1e-9
 

@@ -39,18 +39,10 @@ def adjoint_table(measurements: Sequence[Measurement]) -> str:
         manual = next(other for other in measurements if (other.scene, other.variant) == (item.scene, "manual"))
         ratio = (median(item.backward) or 0.0) / (median(manual.backward) or 1.0) if item.backward else None
         name, error = item.worst if item.errors else ("-", None)
-        rows.append(
-            (
-                item.scene,
-                item.variant,
-                _number(error, "{:.1e}"),
-                name,
-                _milliseconds(item.forward),
-                _milliseconds(item.backward) + " extrapolated" * item.extrapolated,
-                _number(ratio, "{:.2f}" if ratio and ratio < 100 else "{:.0e}"),
-                _number(item.memory and item.memory / 2**20, "{:.1f}"),
-            )
-        )
+        times = (_milliseconds(item.forward), _milliseconds(item.backward) + " extrapolated" * item.extrapolated)
+        relative = _number(ratio, "{:.2f}" if ratio and ratio < 100 else "{:.0e}")
+        memory = _number(item.memory and item.memory / 2**20, "{:.1f}")
+        rows.append((item.scene, item.variant, _number(error, "{:.1e}"), name, *times, relative, memory))
     headers = ("scene", "variant", "error", "of", "forward ms", "backward ms", "x manual", "peak MiB")
     return format_table(headers, rows)
 
@@ -61,18 +53,8 @@ def knob_table(measurements: Sequence[Measurement]) -> str:
     for item in measurements:
         default = _default(measurements, item)
         name, error = item.worst
-        rows.append(
-            (
-                item.scene,
-                item.variant,
-                f"{item.image_error:.1e}",
-                f"{error:.1e}",
-                name,
-                _milliseconds(item.forward),
-                _milliseconds(item.backward),
-                f"{_both(item) / _both(default):.2f}",
-            )
-        )
+        times = _milliseconds(item.forward), _milliseconds(item.backward), f"{_both(item) / _both(default):.2f}"
+        rows.append((item.scene, item.variant, f"{item.image_error:.1e}", f"{error:.1e}", name, *times))
     headers = ("scene", "setting", "image error", "gradient error", "of", "forward ms", "backward ms", "x default")
     return format_table(headers, rows)
 

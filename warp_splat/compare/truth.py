@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
@@ -36,15 +37,18 @@ class Error:
     bias: float  # mean difference over mean magnitude of the truth, signed
 
 
+def for_oracle(options: RasterOptions) -> dict[str, Any]:
+    """Those that change what is true, as keywords of the oracle."""
+    return {key: getattr(options, key) for key in ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")}
+
+
 def compute_truth(workload: Workload) -> Truth:
     """Float64 image and gradients at the workload's pixels."""
     options = workload.options
     means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double().cpu() for tensor in workload.gaussians)
     leaves = [means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), workload.background.double().cpu()]
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
-    keys = ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")
-    chosen = {key: getattr(options, key) for key in keys}
-    out = oracle.exact_render(*leaves[:5], workload.camera, leaves[5], **chosen, pixels=workload.pixels)
+    out = oracle.exact_render(*leaves[:5], workload.camera, leaves[5], **for_oracle(options), pixels=workload.pixels)
     weights = torch.randn(out.image.shape, generator=torch.Generator().manual_seed(1))
     weights[out.fragile] = 0.0
     out.means2d.retain_grad()

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
+from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera
 from warp_splat.compare.trained import SHORT
 from warp_splat.config import RasterOptions
 from warp_splat.raster.data import Gaussians
@@ -54,10 +55,9 @@ def layered(candidates: int) -> Workload:
     """
     rng = np.random.default_rng(candidates)
     size = LAYERED_SIZE
-    camera = Camera(size, size, size, size, size / 2, size / 2, np.eye(3), np.zeros(3))
-    depth = 2.0 + 6.0 * (rng.permutation(candidates) + rng.uniform(0.25, 0.75, candidates)) / candidates
-    pixels = rng.uniform(0.3, 0.7, (candidates, 2)) * size
-    means = np.concatenate([(pixels - size / 2) / size * depth[:, None], depth[:, None]], 1)
+    camera = make_camera(size, size, size, seed=None)
+    depth = distinct_depths(rng, candidates, 2.0, 8.0)
+    means = at_pixels(rng.uniform(0.3, 0.7, (candidates, 2)) * size, depth, camera)
     scales = rng.uniform(0.4, 0.9, (candidates, 3)) * depth[:, None]
     opacities = rng.uniform(0.0045, max(0.008, min(0.9, 15 / candidates)), candidates)
     arrays = (means, rng.normal(size=(candidates, 4)), scales, opacities, rng.uniform(-1.5, 1.5, (candidates, 1, 3)))

@@ -170,7 +170,7 @@ def _smooth(values: np.ndarray) -> np.ndarray:
     return (sums[last] - sums[first]) / (last - first)
 
 
-def new_figure(width: float, height: float, layout: Literal["constrained"] | None = None) -> Figure:
+def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] | None = None) -> Figure:
     """An empty figure in inches that belongs to no pyplot state and needs no display."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
 

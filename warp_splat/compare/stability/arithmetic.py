@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import re
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import torch
 
-from warp_splat.compare.stability.inputs import cloud, look, tensors
+from warp_splat.compare.scenes import cloud, look, tensors
 from warp_splat.compare.stability.verdict import (
     EPS,
     FLOAT_MAX,
@@ -217,12 +218,12 @@ def too_many_tiles(_mode: str) -> Outcome:
 
 CASES = (
     *(
-        Case(f"recovery_{layers}", "numbers", "T back at 1 within 4 n eps", functools.partial(recovery, layers), False)
+        Case(f"recovery_{layers}", "numbers", "T back at 1 within 4 n eps", partial(recovery, layers), False)
         for layers in (100, 1_000, 10_000, 100_000)
     ),
     Case("determinant", "numbers", "needles to 1e8 at every angle: error below 16 eps in float32", determinant, False),
     *(
-        Case(name, "loss", "value and gradient as in float64", functools.partial(loss, scale, noise), False)
+        Case(name, "loss", "value and gradient as in float64", partial(loss, scale, noise), False)
         for name, scale, noise in (
             ("loss_constant", 1.0, 0.0),
             ("loss_1e-8", 1e-8, 1.0),
@@ -231,7 +232,7 @@ CASES = (
         )
     ),
     *(
-        Case(f"{kind}_{gradient:g}", "optimizer", claim, functools.partial(adam, gradient, kind), False)
+        Case(f"{kind}_{gradient:g}", "optimizer", claim, partial(adam, gradient, kind), False)
         for kind in ("adam", "sparse_adam")
         for gradient, claim in (
             (1e-20, "as in float64"),

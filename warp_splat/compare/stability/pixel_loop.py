@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 
+from warp_splat.compare.scenes import at_pixels, cloud, distinct_depths, look, tensors
 from warp_splat.compare.stability import verdict as check
-from warp_splat.compare.stability.inputs import at_pixels, cloud, distinct_depths, look, tensors
 from warp_splat.compare.stability.verdict import EPS, GRADIENT_LIMIT, Case, Outcome, Problem, rendered, truth
 from warp_splat.config import T_MIN, RasterOptions
 
+CHAIN_CLAIM = "transmittance recovered over the chain: error of the gradients within n eps"
 CHAINS = (100, 1_000, 10_000, 100_000)  # layers
 EVERYTHING = RasterOptions(alpha_min=0.0, t_min=0.0)
 EDGE_STEPS = range(-18, 19, 3)  # units in the last place that an opacity is moved at the edge of the early stop
@@ -28,7 +29,7 @@ def logits() -> Problem:
 
 def clamp() -> Problem:
     """Opacities of 0.99 and a few units in the last place around it, centred on pixels: alpha is at the clamp."""
-    camera = look(8, 8, seed=None, center=(0, 0, 0))
+    camera = look(8, 8, seed=None)
     arrays = cloud(2, 24, camera, opacity=(0.99, 0.99), sigma=(0.8, 1.5))
     pixels = np.stack([np.arange(24) % 8 + 0.5, np.arange(24) // 8 * 2 + 0.5], 1)
     arrays["means"] = at_pixels(pixels, distinct_depths(np.random.default_rng(2), 24, 2, 8), camera)
@@ -44,7 +45,7 @@ def opacity_one() -> Problem:
 
 def chain(layers: int) -> Problem:
     """So many Gaussians over a 2 x 2 image, all blended; together they let e^-5 or so through."""
-    camera = look(2, 2, seed=None, center=(0, 0, 0))
+    camera = look(2, 2, seed=None)
     arrays = cloud(4, layers, camera, sigma=(4, 8), opacity=(2.5 / layers, 7.5 / layers), aspect=0.5)
     limit = max(GRADIENT_LIMIT, layers * EPS)
     return Problem(tensors(arrays), camera, EVERYTHING, gradient_limit=limit)
@@ -52,13 +53,13 @@ def chain(layers: int) -> Problem:
 
 def underflow() -> Problem:
     """Without a stop, 80 layers of alpha 0.5 to 0.9: transmittance falls below float32's smallest number."""
-    camera = look(2, 2, seed=None, center=(0, 0, 0))
+    camera = look(2, 2, seed=None)
     return Problem(tensors(cloud(5, 80, camera, sigma=(4, 8), opacity=(0.6, 0.95))), camera, EVERYTHING)
 
 
 def tile() -> Problem:
     """100,000 small Gaussians in one tile; pixels stop after some thousands."""
-    camera = look(4, 4, seed=None, center=(0, 0, 0))
+    camera = look(4, 4, seed=None)
     arrays = cloud(6, 100_000, camera, sigma=(0.2, 0.6), opacity=(0.004, 0.02))
     return Problem(tensors(arrays), camera)
 
@@ -68,7 +69,7 @@ def edge(steps: int, side: float) -> Problem:
 
     ``steps`` units in the last place are added to the second opacity.
     """
-    camera = look(1, 1, seed=None, center=(0, 0, 0))
+    camera = look(1, 1, seed=None)
     arrays = cloud(7, 6, camera, sigma=(20, 30), aspect=0.5)
     arrays["means"] = at_pixels(np.full((6, 2), 0.5), np.linspace(2, 4, 6), camera)
     arrays["opacities"] = np.full(6, np.float32(0.9), dtype=np.float64)
@@ -76,7 +77,7 @@ def edge(steps: int, side: float) -> Problem:
     return Problem(tensors(arrays), camera, RasterOptions(t_min=side * T_MIN))
 
 
-EDGES = {steps: [functools.partial(edge, steps, side) for side in (1.01, 0.99)] for steps in EDGE_STEPS}
+EDGES = {steps: [partial(edge, steps, side) for side in (1.01, 0.99)] for steps in EDGE_STEPS}
 
 
 def stop_edge(mode: str) -> Outcome:
@@ -149,15 +150,7 @@ CASES = (
     rendered("logits_100", "blending", "sigmoid saturates; alpha is clamped, or below the cut", logits),
     rendered("clamp_0.99", "blending", "alpha within rounding of the clamp: the image has no step there", clamp),
     rendered("opacity_1", "blending", "clamped at 0.99, no gradient through the clamp", opacity_one),
-    *(
-        rendered(
-            f"chain_{layers}",
-            "blending",
-            "transmittance recovered over the chain: error of the gradients within n eps",
-            functools.partial(chain, layers),
-        )
-        for layers in CHAINS
-    ),
+    *(rendered(f"chain_{layers}", "blending", CHAIN_CLAIM, partial(chain, layers)) for layers in CHAINS),
     rendered("chain_underflow", "blending", "without a stop, T below 1e-38: gradients as in float64", underflow),
     rendered("tile_100000", "blending", "100,000 Gaussians in one tile: image and gradients as in float64", tile),
     Case("stop_edge", "blending", "T within rounding of t_min: one decision, the adjoint's too", stop_edge),

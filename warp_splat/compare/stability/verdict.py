@@ -20,6 +20,7 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
+from warp_splat.compare.truth import for_oracle
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster import api
@@ -131,18 +132,8 @@ def draw_case(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> a
 def draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Render:
     """The oracle's render of all rows given."""
     *geometry, sh_dc, sh_rest = activated(problem, leaves)
-    options = problem.options
-    return oracle.exact_render(
-        *geometry,
-        torch.cat([sh_dc, sh_rest], 1),
-        problem.camera,
-        leaves["background"],
-        sh_degree=options.sh_degree,
-        antialiasing=options.antialiasing,
-        projection=options.projection,
-        alpha_min=options.alpha_min,
-        t_min=options.t_min,
-    )
+    sh, options = torch.cat([sh_dc, sh_rest], 1), for_oracle(problem.options)
+    return oracle.exact_render(*geometry, sh, problem.camera, leaves["background"], **options)
 
 
 def gradients_by_name(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

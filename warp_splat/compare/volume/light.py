@@ -28,8 +28,8 @@ from scipy.special import erf, exprel
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
 from warp_splat.errors import InputError
+from warp_splat.formats.splats import SH_C0
 
-SH_C0 = 0.28209479177387814  # color = SH_C0 * sh + 0.5
 REACH = 9.0  # standard deviations beyond which a Gaussian is nothing: exp(-81 / 2) = 3e-18
 NODES = 16  # of Gauss and Legendre, in each panel of the truth
 

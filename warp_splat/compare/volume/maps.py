@@ -8,31 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from warp_splat.compare.volume.media import (
-    LEAST_ERROR,
-    LIMIT_DEPTHS,
-    METHODS,
-    OPTICAL_DEPTHS,
-    PARENT,
-    RAYS,
-    UNSTABLE,
-    plain,
-)
-from warp_splat.evaluation.report import DPI, FAINT, INK, WIDTH
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.compare.volume import media
+from warp_splat.evaluation import report
+from warp_splat.evaluation.report import FAINT, INK
 
 
 def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limits: Sequence[Mapping[str, Any]]) -> None:
     """Draw error against run time, a panel for each optical depth, and error against tau ds around the limits."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
-
-    figure = Figure(figsize=(WIDTH, 5.4), dpi=DPI, layout="constrained", facecolor="white")
+    figure = report.new_figure(report.WIDTH, 5.4, layout="constrained")
     figure.supylabel("largest error of the radiance (colors 0 to 1)", fontsize=9, color=INK)
     panels = figure.subplots(2, 3).ravel()
-    for axes, optical_depth in zip(panels, OPTICAL_DEPTHS, strict=False):
+    for axes, optical_depth in zip(panels, media.OPTICAL_DEPTHS, strict=False):
         chosen = [r for r in integrators if r["optical_depth"] == optical_depth]
-        _style(axes, f"optical depth {plain(optical_depth)}", f"run time for {RAYS} rays [ms]", "")
-        for name, (*_, color, marker) in METHODS.items():
+        _style(axes, f"optical depth {media.plain(optical_depth)}", f"run time for {media.RAYS} rays [ms]")
+        for name, (*_, color, marker) in media.METHODS.items():
             stable = [(1e3 * r["seconds"], r["error"]) for r in chosen if r["method"] == name and r["stable"]]
             unstable = [1e3 * r["seconds"] for r in chosen if r["method"] == name and not r["stable"]]
             if stable:
@@ -40,64 +29,56 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
             # crosses in a row of their own, above every error
             axes.plot(unstable, [6.0 if name == "Euler" else 60.0] * len(unstable), "x", color=color, markersize=5)
         axes.set_ylim(1e-16, 1e3)
-        axes.axhline(UNSTABLE, color=INK, linewidth=0.6, linestyle=":")
+        axes.axhline(media.UNSTABLE, color=INK, linewidth=0.6, linestyle=":")
     axes = panels[-1]
-    _style(axes, f"step limit at {plain(LIMIT_DEPTHS[-1])}", "tau ds at the peak of tau", "")
-    for record in limits[-len(METHODS) :]:  # those of the densest medium
-        theory, color = METHODS[record["method"]][2:4]
+    _style(axes, f"step limit at {media.plain(media.LIMIT_DEPTHS[-1])}", "tau ds at the peak of tau")
+    for record in limits[-len(media.METHODS) :]:  # those of the densest medium
+        theory, color = media.METHODS[record["method"]][2:4]
         axes.plot(record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, linewidth=1.4)  # some are inf
         if np.isfinite(theory):
             axes.axvline(theory, color=color, linewidth=1, linestyle="--")
     axes.set_ylim(1e-16, 1e3)
     axes.set_xticks([1, 2, 5, 10, 20], labels=["1", "2", "5", "10", "20"])
     axes.minorticks_off()
-    lines = [axes.plot([], [], color=color, marker=marker, markersize=4)[0] for *_, color, marker in METHODS.values()]
+    lines = [
+        axes.plot([], [], color=color, marker=marker, markersize=4)[0] for *_, color, marker in media.METHODS.values()
+    ]
     cross = axes.plot([], [], "x", color=INK)[0]
     dashed = axes.plot([], [], "--", color=INK, linewidth=1)[0]
-    labels = [*METHODS, "unstable: error above 1", "stability limit for constant tau"]
+    labels = [*media.METHODS, "unstable: error above 1", "stability limit for constant tau"]
     figure.legend([*lines, cross, dashed], labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary)
+    report.save_figure(figure, path)
 
 
-def _style(axes: Any, title: str, x: str, y: str) -> None:
-    axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
-    axes.set_xlabel(x, fontsize=9, color=INK)
-    axes.set_ylabel(y, fontsize=9, color=INK)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["bottom", "left"]].set_color(FAINT)
-    axes.tick_params(labelsize=8, labelcolor=INK, color=FAINT)
+def _style(axes: Any, title: str, x: str) -> None:
+    report.plain_axes(axes, title)
+    axes.set(xlabel=x, xscale="log", yscale="log")
     axes.grid(color=FAINT, linewidth=0.5)
-    axes.set_axisbelow(True)
 
 
 def plot_maps(path: Path, scenes: Mapping[str, Mapping[str, np.ndarray]]) -> None:
     """Draw for each scene the truth, the renderer's image, and where each rung of the ladder is wrong."""
     from matplotlib.colors import LogNorm  # noqa: PLC0415 - half a second, only for pictures
-    from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(WIDTH, 4.2), dpi=DPI, layout="compressed", facecolor="white")
+    figure = report.new_figure(report.WIDTH, 4.2, layout="compressed")
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
-    grid = figure.subplots(len(scenes), 1 + len(PARENT))
+    grid = figure.subplots(len(scenes), 1 + len(media.PARENT))
     shown = None
     for row, (scene, images) in zip(grid, scenes.items(), strict=True):
         row[0].imshow(images["truth"].clip(0, 1))
         row[0].set_ylabel(scene.replace(" at", "\nat"), fontsize=8, color=INK)
-        for axes, rung in zip(row[1:], PARENT, strict=True):
+        for axes, rung in zip(row[1:], media.PARENT, strict=True):
             error = np.abs(images[rung] - images["truth"]).mean(-1)
-            shown = axes.imshow(error.clip(LEAST_ERROR), cmap="inferno", norm=LogNorm(LEAST_ERROR, 0.3))
+            shown = axes.imshow(error.clip(media.LEAST_ERROR), cmap="inferno", norm=LogNorm(media.LEAST_ERROR, 0.3))
             mean = f"{error.mean():.1e}" if error.mean() > 1e-12 else "exact"
             axes.set_xlabel(mean, fontsize=8, color=INK, labelpad=2)
         for axes in row:
             axes.set_xticks([])
             axes.set_yticks([])
             axes.spines[:].set_visible(False)
-    for axes, title in zip(grid[0], ("truth", *PARENT), strict=True):
+    for axes, title in zip(grid[0], ("truth", *media.PARENT), strict=True):
         axes.set_title(title, fontsize=8, fontweight="bold", color=INK)
     bar = figure.colorbar(shown, ax=grid, orientation="horizontal", fraction=0.05, aspect=70, extend="both")
     bar.set_label("|error|, mean of the channels (colors 0 to 1); under each map its mean", fontsize=8)
     bar.ax.tick_params(labelsize=8, labelcolor=INK)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary)
+    report.save_figure(figure, path)

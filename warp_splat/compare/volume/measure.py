@@ -13,22 +13,8 @@ from typing import Any
 import numpy as np
 
 from warp_splat.compare.volume import light as physics
+from warp_splat.compare.volume import media
 from warp_splat.compare.volume.maps import plot_integrators, plot_maps
-from warp_splat.compare.volume.media import (
-    FAR,
-    LIMIT_DEPTHS,
-    METHODS,
-    OPTICAL_DEPTHS,
-    PARENT,
-    PICTURED,
-    RAYS,
-    REPEATS,
-    SAMPLES,
-    SCENES,
-    UNSTABLE,
-    plain,
-    stiff_medium,
-)
 from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.text import format_table
 
@@ -48,7 +34,7 @@ def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[
     """
     out = Path(out)
     integrators, limits = measure_integrators(), measure_limits()
-    say(f"Error of C(0), the largest of {RAYS} rays, by samples per ray (and run time for all rays)\n")
+    say(f"Error of C(0), the largest of {media.RAYS} rays, by samples per ray (and run time for all rays)\n")
     say(_integrator_table(integrators))
     say("\nLargest stable tau ds, tau at its peak\n")
     say(_limit_table(limits))
@@ -61,21 +47,23 @@ def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[
     write_json(out / "volume.json", results)
     _write_csv(out / "volume.csv", results)
     plot_integrators(out / "volume_stiff.png", integrators, limits)
-    plot_maps(out / "volume_maps.png", {name: images[name] for name in PICTURED})
+    plot_maps(out / "volume_maps.png", {name: images[name] for name in media.PICTURED})
     return results
 
 
 def measure_integrators() -> list[dict[str, Any]]:
     """Error and run time of each integrator at each optical depth and number of samples."""
     records = []
-    for optical_depth in OPTICAL_DEPTHS:
-        profile, volume = stiff_medium(optical_depth)
+    for optical_depth in media.OPTICAL_DEPTHS:
+        profile, volume = media.stiff_medium(optical_depth)
         medium = profile.medium(volume.colors)
         truth = physics.integrate_exact(profile, volume.colors, volume.background, 128)
         doubled = physics.integrate_exact(profile, volume.colors, volume.background, 256)
-        seconds: dict[tuple[str, int], list[float]] = {(name, count): [] for name in METHODS for count in SAMPLES}
+        seconds: dict[tuple[str, int], list[float]] = {
+            (name, count): [] for name in media.METHODS for count in media.SAMPLES
+        }
         radiance = {}
-        for _ in range(REPEATS):  # interleaved, so that a disturbance meets all alike
+        for _ in range(media.REPEATS):  # interleaved, so that a disturbance meets all alike
             for (name, count), times in seconds.items():
                 radiance[name, count] = _integrate(name, medium, count, volume.background)  # memory and caches ready
                 start = time.perf_counter()
@@ -83,12 +71,10 @@ def measure_integrators() -> list[dict[str, Any]]:
                 times.append(time.perf_counter() - start)
         records += [
             {
-                "optical_depth": optical_depth,
-                "method": name,
-                "samples": count,
-                "peak_tau_ds": _peak(profile) * FAR * METHODS[name][1] / count,
+                **{"optical_depth": optical_depth, "method": name, "samples": count},
+                "peak_tau_ds": _peak(profile) * media.FAR * media.METHODS[name][1] / count,
                 "error": _error(radiance[name, count], truth),
-                "stable": _error(radiance[name, count], truth) < UNSTABLE,
+                "stable": _error(radiance[name, count], truth) < media.UNSTABLE,
                 "seconds": float(np.median(times)),
                 "truth_error": _error(truth, doubled),
             }
@@ -104,34 +90,27 @@ def measure_limits() -> list[dict[str, Any]]:
     the more steps amplify, until nothing can damp them, and the limit falls to that of the slab.
     """
     records = []
-    for name, (integrate, _, theory, *_) in METHODS.items():
+    for name, (integrate, _, theory, *_) in media.METHODS.items():
         records.append({"medium": "slab", "method": name, "theory": theory, "measured": _slab_limit(integrate)})
-    for optical_depth in LIMIT_DEPTHS:
-        profile, volume = stiff_medium(optical_depth, rays=1)
+    for optical_depth in media.LIMIT_DEPTHS:
+        profile, volume = media.stiff_medium(optical_depth, rays=1)
         medium = profile.medium(volume.colors)
         truth = physics.integrate_exact(profile, volume.colors, volume.background, 128)
-        for name, (integrate, _, theory, *_) in METHODS.items():
-            steps = np.unique((_peak(profile) * FAR / np.geomspace(1, 20, 60)).astype(int))
-            errors = [_error(integrate(medium, 0.0, FAR, int(n), volume.background), truth) for n in steps]
-            tau_ds = _peak(profile) * FAR / steps
-            bad = np.flatnonzero(~(np.array(errors) < UNSTABLE))
+        for name, (integrate, _, theory, *_) in media.METHODS.items():
+            steps = np.unique((_peak(profile) * media.FAR / np.geomspace(1, 20, 60)).astype(int))
+            errors = [_error(integrate(medium, 0.0, media.FAR, int(n), volume.background), truth) for n in steps]
+            tau_ds = _peak(profile) * media.FAR / steps
+            bad = np.flatnonzero(~(np.array(errors) < media.UNSTABLE))
             measured = np.inf if not len(bad) else float(tau_ds[bad[-1] + 1])
-            records.append(
-                {
-                    "medium": f"Gaussians, optical depth {plain(optical_depth)}",
-                    "method": name,
-                    "theory": theory,
-                    "measured": measured,
-                    "tau_ds": tau_ds.tolist(),
-                    "errors": errors,
-                }
-            )
+            found = {"measured": measured, "tau_ds": tau_ds.tolist(), "errors": errors}
+            medium_name = f"Gaussians, optical depth {media.plain(optical_depth)}"
+            records.append({"medium": medium_name, "method": name, "theory": theory, **found})
     return records
 
 
 def _integrate(name: str, medium: physics.Medium, samples: int, background: np.ndarray) -> np.ndarray:
-    integrate, evaluations, *_ = METHODS[name]
-    return integrate(medium, 0.0, FAR, samples // evaluations, background)
+    integrate, evaluations, *_ = media.METHODS[name]
+    return integrate(medium, 0.0, media.FAR, samples // evaluations, background)
 
 
 def _error(radiance: np.ndarray, truth: np.ndarray) -> float:
@@ -141,7 +120,7 @@ def _error(radiance: np.ndarray, truth: np.ndarray) -> float:
 
 def _peak(profile: physics.Profile) -> float:
     """The largest extinction on the first ray, 1 / world unit."""
-    return float(profile.extinction(np.linspace(0, FAR, 4001)[:, None]).sum(-1)[:, 0].max())
+    return float(profile.extinction(np.linspace(0, media.FAR, 4001)[:, None]).sum(-1)[:, 0].max())
 
 
 def _slab_limit(integrate: Callable) -> float:
@@ -165,27 +144,18 @@ def _slab_limit(integrate: Callable) -> float:
 def measure_ladder() -> tuple[dict[str, dict[str, np.ndarray]], list[dict[str, Any]]]:
     """The images of each scene, "truth" and the rungs, and the errors of the rungs."""
     images, records = {}, []
-    for scene, make in SCENES.items():
+    for scene, make in media.SCENES.items():
         volume, camera = make()
         truth = physics.render_volume(volume, camera)
         truth_error = _error(physics.render_volume(volume, camera, panels=32), truth)
         images[scene] = {"truth": truth, **physics.splat_ladder(volume, camera)}
-        for rung, parent in PARENT.items():
+        for rung, parent in media.PARENT.items():
             error = np.abs(images[scene][rung] - truth)
             own = np.abs(images[scene][rung] - images[scene][parent])
-            records.append(
-                {
-                    "scene": scene,
-                    "rung": rung,
-                    "mean": float(error.mean()),
-                    "max": float(error.max()),
-                    "psnr": float(-10 * np.log10(max((error**2).mean(), 1e-30))),
-                    "parent": parent,
-                    "own_mean": float(own.mean()),
-                    "own_max": float(own.max()),
-                    "truth_error": truth_error,
-                }
-            )
+            found = {"mean": float(error.mean()), "max": float(error.max())}
+            found["psnr"] = float(-10 * np.log10(max((error**2).mean(), 1e-30)))
+            found |= {"parent": parent, "own_mean": float(own.mean()), "own_max": float(own.max())}
+            records.append({"scene": scene, "rung": rung, **found, "truth_error": truth_error})
     return images, records
 
 
@@ -198,9 +168,9 @@ def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
         return f"{error} ({1e3 * record['seconds']:.2g} ms)"
 
     rows = [
-        [plain(depth), name, *(cell(cells[depth, name, count]) for count in shown)]
-        for depth in OPTICAL_DEPTHS
-        for name in METHODS
+        [media.plain(depth), name, *(cell(cells[depth, name, count]) for count in shown)]
+        for depth in media.OPTICAL_DEPTHS
+        for name in media.METHODS
     ]
     return format_table(["optical depth", "integrator", *(f"{count} samples" for count in shown)], rows)
 
@@ -220,16 +190,10 @@ def _ladder_table(records: Sequence[Mapping[str, Any]]) -> str:
     def cells(r: Mapping[str, Any], *keys: str) -> list[str]:
         return [f"{r[key]:.1e}" for key in keys]
 
+    quality = [[f"{r['psnr']:.1f}", r["parent"]] for r in records]
     rows = [
-        [
-            r["scene"],
-            r["rung"],
-            *cells(r, "mean", "max"),
-            f"{r['psnr']:.1f}",
-            r["parent"],
-            *cells(r, "own_mean", "own_max"),
-        ]
-        for r in records
+        [r["scene"], r["rung"], *cells(r, "mean", "max"), *middle, *cells(r, "own_mean", "own_max")]
+        for r, middle in zip(records, quality, strict=True)
     ]
     headers = ["scene", "rung", "mean error", "max error", "PSNR [dB]", "changes", "own mean", "own max"]
     return format_table(headers, rows)

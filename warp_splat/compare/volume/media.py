@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from warp_splat.camera import Camera
+from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.volume import light as physics
 from warp_splat.compare.volume.light import Volume
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE
@@ -64,8 +65,8 @@ def _scene(camera: Camera, means, scales, optical_depths, colors, quats=None) ->
     return replace(volume, densities=optical_depths / physics.peak_depths(volume, camera)), camera
 
 
-def _camera(size: int = 48, focal: float = 48.0) -> Camera:
-    return Camera(size, size, focal, focal, size / 2, size / 2, np.eye(3), np.zeros(3))
+def _camera(focal: float = 48.0) -> Camera:
+    return make_camera(48, 48, focal, seed=None)
 
 
 def _cluster() -> tuple[Volume, Camera]:

@@ -1,4 +1,4 @@
-"""Cameras and Gaussians for the extreme cases: ordinary ones, of which a case changes what it is about."""
+"""Cameras and Gaussians made up: ordinary ones, of which a case, a workload or a test changes what it is about."""
 
 from __future__ import annotations
 
@@ -6,31 +6,30 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
+from warp_splat.formats.splats import SH_C0
 
-C0 = 0.28209479177387814  # color = C0 * sh_dc + 0.5
 
-
-def look(
-    width: int = 24, height: int = 20, fov: float = 50.0, seed: int | None = 0, center=(0.3, -0.2, 0.5), **lens: float
+def make_camera(
+    width: int, height: int, fx=None, fy=None, cx=None, cy=None, seed: int | None = 0, center=(0.3, -0.2, 0.5)
 ) -> Camera:
-    """A camera at ``center``, turned at random (``seed=None``: along the world's axes).
+    """A camera at ``center``, turned at random by ``seed``; without a seed, at the origin along the world's axes.
 
-    Args:
-        width: px.
-        height: px.
-        fov: horizontal field of view [degrees].
-        seed: of the rotation.
-        center: world units.
-        lens: ``cx`` and ``cy`` where they are not the image's middle [px].
+    Unless given, ``fx`` is 1.1 times the width, ``fy`` is ``fx``, and the principal point the image's middle [px].
     """
-    rotation = np.eye(3)
-    if seed is not None:
+    rotation, origin = np.eye(3), np.zeros(3)
+    if seed is not None:  # the Q of a random matrix, its determinant made +1
+        origin = np.asarray(center, dtype=np.float64)
         rotation, upper = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
         rotation *= np.sign(np.diag(upper))
         rotation *= np.linalg.det(rotation)
-    focal = 0.5 * width / np.tan(np.radians(0.5 * fov))
-    principal = {"cx": width / 2, "cy": height / 2} | lens
-    return Camera(width, height, focal, focal, **principal, rotation=rotation, translation=-rotation @ np.array(center))
+    fx = fx or 1.1 * width
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    return Camera(width, height, fx, fy or fx, cx, cy, rotation, -rotation @ origin)
+
+
+def look(width: int = 24, height: int = 20, fov: float = 50.0, **pose) -> Camera:
+    """:func:`make_camera` by the horizontal field of view [degrees]."""
+    return make_camera(width, height, 0.5 * width / np.tan(np.radians(0.5 * fov)), **pose)
 
 
 def distinct_depths(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
@@ -81,7 +80,7 @@ def cloud(
         "quats": rng.normal(size=(count, 4)),
         "scales": size[:, None] * ratios,
         "opacities": rng.uniform(*opacity, count),
-        "sh_dc": (rng.uniform(0, 1, (count, 1, 3)) - 0.5) / C0,
+        "sh_dc": (rng.uniform(0, 1, (count, 1, 3)) - 0.5) / SH_C0,
         "sh_rest": 0.15 * rng.normal(size=(count, 3, 3)),
     }
 
