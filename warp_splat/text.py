@@ -1,4 +1,4 @@
-"""Tables as text."""
+"""Tables and lists as text."""
 
 from __future__ import annotations
 
