@@ -30,7 +30,7 @@ from warp_splat.raster.data import Bins, Gaussians
 from warp_splat.raster.drivers import CPU, using
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch
-from warp_splat.scene.images import read_rgb
+from warp_splat.scene.images import read_pixels
 from warp_splat.training.trainer import Trainer
 
 SYNTHETIC = (200_000, 980, 545)
@@ -209,7 +209,7 @@ def measure_decoding(trainer: Trainer) -> list[str]:
             for times, decodes in zip(found, (True, False), strict=True):
                 start = time.perf_counter()
                 if decodes:
-                    np.rint(255.0 * read_rgb(path, 0.0)).astype(np.uint8)
+                    np.rint(255.0 * read_pixels(path, 0.0).color).astype(np.uint8)
                 step()
                 times.append(time.perf_counter() - start)
     return row_of("decoding the photograph in the step", *map(statistics.median, found), "same image, same gradients")

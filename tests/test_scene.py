@@ -25,7 +25,7 @@ from scene_files import (
     write_model,
 )
 
-from warp_splat.scene.images import read_rgb, target_size
+from warp_splat.scene.images import read_pixels, target_size
 
 ROOT = Path(__file__).resolve().parent.parent
 FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
@@ -219,7 +219,7 @@ def test_alpha_is_composited_on_the_background(tmp_path, white, suffix, channels
     alpha = pixels[..., -1:] / 255.0
     expected = pixels[..., :-1] * alpha + 255.0 * white * (1 - alpha)
     assert np.abs(image - expected).max() <= 0.5 + 1e-3
-    unrounded = read_rgb(root / "images" / f"a.{suffix}", float(white)) * 255
+    unrounded = read_pixels(root / "images" / f"a.{suffix}", float(white)).color * 255
     np.testing.assert_allclose(unrounded, np.broadcast_to(expected, image.shape), atol=1e-3)
 
 

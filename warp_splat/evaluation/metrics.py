@@ -15,7 +15,7 @@ from scipy.ndimage import correlate1d
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_json
-from warp_splat.formats.png import load_png
+from warp_splat.formats.png import check_image, load_png
 
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
 RADIUS, SIGMA = 5, 1.5
@@ -155,9 +155,8 @@ def unit_images(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, n
     Raises:
         InputError: if the shapes differ or the type is not uint8.
     """
-    for array in (image, reference):
-        if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
-            raise InputError(f"image: expected (H, W, 3) uint8, got {array.shape} {array.dtype}.")
+    check_image(image)
+    check_image(reference)
     if image.shape != reference.shape:
         raise InputError(f"image: expected the shape of the reference, {reference.shape}, got {image.shape}.")
     return image / 255.0, reference / 255.0

@@ -25,7 +25,7 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
     Raises:
         InputError: if the image has another shape or type; if the file cannot be written.
     """
-    _check_image(image)
+    check_image(image)
     height, width, _ = image.shape
     with atomic_write(path) as temporary:
         output = oiio.ImageOutput.create(str(temporary))
@@ -81,7 +81,7 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
     first = next(frames, None)
     if first is None:
         raise InputError("frames: expected at least one image, got none.")
-    _check_image(first)
+    check_image(first)
     height, width, _ = first.shape
     with atomic_write(path) as temporary:
         with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as container:
@@ -110,6 +110,7 @@ def _h264_stream(container, width: int, height: int, fps: float):
     return stream
 
 
-def _check_image(image: np.ndarray) -> None:
+def check_image(image: np.ndarray) -> None:
+    """Raise InputError if this is no image [H, W, 3] uint8."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
         raise InputError(f"image: expected (H, W, 3) uint8, got {image.shape} {image.dtype}.")

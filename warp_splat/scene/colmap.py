@@ -76,9 +76,9 @@ def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path,
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read the model in ``folder``, binary or text. Raises InputError if it is cut short, damaged or unknown."""
-    for name, end in ENDS.items():
+    for name, record_end in RECORD_ENDS.items():
         if (folder / name).is_file():
-            _check_length(folder / name, end)
+            _check_length(folder / name, record_end)
     try:
         model = pycolmap.Reconstruction(folder)
         if not (folder / "images.bin").is_file():
@@ -103,74 +103,63 @@ def _restore_names(model: pycolmap.Reconstruction, path: Path) -> None:
                 next(lines, None)  # the line of its keypoints, which may be empty
 
 
-def _check_length(path: Path, end: Callable[[bytes], int]) -> None:
+def _check_length(path: Path, record_end: Callable[[bytes, int], int | None]) -> None:
     """Refuse a file that its records do not fill: pycolmap 4.2 accepts some, and never returns from others."""
     data = path.read_bytes()
     try:
-        expected = end(data)
+        (count,), end = UINT64.unpack_from(data), UINT64.size
+        for _ in range(count):
+            end = record_end(data, end)
+            if end is None:  # of a camera model that is unknown: pycolmap will refuse it
+                return
     except (struct.error, OverflowError, ValueError, IndexError):
-        expected = None
-    if expected != len(data):
+        end = None
+    if end != len(data):
         raise InputError(
             f"{path}: expected a COLMAP file that ends with its last record, but it is cut short or damaged (it has "
             f"{len(data)} bytes); export the model again."
         )
 
 
-def _cameras_end(data: bytes) -> int:
-    (count,), end = UINT64.unpack_from(data), UINT64.size
-    for _ in range(count):
-        _, model, width, height = CAMERA.unpack_from(data, end)
-        if model not in KNOWN_MODELS:
-            return len(data)  # its number of parameters is unknown: pycolmap will refuse it
-        camera = pycolmap.Camera.create_from_model_id(0, KNOWN_MODELS[model], 1.0, width, height)
-        end += CAMERA.size + 8 * len(camera.params)
+def _camera_end(data: bytes, start: int) -> int | None:
+    _, model, width, height = CAMERA.unpack_from(data, start)
+    if model not in KNOWN_MODELS:
+        return None
+    camera = pycolmap.Camera.create_from_model_id(0, KNOWN_MODELS[model], 1.0, width, height)
+    return start + CAMERA.size + 8 * len(camera.params)
+
+
+def _image_end(data: bytes, start: int) -> int:
+    name_end = data.index(b"\0", start + IMAGE_HEAD) + 1
+    (keypoints,) = UINT64.unpack_from(data, name_end)
+    return name_end + UINT64.size + 24 * keypoints
+
+
+def _point_end(data: bytes, start: int) -> int:
+    (track,) = UINT64.unpack_from(data, start + POINT_HEAD)
+    return start + POINT_HEAD + UINT64.size + 8 * track
+
+
+def _rig_end(data: bytes, start: int) -> int:
+    _, sensors = UINT32_PAIR.unpack_from(data, start)
+    end = start + UINT32_PAIR.size + (SENSOR if sensors else 0)
+    for _ in range(sensors - 1):
+        end += SENSOR + 1 + (POSE if data[end + SENSOR] else 0)
     return end
 
 
-def _images_end(data: bytes) -> int:
-    (count,), end = UINT64.unpack_from(data), UINT64.size
-    for _ in range(count):
-        end = data.index(b"\0", end + IMAGE_HEAD) + 1
-        (keypoints,) = UINT64.unpack_from(data, end)
-        end += UINT64.size + 24 * keypoints
-    return end
+def _frame_end(data: bytes, start: int) -> int:
+    (images,) = UINT32.unpack_from(data, start + UINT32_PAIR.size + POSE)
+    return start + UINT32_PAIR.size + POSE + UINT32.size + (SENSOR + 8) * images
 
 
-def _points_end(data: bytes) -> int:
-    (count,), end = UINT64.unpack_from(data), UINT64.size
-    for _ in range(count):
-        (track,) = UINT64.unpack_from(data, end + POINT_HEAD)
-        end += POINT_HEAD + UINT64.size + 8 * track
-    return end
-
-
-def _rigs_end(data: bytes) -> int:
-    (count,), end = UINT64.unpack_from(data), UINT64.size
-    for _ in range(count):
-        _, sensors = UINT32_PAIR.unpack_from(data, end)
-        end += UINT32_PAIR.size + (SENSOR if sensors else 0)
-        for _ in range(sensors - 1):
-            has_pose = data[end + SENSOR]
-            end += SENSOR + 1 + (POSE if has_pose else 0)
-    return end
-
-
-def _frames_end(data: bytes) -> int:
-    (count,), end = UINT64.unpack_from(data), UINT64.size
-    for _ in range(count):
-        (images,) = UINT32.unpack_from(data, end + UINT32_PAIR.size + POSE)
-        end += UINT32_PAIR.size + POSE + UINT32.size + (SENSOR + 8) * images
-    return end
-
-
-#: Where the last record of a file ends, for those whose records have lengths of their own.
-ENDS = {
-    "rigs.bin": _rigs_end,
-    "cameras.bin": _cameras_end,
-    "frames.bin": _frames_end,
-    "images.bin": _images_end,
-    "points3D.bin": _points_end,
+#: Where the record that starts at a place ends, in files whose records have lengths of their own.
+RECORD_ENDS = {
+    "rigs.bin": _rig_end,
+    "cameras.bin": _camera_end,
+    "frames.bin": _frame_end,
+    "images.bin": _image_end,
+    "points3D.bin": _point_end,
 }
 
 
@@ -186,19 +175,15 @@ def _points(model: pycolmap.Reconstruction, report: Callable[[str], object]) -> 
 
 def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: Callable[[str], object]) -> list[Photo]:
     finder = ImageFinder(root)
-    paths = {image.name: finder.find(image.name) for image in registered}
-    missing = [name for name, path in paths.items() if path is None]
-    if missing:
-        raise InputError(
-            f"{root}: expected the {len(registered)} images of {where}, but {len(missing)} of them cannot be found, "
-            f"the first is {missing[0]!r}; copy them there or choose another folder with --images."
-        )
-    finder.describe(len(registered), report)
+    names = [image.name for image in registered]
+    paths = finder.find_all(
+        names, f"images of {where}", "copy them there or choose another folder with --images", report
+    )
     sampling = make_sampling()  # lives as long as the photos
     photos, scaled, distorted = [], 0, []
-    for image in registered:
-        size = images.read_size(paths[image.name])
-        photos.append(make_photo(image.name, paths[image.name], image.camera, pose_of(image), size, sampling))
+    for image, path in zip(registered, paths, strict=True):
+        size = images.read_size(path)
+        photos.append(make_photo(image.name, path, image.camera, pose_of(image), size, sampling))
         scaled += size != (image.camera.width, image.camera.height)
         distorted += [] if photos[-1].sampling is None else [image.camera.model_name]
     if scaled:

@@ -98,11 +98,6 @@ def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
 
 
-def read_rgb(path: Path, background: float) -> np.ndarray:
-    """The colors of :func:`read_pixels`."""
-    return read_pixels(path, background).color
-
-
 def read_pixels(path: Path, background: float) -> LoadedImage:
     """Read an image, 0..1 or in linear light; gray becomes RGB, alpha is composited on ``background``.
 
@@ -140,7 +135,7 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
     Raises:
         InputError: if the file cannot be read, or has another shape.
     """
-    brightness = read_rgb(path, 0.0).max(axis=2)
+    brightness = read_pixels(path, 0.0).color.max(axis=2)
     found = brightness.shape[1], brightness.shape[0]
     if not same_shape(found, size):
         raise InputError(

@@ -92,11 +92,23 @@ class ImageFinder:
         """Whether there is a file of exactly this name in the folder."""
         return path.name in self._files(path.parent)
 
-    def describe(self, count: int, report: Callable[[str], object]) -> None:
-        """Say how many of ``count`` images were found under other endings."""
+    def find_all(self, names: list[str], what: str, hint: str, report: Callable[[str], object]) -> list[Path]:
+        """The files of all; says how many were found under other endings.
+
+        Raises:
+            InputError: if one is missing, or as :meth:`find`; ``what`` they are, and a ``hint`` what to do.
+        """
+        files = {name: self.find(name) for name in names}
+        missing = [name for name, file in files.items() if file is None]
+        if missing:
+            raise InputError(
+                f"{self.root}: expected the {len(names)} {what}, but {len(missing)} of them cannot be found, the first "
+                f"is {missing[0]!r:.200}; {hint}."
+            )
         if self.renamed:
             name, file = next(iter(self.renamed.items()))
-            report(f"Taking {len(self.renamed)} of {count} images by their stems: {file} for {name}, ...")
+            report(f"Taking {len(self.renamed)} of {len(names)} images by their stems: {file} for {name}, ...")
+        return [file for name in names if (file := files[name])]
 
     def _files(self, folder: Path) -> frozenset[str]:
         if folder not in self._folders:

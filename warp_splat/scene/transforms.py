@@ -84,14 +84,7 @@ def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], ob
     places = [f"{path}, frame {index}" for index in range(len(frames))]
     finder = ImageFinder(path.parent)
     names = [_path(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
-    paths = [finder.find(name) for name in names]
-    missing = [name for name, found in zip(names, paths, strict=True) if found is None]
-    if missing:
-        raise InputError(
-            f"{path}: expected the images of its {len(frames)} frames, but {len(missing)} of them cannot be found, "
-            f"the first is {missing[0]!r:.200}; copy them there."
-        )
-    finder.describe(len(frames), report)
+    paths = finder.find_all(names, f"frames of {path.name}", "copy them there", report)
     sampling = make_sampling()
     photos = [
         _photo({**content, **frame}, found, finder, sampling, where)

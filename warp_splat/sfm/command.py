@@ -224,7 +224,7 @@ def _groups(root: Path, names: list[str], threads: int, say) -> tuple[list[list[
 
     def lens(name: str) -> tuple | None:
         try:
-            images.read_rgb(root / name, 0.0)  # to the end: from a file that is cut short, pycolmap takes what there is
+            images.read_pixels(root / name, 0.0)  # to the end: of a file that is cut short, pycolmap takes a part
             return images.read_lens(root / name)
         except InputError as error:
             say(f"warning: leaving out a photograph: {error}")
