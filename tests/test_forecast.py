@@ -52,7 +52,7 @@ def test_forecast_is_what_a_step_takes(point, kinds):
         ({"max_gaussians": 70}, 5000, "(--max_gaussians)."),
         ({"iterations": 400}, 5000, "(as at the beginning)"),
         ({"densify_until_iter": 0, "max_gaussians": 70_000}, 5000, "(as at the beginning)."),
-        ({}, 120_000, "for 2 px of a photograph; --max_gaussians limits them), 1.8 GiB more for each further million."),
+        ({}, 120_000, "for 2 px of a photograph; --max_gaussians limits them), 1.7 GiB more for each further million."),
     ],
 )
 def test_grounds(scene, options, count, reason):
