@@ -46,8 +46,8 @@ def pack(means, scales, opacities, sh, camera, rng, quats=None, background=(0.2,
     return Scene(*tensors, camera, torch.tensor(background, dtype=torch.float32))
 
 
-def colours(rng, count, degree, low=0.0, high=1.0, rest=0.15):
-    """SH coefficients [N, K, 3]: base colours in low..high, the rest normal."""
+def colors(rng, count, degree, low=0.0, high=1.0, rest=0.15):
+    """SH coefficients [N, K, 3]: base colors in low..high, the rest normal."""
     sh = rng.normal(size=(count, (degree + 1) ** 2, 3)) * rest
     sh[:, 0] = (rng.uniform(low, high, (count, 3)) - 0.5) / SH_C0
     return sh
@@ -67,7 +67,7 @@ def cloud(
     ratios = np.exp(rng.uniform(np.log(aspect), 0, (count, 3)))
     ratios[np.arange(count), rng.integers(0, 3, count)] = 1
     opacities = rng.uniform(*opacity, count)
-    sh = colours(rng, count, degree, **sh_options)
+    sh = colors(rng, count, degree, **sh_options)
     return pack(at_pixels(pixels, depth, camera), size[:, None] * ratios, opacities, sh, camera, rng)
 
 
@@ -86,7 +86,7 @@ def inside():
     slope = rng.uniform(0, 5, count)  # the image ends at 1.6, the clamp at 2.1
     points = np.stack([slope * np.cos(angle) * z, slope * np.sin(angle) * z, z], 1)
     scales = np.exp(rng.uniform(np.log(0.05), np.log(0.5), (count, 3))) * z[:, None]
-    return pack(to_world(points, camera), scales, rng.uniform(0.1, 0.7, count), colours(rng, count, 2), camera, rng)
+    return pack(to_world(points, camera), scales, rng.uniform(0.1, 0.7, count), colors(rng, count, 2), camera, rng)
 
 
 def join(first, second):
@@ -109,7 +109,7 @@ def needles(stretch=1):
     quats = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
     quats[::6] = rng.normal(size=quats[::6].shape)
     return pack(
-        at_pixels(pixels, z, camera), scales, rng.uniform(0.3, 0.9, count), colours(rng, count, 0), camera, rng, quats
+        at_pixels(pixels, z, camera), scales, rng.uniform(0.3, 0.9, count), colors(rng, count, 0), camera, rng, quats
     )
 
 
@@ -159,7 +159,7 @@ def dense_tile():
     z = distinct_depths(rng, 450, 1, 1.9)
     pixels = rng.uniform(1, 15, (450, 2))
     scales = rng.uniform(0.3, 1.5, (450, 3)) / camera.fx * z[:, None]
-    tile = pack(at_pixels(pixels, z, camera), scales, rng.uniform(0.02, 0.2, 450), colours(rng, 450, 1), camera, rng)
+    tile = pack(at_pixels(pixels, z, camera), scales, rng.uniform(0.02, 0.2, 450), colors(rng, 450, 1), camera, rng)
     return join(scene, tile)
 
 
@@ -178,7 +178,7 @@ SCENES = {
     "degree1": _clouds(1),
     "degree2": _clouds(2),
     "degree3": _clouds(3),
-    "offcentre": lambda: cloud(1, 120, make_camera(50, 31, fx=60, fy=41, cx=38.3, cy=7.2, seed=5), degree=1),
+    "off_center": lambda: cloud(1, 120, make_camera(50, 31, fx=60, fy=41, cx=38.3, cy=7.2, seed=5), degree=1),
     "principal_outside": lambda: cloud(2, 120, make_camera(40, 24, cx=-25.5, cy=44.2, seed=6), degree=1),
     "focal_ratio": lambda: cloud(3, 100, make_camera(45, 38, fx=33, fy=101, seed=7), degree=1, sigma=(0.5, 3)),
     "size_1x1": lambda: cloud(4, 30, make_camera(1, 1, fx=2), sigma=(0.5, 2), opacity=(0.05, 0.4)),
@@ -204,5 +204,5 @@ SCENES = {
     "dense_tile": dense_tile,
     "quat_norms": quat_norms,
     "far_world": lambda: cloud(17, 100, make_camera(41, 34, seed=8, center=(1000.3, -900.7, 1100.2)), degree=1),
-    "negative_colour": lambda: cloud(18, 120, make_camera(39, 28), degree=1, low=-1.0, high=1.0, rest=0.4),
+    "negative_color": lambda: cloud(18, 120, make_camera(39, 28), degree=1, low=-1.0, high=1.0, rest=0.4),
 }

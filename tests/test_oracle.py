@@ -11,7 +11,8 @@ from scipy.special import sph_harm_y
 
 from warp_splat.compare import oracle
 
-CENTRED = scenes.make_camera(9, 7, fx=20, seed=None)  # the middle pixel's centre is the principal point
+C0 = 0.5 / math.sqrt(math.pi)  # the harmonic of degree 0
+CENTERED = scenes.make_camera(9, 7, fx=20, seed=None)  # the middle pixel's center is the principal point
 SMALL = scenes.make_camera(13, 11, fx=15, fy=12, cx=7.3, cy=4.1)
 
 
@@ -20,11 +21,11 @@ def double(*values):
     return [torch.tensor(value, dtype=torch.float64) for value in values]
 
 
-def ball(z, sigma, opacity, rgb, camera=CENTRED, background=(0, 0, 0)):
+def ball(z, sigma, opacity, rgb, camera=CENTERED, background=(0, 0, 0)):
     """Render isotropic Gaussians on the optical axis; lists of equal length."""
     count = len(z)
     means = [[0, 0, depth] for depth in z]
-    sh = [[[(value - 0.5) / scenes.C0 for value in colour]] for colour in rgb]
+    sh = [[[(value - 0.5) / C0 for value in color]] for color in rgb]
     quats = [[1.0, 0, 0, 0]] * count
     return oracle.exact_render(*double(means, quats, [[s] * 3 for s in sigma], opacity, sh), camera, background)
 
@@ -97,7 +98,7 @@ def test_jacobian_is_the_projections_inside_the_frame_and_limited_beyond():
 def scalar_pixel(splats, row, column, background):
     """One pixel as the papers' loop has it: sort, skip, clamp, stop."""
     order = sorted((z, n) for n, z in enumerate(splats.z.tolist()) if splats.live[n])
-    colour, transmittance = np.zeros(3), 1.0
+    color, transmittance = np.zeros(3), 1.0
     for _, n in order:
         d = splats.means2d[n].numpy() - [column + 0.5, row + 0.5]
         conic = np.linalg.inv(splats.cov2d[n].numpy())
@@ -106,9 +107,9 @@ def scalar_pixel(splats, row, column, background):
             continue
         if transmittance * (1 - alpha) < 1e-4:
             break
-        colour += transmittance * alpha * splats.colour[n].numpy()
+        color += transmittance * alpha * splats.color[n].numpy()
         transmittance *= 1 - alpha
-    return colour + transmittance * np.asarray(background)
+    return color + transmittance * np.asarray(background)
 
 
 @pytest.mark.parametrize("name", ["saturated", "opaque", "near_and_behind", "inside", "ties"])
@@ -139,7 +140,7 @@ def differentiable(scene, **options):
     [(0, 0, {}), (1, 1, {"antialiasing": True}), (2, 2, {"sh_degree": 1}), (3, 3, {})],
 )
 def test_gradients_match_central_differences(seed, degree, options):
-    """Of every input number, on few Gaussians: some clamped at 0.99, some beyond the frame, some colours below 0."""
+    """Of every input number, on few Gaussians: some clamped at 0.99, some beyond the frame, some colors below 0."""
     scene = scenes.cloud(seed, 5, SMALL, degree, sigma=(3, 8), opacity=(0.5, 1), frame=0.4, low=-0.5, rest=0.3)
     images, leaves = differentiable(scene.to("cpu", torch.float64), **options)
     assert torch.autograd.gradcheck(images, leaves, eps=1e-7, atol=1e-5, rtol=1e-5, fast_mode=False)
@@ -165,7 +166,7 @@ def test_gradients_match_directional_differences(name):
 
 
 def test_means2d_gradient_is_the_images():
-    """A shift of every 2D mean is a shift of the principal point: covariance and colours stay."""
+    """A shift of every 2D mean is a shift of the principal point: covariance and colors stay."""
     scene = scenes.SCENES["degree1"]().to("cpu", torch.float64)
     _, leaves = differentiable(scene)
     out = oracle.exact_render(*leaves[:5], scene.camera, leaves[5])
@@ -201,8 +202,8 @@ def test_scenes_hold_what_their_names_say():
     slopes = (splats.means2d - scene.means.new_tensor([scene.camera.cx, scene.camera.cy])) / torch.tensor([14, 16])
     limits = 1.3 * torch.tensor([45 / 28, 37 / 32])
     assert ((slopes.abs() > limits).any(1) & out.touches).sum() >= 10
-    _, out, splats = facts("negative_colour")
-    assert 0.2 < (splats.colour[out.touches] == 0).double().mean() < 0.8
+    _, out, splats = facts("negative_color")
+    assert 0.2 < (splats.color[out.touches] == 0).double().mean() < 0.8
     _, out, _ = facts("saturated")
     assert (out.alpha > 1 - 2e-4).double().mean() > 0.5
     _, out, _ = facts("faint")

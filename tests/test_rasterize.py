@@ -147,7 +147,7 @@ VARIANTS = [
     ("degree2", RasterOptions(antialiasing=True)),
     ("subpixel", RasterOptions(antialiasing=True)),
     ("near_and_behind", RasterOptions(antialiasing=True)),
-    ("offcentre", RasterOptions(antialiasing=True, depth=True)),
+    ("off_center", RasterOptions(antialiasing=True, depth=True)),
     ("degree3", RasterOptions(sh_degree=0)),
     ("degree3", RasterOptions(sh_degree=1)),
     ("degree3", RasterOptions(sh_degree=2)),
@@ -155,7 +155,7 @@ VARIANTS = [
     ("degree2", RasterOptions(projection="ellipsoid")),
     ("inside", RasterOptions(projection="ellipsoid", depth=True)),
     ("needles", RasterOptions(projection="ellipsoid")),
-    ("offcentre", RasterOptions(projection="ellipsoid", antialiasing=True)),
+    ("off_center", RasterOptions(projection="ellipsoid", antialiasing=True)),
     ("near_and_behind", RasterOptions(projection="ellipsoid")),
     ("degree1", RasterOptions(alpha_min=0.0)),
     ("saturated", RasterOptions(t_min=0.0)),
@@ -229,7 +229,7 @@ def test_loop_cap(device):
 
 def test_means2d_carries_gradients_of_its_own(device):
     """A loss on the 2D means alone reaches the 3D means (and nothing else asks for an image)."""
-    scene = SCENES["offcentre"]()
+    scene = SCENES["off_center"]()
     leaves, exact = leaves_of(scene.to(device)), leaves_of(scene.to("cpu", torch.float64))
     out = rasterize(scene, leaves)
     weight = torch.randn(120, 2, generator=torch.Generator().manual_seed(2)) * (out.radii.cpu() > 0)[:, None]
@@ -240,7 +240,7 @@ def test_means2d_carries_gradients_of_its_own(device):
 
 
 def test_second_derivatives_are_refused(device):
-    scene = SCENES["offcentre"]()
+    scene = SCENES["off_center"]()
     leaves = leaves_of(scene.to(device))
     loss = rasterize(scene, leaves).image.square().sum()
     (first,) = torch.autograd.grad(loss, leaves["means"], create_graph=True)

@@ -1,4 +1,4 @@
-"""The catalogue of extreme cases, one test for each case and adjoint, and the parts that could be wrong themselves."""
+"""The catalog of extreme cases, one test for each case and adjoint, and the parts that could be wrong themselves."""
 
 import csv
 import json

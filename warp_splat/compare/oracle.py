@@ -34,7 +34,7 @@ class Splats:
     z: torch.Tensor  # depth in the camera
     cov2d: torch.Tensor  # [N, 2, 2] px^2, low-pass filter included
     opacity: torch.Tensor  # [N] times the antialiasing factor
-    colour: torch.Tensor  # [N, 3]
+    color: torch.Tensor  # [N, 3]
     live: torch.Tensor  # [N] bool
 
 
@@ -99,11 +99,11 @@ def jacobians(points, camera):
     """d(pixel) / d(camera point) at ``points`` [N, 3], [N, 2, 3]; x/z and y/z limited to a frame around the image."""
     z = points[:, 2]
     entries = []
-    for axis, (focal, centre, size) in enumerate(
+    for axis, (focal, center, size) in enumerate(
         ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     ):
         margin = SIDE * size / (2 * focal)
-        slope = (points[:, axis] / z).clamp(-centre / focal - margin, (size - centre) / focal + margin)
+        slope = (points[:, axis] / z).clamp(-center / focal - margin, (size - center) / focal + margin)
         row = [torch.zeros_like(z), torch.zeros_like(z), -focal * slope / z]
         row[axis] = focal / z
         entries.append(torch.stack(row, 1))
@@ -111,10 +111,10 @@ def jacobians(points, camera):
 
 
 def outlines(points, sigma, live, camera):
-    """Centres [N, 2] and covariances [N, 2, 2] of the ellipses that ellipsoids show, by the dual conic.
+    """Centers [N, 2] and covariances [N, 2, 2] of the ellipses that ellipsoids show, by the dual conic.
 
     The dual quadric of an ellipsoid projects linearly: its outline's dual conic is K (Sigma - p p^T) K^T (Hartley and
-    Zisserman 2004, 8.3), and that of an ellipse with centre c and covariance S is
+    Zisserman 2004, 8.3), and that of an ellipse with center c and covariance S is
     a multiple of [S - c c^T, -c; -c^T, -1].
     """
     calibration = points.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -122,8 +122,8 @@ def outlines(points, sigma, live, camera):
     dual = torch.where(live[:, None, None], dual, -torch.eye(3, dtype=dual.dtype))
     dual = calibration @ dual @ calibration.T
     dual = dual / -dual[:, 2:, 2:]
-    centre = -dual[:, :2, 2]
-    return centre.clone(), (dual[:, :2, :2] + centre[:, :, None] * centre[:, None, :]) / OUTLINE**2
+    center = -dual[:, :2, 2]
+    return center.clone(), (dual[:, :2, :2] + center[:, :, None] * center[:, None, :]) / OUTLINE**2
 
 
 def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
@@ -149,12 +149,12 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
         ratio = torch.linalg.det(sharp) / torch.linalg.det(cov2d)
         opacity = opacities * ratio.clamp_min(2.5e-5).sqrt()  # the floor is the reference's
 
-    centre = torch.as_tensor(camera.center, dtype=torch.float64)
+    center = torch.as_tensor(camera.center, dtype=torch.float64)
     degree = int(sh.shape[1] ** 0.5) - 1
     degree = degree if sh_degree is None else min(degree, sh_degree)
-    basis = sh_basis(torch.nn.functional.normalize(means - centre, dim=1), degree)
-    colour = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
-    return Splats(means2d, z, cov2d, opacity, colour, live)
+    basis = sh_basis(torch.nn.functional.normalize(means - center, dim=1), degree)
+    color = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
+    return Splats(means2d, z, cov2d, opacity, color, live)
 
 
 def _alphas(splats, order, camera, pixels):
@@ -251,7 +251,7 @@ def exact_render(
     through = torch.cat([torch.ones_like(raw[:, :1].sum(1, keepdim=True)), torch.cumprod(1 - alpha, 1)], 1)
     weight = alpha * through[:, :-1]
     background = torch.as_tensor(background, dtype=torch.float64)
-    image = weight @ splats.colour[order] + through[:, -1:] * background
+    image = weight @ splats.color[order] + through[:, -1:] * background
     total = weight.sum(1)
     depth = torch.where(total > 0, weight @ splats.z[order] / torch.where(total > 0, total, 1), 0)
     return Render(

@@ -60,7 +60,7 @@ LN_2 = wp.constant(0.6931471805599453)
 def make_exp(degree: int | None) -> wp.Function:
     """2^-z for z >= 0 by a polynomial of ``degree`` (3 to 6), or by the C library (None).
 
-    wp.exp is a scalar libm call, which defeats the vectoriser. 2^-z = 2^-n 2^-f with n whole; 2^-125 is the least.
+    wp.exp is a scalar libm call, which defeats the vectorizer. 2^-z = 2^-n 2^-f with n whole; 2^-125 is the least.
     """
     if degree is None:
 

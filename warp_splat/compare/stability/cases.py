@@ -1,8 +1,8 @@
 """Stiff and extreme cases: what float64 says, what every adjoint gives, and whether that is what was stated.
 
-A catalogue of named inputs at the ends of what float32 holds. Each has a stated outcome: as in float64 within a limit,
+A catalog of named inputs at the ends of what float32 holds. Each has a stated outcome: as in float64 within a limit,
 or left out and counted; never NaN or infinity where float64 is finite. ``warp-splat compare --stability`` writes the
-table, and the tests run the same catalogue. The bounds are those of Higham, Accuracy and Stability of Numerical
+table, and the tests run the same catalog. The bounds are those of Higham, Accuracy and Stability of Numerical
 Algorithms, 2002: n eps for a product of n rounded factors, and the condition of a problem where that is larger.
 """
 

@@ -28,7 +28,7 @@ def logits() -> Problem:
 
 
 def clamp() -> Problem:
-    """Opacities of 0.99 and a few units in the last place around it, centred on pixels: alpha is at the clamp."""
+    """Opacities of 0.99 and a few units in the last place around it, centered on pixels: alpha is at the clamp."""
     camera = look(8, 8, seed=None)
     arrays = cloud(2, 24, camera, opacity=(0.99, 0.99), sigma=(0.8, 1.5))
     pixels = np.stack([np.arange(24) % 8 + 0.5, np.arange(24) // 8 * 2 + 0.5], 1)
