@@ -113,7 +113,7 @@ def _registered(monkeypatch):
     "options",
     [
         {"parts": "gain", "gain_lr": 0.05, "opacity_reset_interval": 100},
-        {"parts": "background,gain", "growth": "faint", "optimizer_type": "sparse_adam", "faint_below": 0.095},
+        {"parts": "random_background,gain", "growth": "faint", "optimizer_type": "sparse_adam", "faint_below": 0.095},
     ],
     ids=str,
 )
@@ -162,7 +162,7 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
     options = "--no-quiet --parts auto --growth faint --gain_lr 0.5 --iterations 12"
     assert train(tmp_path / "a", *options.split()) == 0
     out = "".join(capsys.readouterr())
-    assert "Part background: left out, since 0 of 43 photographs are transparent somewhere." in out
+    assert "Part random_background: left out, since 0 of 43 photographs are transparent somewhere." in out
     assert "Part gain: taken, since the brightness of the photographs varies by" in out and "as at the beginning" in out
     config = read_config(tmp_path / "a" / "config.toml")
     assert (config["parts"], config["growth"], config["gain_lr"]) == ("gain", "faint", 0.5)
@@ -174,7 +174,7 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
         main(["train", "--help"])
     assert "--gain_lr FLOAT" in capsys.readouterr().out
     begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
-    assert "--parts: expected auto, or some of background, gain" in fails(capsys, *begun, "--parts", "sky")
+    assert "--parts: expected auto, or some of random_background, gain" in fails(capsys, *begun, "--parts", "sky")
     assert "--growth: expected one of reference, faint" in fails(capsys, *begun, "--growth", "sky")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -139,30 +139,25 @@ class Optimizer:
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
         """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""
         for name in self.model.NAMES:
-            old = self.model.parameters[name]
-            self._swap(name, torch.cat([old.detach()[kept], added[name]]))
-            state = self.adam.state.get(self.model.parameters[name], {})
-            for moment in MOMENTS:
-                if moment in state:
-                    state[moment] = torch.cat([state[moment][kept], torch.zeros_like(added[name])])
+            rows, nothing = added[name], torch.zeros_like(added[name])
+            self._swap(name, torch.cat([self.model.parameters[name].detach()[kept], rows]))
+            self._change_moments(name, lambda moment, nothing=nothing: torch.cat([moment[kept], nothing]))
 
     def arrange(self, order: torch.Tensor) -> None:
         """Put the rows in ``order`` (indices), moments and all."""
         for name in self.model.NAMES:
             self._swap(name, self.model.parameters[name].detach()[order])
-            state = self.adam.state.get(self.model.parameters[name], {})
-            for moment in MOMENTS:
-                if moment in state:
-                    state[moment] = state[moment][order]
+            self._change_moments(name, lambda moment: moment[order])
 
     def reset_opacities(self, ceiling: float) -> None:
         """Lower every opacity to at most ``ceiling`` and forget its moments."""
         logits = self.model.parameters["opacities"].detach()
         self._swap("opacities", logits.clamp_max(math.log(ceiling / (1.0 - ceiling))))
-        state = self.adam.state.get(self.model.parameters["opacities"], {})
-        for moment in MOMENTS:
-            if moment in state:
-                state[moment] = torch.zeros_like(state[moment])
+        self._change_moments("opacities", torch.zeros_like)
+
+    def _change_moments(self, name: str, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        state = self.adam.state.get(self.model.parameters[name], {})
+        state.update({moment: change(state[moment]) for moment in MOMENTS if moment in state})
 
     def state(self) -> dict[str, torch.Tensor]:
         """The parameters and all that belongs to them, as ``kind.name``: gradients, moments, and images learned from.

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 class Entry(NamedTuple):
     """A line of the table of parts, or of that of growths."""
 
-    options: type  # a frozen dataclass of flags; where a part's has `asked` and it is true, --parts need not name it
+    options: type  # a frozen dataclass of flags
     place: str  # of the class, as module.Class
 
     def load(self) -> Any:

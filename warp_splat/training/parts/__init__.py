@@ -21,15 +21,10 @@ class BackgroundOptions:
 
     random_background: bool = rendering(False, "a random background color in every step")
 
-    @property
-    def asked(self) -> bool:
-        """Whether the flag asks for it by itself."""
-        return self.random_background
 
-
-#: In this order they act in each step.
+#: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
-    "background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
+    "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
 }
 
 
@@ -37,7 +32,7 @@ def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
     """The names of the parts to use, and a sentence for each that ``--parts auto`` has weighed."""
     used, told, named = [], [], config.model.parts.split(",")
     for name, entry in PARTS.items():
-        if name in named or getattr(config.plugins[name], "asked", False):
+        if name in named or getattr(config.plugins[name], name, False):
             used.append(name)
         elif named == [AUTO]:
             verdict = entry.load().needed(scene)
