@@ -23,12 +23,12 @@ from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
+from warp_splat.kernels.splat import BlendVariant
 
 BLOCK = 256
 REGISTERS = 65536  # of a multiprocessor, all architectures below
 #: Architecture: threads, blocks and KiB of shared memory of a multiprocessor (CUDA C++ Programming Guide, table 15).
 LIMITS = {75: (1024, 16, 64), 80: (2048, 32, 164), 86: (1536, 16, 100), 89: (1536, 24, 100), 90: (2048, 32, 228)}
-DEGREE = 5  # of the exponential, the default
 
 PROPERTIES = re.compile(r"Function (\S+):\s+REG:(\d+) STACK:(\d+) SHARED:(\d+)")
 
@@ -41,17 +41,18 @@ def modules() -> dict[str, wp.Module]:
         "adjoint of shade": sh_colors.make_adj_shade(1).module,
         "quarantine": project.quarantine.module,
         "adam": make_adam(15, 3).module,
-        "tiles": tiles.pack.module,
+        "pack": tiles.make_pack().module,
+        "tiles": tiles.find_spans.module,
     }
     for depth in (False, True):
-        suffix = ", depth" if depth else ""
-        found[f"blend{suffix}"] = make_blend_block(depth, DEGREE, False).module
-        found[f"blend, stored{suffix}"] = make_blend_block(depth, DEGREE, True).module
-        found[f"upstream{suffix}"] = make_upstream_block(depth).module
+        suffix, variant = ", depth" if depth else "", BlendVariant(3 + depth)
+        found[f"blend{suffix}"] = make_blend_block(variant).module
+        found[f"blend, stored{suffix}"] = make_blend_block(variant._replace(keep=True)).module
+        found[f"upstream{suffix}"] = make_upstream_block(variant).module
         for mode in ADJOINTS[:2]:
-            found[f"{mode}{suffix}"] = make_reverse_block(mode, depth, DEGREE).module
+            found[f"{mode}{suffix}"] = make_reverse_block(mode, variant).module
         for mode in ADJOINTS[2:]:
-            found[f"{mode}{suffix}"] = make_walk_block(mode, depth, DEGREE).module
+            found[f"{mode}{suffix}"] = make_walk_block(mode, variant).module
     return found
 
 

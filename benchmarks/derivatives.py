@@ -12,9 +12,9 @@ from common import write_table
 KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
 
 _CLAMP = ("splat.adj_alpha_of",)
-_EXP = ("step.adj_exp2_known", "step.adj_opaque", *_CLAMP)
+_EXP = ("falloff.adj_exp2_known", "step.adj_opaque", *_CLAMP)
 _ROOT = ("step.conic_from_root",)
-_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "cpu/taped.adj_exp2_value", *_ROOT)
+_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "cpu/taped.adj_fall_value", *_ROOT)
 _BEGIN = ("cpu/taped.replay_begin", "cpu/taped.adj_begin")
 _UNDO = ("cpu/taped.replay_front_of", "cpu/taped.adj_front_of", "splat.odds_of")
 _KEPT = ("cpu/taped.replay_front_of_kept", "cpu/taped.adj_front_of_kept")
@@ -25,13 +25,13 @@ RULES = {
     "stepwise": ("splat.odds_of", *_EXP, *_ROOT),
     "reversible": (*_BEGIN, *_UNDO, *_EXP, *_READ),
     "stored": (*_BEGIN, *_KEPT, *_EXP, *_READ),
-    "generated": (*_BEGIN, *_UNDO, "lanes.adj_halved"),
+    "generated": (*_BEGIN, *_UNDO, "simd.adj_halved"),
     "plain": (*_EXP, *_READ),
 }
 #: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
-_KNOWN = ("step.exp2_known", "step.opaque")
+_KNOWN = ("falloff.exp2_known", "step.opaque")
 _LOOP = ("cpu/adjoint.adj_blend", "cpu/adjoint.folded")
-_WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "cpu/taped.exp2_value", *_KNOWN)
+_WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "cpu/taped.fall_value", *_KNOWN)
 PLUMBING = {
     "manual": (*_LOOP, "cpu/adjoint._make_manual_body"),
     "stepwise": (*_LOOP, "cpu/adjoint._make_stepwise_body", "step.make_stepwise", *_KNOWN),
@@ -62,7 +62,7 @@ class _Specialize(ast.NodeTransformer):
     """Removes docstrings, and the branches of ``if wp.static(...)`` that a mode does not take."""
 
     def __init__(self, mode: str):
-        self.known = {"mode": mode, "depth": False}
+        self.known = {"mode": mode, "CHANNELS": 3}
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         super().generic_visit(node)

@@ -12,7 +12,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.cuda.adjoint import make_reverse_block
 from warp_splat.raster.cuda import THREADS, spread_upstream
-from warp_splat.raster.data import Gaussians, Pixels
+from warp_splat.raster.data import Gaussians, Pixels, variant_of
 from warp_splat.raster.drivers import CUDA
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, launch_blocks, view
@@ -83,7 +83,7 @@ class Blends:
         lists = self.bins.views(self.options)
         states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
         inputs = [*lists, *states, view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
-        kernel = make_reverse_block("manual", False, self.options.exp_degree, *write)
+        kernel = make_reverse_block("manual", variant_of(self.options), *write)
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
 
     def into_slots(self) -> None:

@@ -8,7 +8,8 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.splat import LN_2, Splat2D
+from warp_splat.kernels.falloff import LN_2
+from warp_splat.kernels.splat import Splat2D
 
 wp.set_module_options(FORWARD_ONLY)
 vec9 = wp.types.vector(length=9, dtype=float)

@@ -24,8 +24,9 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, offset_x, offset_y, reach
+from warp_splat.kernels.falloff import make_exp
 from warp_splat.kernels.simd import LANES, total, vec16, where_less
-from warp_splat.kernels.splat import Splat2D, alpha_of, exponent, make_exp
+from warp_splat.kernels.splat import Splat2D, alpha_of, exponent
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import camera_view, project

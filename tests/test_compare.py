@@ -15,6 +15,7 @@ from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.simd import LANES, vec16
+from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
@@ -45,7 +46,7 @@ def test_what_is_differentiated_is_the_blend(mode):
     slots = torch.zeros(len(bins.instances), 9)
     states = [view(state, vec16) for state in (final, count, kept)]
     inputs = [*lists, *states, view(steps, wp.int32), view(slots, wp.float32)]
-    launch(make_walk(mode, False, 5), len(final), inputs, [view(color, vec16), view(behind, vec16)])
+    launch(make_walk(mode, BlendVariant()), len(final), inputs, [view(color, vec16), view(behind, vec16)])
     assert torch.allclose(behind, final, rtol=1e-6, atol=0)
     height, width, _ = image.shape
     for tile in range(len(final)):

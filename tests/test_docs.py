@@ -205,13 +205,16 @@ def example():
 @pytest.mark.parametrize("page", [page for page in USERS if "```python" in page.read_text()], ids=name_of)
 def test_code(page, tmp_path, monkeypatch):
     monkeypatch.chdir(with_scene(tmp_path))
-    names = {}
+    monkeypatch.syspath_prepend(tmp_path)
+    names, before = {}, ""
     exec(example(), names)
     for language, text in blocks(page):
-        if language == "diff":  # from here on, see below
-            break
-        if language == "python":
+        if file := re.match(r"# (\w+\.py)\n", text):
+            Path(file[1]).write_text(text)
+        elif language == "python" and before != "diff":  # what follows a change of the package: see below
             exec(text, names)
+        before = language
+    assert "report" not in names or names["report"].ok
     assert all(names[name].grad.isfinite().all() for name in ("means", "quats", "scales", "opacities", "sh"))
 
 
@@ -231,23 +234,11 @@ EVIDENCE = (
     assert seen.sum() > 100 and torch.allclose(out.means2d[seen].double(), wanted[seen], atol=1e-3)
     assert warp_splat.check_gradients(means, quats, scales, opacities, sh, flat).ok
     """,
-    """
-    one = [tensor[:1].detach() for tensor in (means, quats, scales, opacities, sh)]
-    out = warp_splat.rasterize(*one, camera)
-    (x, y), (a, b, c), opacity = out.means2d[0], out.conics[0], out.opacities2d[0]
-    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5 - y, torch.arange(camera.width) + 0.5 - x, indexing="ij")
-    alpha = opacity / (1 + 0.5 * (a * u * u + 2 * b * u * v + c * v * v))
-    wanted = torch.where(alpha < 1 / 255, 0, alpha.clamp(max=0.99))
-    assert (wanted > 0).sum() > 20 and (out.alpha - wanted).abs().max() < 1e-5
-    report = warp_splat.check_gradients(means, quats, scales, opacities, sh, camera, adjoint="stepwise")
-    assert report.ok
-    assert not warp_splat.check_gradients(means, quats, scales, opacities, sh, camera).ok
-    """,
 )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("place", [0])
 def test_changed_kernels(place, tmp_path):
     """The changes that docs/extending.md proposes, each made to a copy of the package."""
     found = blocks(DOCS / "extending.md")

@@ -10,6 +10,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "camera",
+    "Falloff": "kernels.falloff",
     "InputError": "errors",
     "RasterOptions": "config",
     "RenderOutput": "raster.api",
@@ -22,6 +23,7 @@ _HOMES = {
 }
 __all__ = [
     "Camera",
+    "Falloff",
     "InputError",
     "RasterOptions",
     "RenderOutput",
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from warp_splat.camera import Camera
     from warp_splat.config import RasterOptions
     from warp_splat.errors import InputError
+    from warp_splat.kernels.falloff import Falloff
     from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
     from warp_splat.raster.gradcheck import check_gradients
     from warp_splat.runtime.launch import get_threads, set_threads

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from warp_splat.flags import argument, film, flag, machinery, reporting
+
+if TYPE_CHECKING:
+    from warp_splat.kernels.falloff import Falloff
 
 # The renderer's constants (those of the reference implementation, Kerbl et al. 2023).
 ALPHA_MIN = 1.0 / 255.0  # a Gaussian weaker than this at a pixel is skipped there
@@ -52,6 +56,7 @@ class RasterOptions:
         extent: which tiles list a Gaussian: "ellipse" (exactly those where its opacity reaches ``alpha_min``) or
             "square" (of the reference: 3 standard deviations of the long axis).
         exp_degree: degree of the polynomial in the exponential, 3 to 6; None calls the C library's, without lanes.
+        falloff: of your own instead of the Gaussian's, see :class:`warp_splat.Falloff`; not with adjoint "manual".
     """
 
     depth: bool = False
@@ -63,6 +68,7 @@ class RasterOptions:
     max_steps: int | None = None
     extent: str = "ellipse"
     exp_degree: int | None = 5
+    falloff: Falloff | None = None
 
 
 @dataclass

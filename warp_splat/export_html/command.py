@@ -21,7 +21,7 @@ from warp_splat.export_html import pack
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_text
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.kernels import harmonics, splat
+from warp_splat.kernels import falloff, harmonics
 
 SHADERS = ("screen.glsl", "project.glsl", "outline.glsl", "blend.glsl", "resolve.glsl")
 HARMONICS = ("C0", "C1", "C2A", "C2B", "C2C", "C3A", "C3B", "C3C", "C3D", "C3E")
@@ -134,5 +134,5 @@ def _constants(options: dict[str, object]) -> str:
     values = {name: getattr(constants, name) for name in names}
     values |= {name: getattr(harmonics, name) for name in HARMONICS}
     values |= {name: float(getattr(pack, name)) for name in STEPS}
-    values |= {"LOG2_E": float(splat.LOG2_E), "TOE": TOE, **options}
+    values |= {"LOG2_E": float(falloff.LOG2_E), "TOE": TOE, **options}
     return "\n".join(f"const {type(value).__name__} {name} = {str(value).lower()};" for name, value in values.items())

@@ -28,6 +28,7 @@ import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR, OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.compiler import DIFFERENTIABLE_LANES, IN_ORDER
+from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.simd import (
     LANES,
     TYPES,
@@ -48,7 +49,6 @@ from warp_splat.kernels.simd import (
     vec16,
     whole,
 )
-from warp_splat.kernels.splat import reach_of
 
 wp.set_module_options(IN_ORDER)
 
@@ -79,23 +79,12 @@ class CameraView:
     alpha_min: float
 
 
-@wp.func
-def reaches(opacity: float, alpha_min: float):
-    """:func:`reach_of` in every lane."""
-    return reach_of(opacity, alpha_min)
-
-
-@wp.func
-def reaches(opacity: vec16, alpha_min: float):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = reach_of(opacity[lane], alpha_min)
-    return r
-
-
 @functools.cache
-def make_project(lanes: int) -> wp.Kernel:
-    """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU. Its adjoint is Warp's."""
+def make_project(lanes: int, reach_of: wp.Function = reach_of) -> wp.Kernel:
+    """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU. Its adjoint is Warp's.
+
+    ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`).
+    """
     number, integer, row2, row3, row4 = TYPES[lanes]
 
     @wp.func
@@ -115,6 +104,16 @@ def make_project(lanes: int) -> wp.Kernel:
     @wp.func_grad(largest)
     def adj_largest(a: number, b: number, c: number, d: number, adj_ret: number):
         pass
+
+    @wp.func
+    def reaches(opacity: vec16, alpha_min: float):
+        """``reach_of`` in every lane."""
+        r = vec16()
+        for lane in range(LANES):
+            r[lane] = reach_of(opacity[lane], alpha_min)
+        return r
+
+    reaches = reaches if lanes > 1 else reach_of
 
     @wp.func
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):

@@ -1,11 +1,8 @@
 """The adjoint of one step of the blend, for one pixel or for lanes: by hand, or differentiated by Warp.
 
 Both drivers' reverse loops call one of the two; what they share with the loops that Warp differentiates whole is here,
-too. ``number`` is float or vec16. The step is sliced so that a kernel calls the exponential at one place: LLVM inlines
-a function of that size only then, and a call costs more than the step. So there is ``exp2_known``, whose gradient uses
-a value that is there already. Tried:
-
-- 2.9 x the time: three calls
+too. ``number`` is float or vec16. The step is sliced so that the Gaussian is computed at one place of a kernel
+(:mod:`warp_splat.kernels.falloff`).
 """
 
 import functools
@@ -14,40 +11,11 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.falloff import LN_2, LOG2_E, make_falloff
 from warp_splat.kernels.simd import fill, inner, times, vec16, where_less
-from warp_splat.kernels.splat import (
-    LN_2,
-    LOG2_E,
-    adj_alpha_blend,
-    adj_alpha_of,
-    alpha_of,
-    exponent,
-    make_exp,
-    odds_of,
-)
+from warp_splat.kernels.splat import BlendVariant, adj_alpha_blend, adj_alpha_of, alpha_of, exponent, odds_of
 
 wp.set_module_options(FORWARD_ONLY)
-
-
-@wp.func
-def exp2_known(z: float, value: float):
-    """2^-z, computed before."""
-    return value
-
-
-@wp.func
-def exp2_known(z: vec16, value: vec16):
-    return value
-
-
-@wp.func_grad(exp2_known)
-def adj_exp2_known(z: float, value: float, adj_ret: float):
-    wp.adjoint[z] += times(value, adj_ret) * -LN_2
-
-
-@wp.func_grad(exp2_known)
-def adj_exp2_known(z: vec16, value: vec16, adj_ret: vec16):
-    wp.adjoint[z] += times(value, adj_ret) * -LN_2
 
 
 @wp.func
@@ -92,9 +60,9 @@ def geometry_from_moments(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.
 
 
 @functools.cache
-def make_manual(exp_degree: int | None, number: type) -> wp.Function:
-    """The adjoint of a step by hand (top of :mod:`warp_splat.kernels.splat`)."""
-    exp2_minus = make_exp(exp_degree)
+def make_manual(falloff: int | None, number: type) -> wp.Function:
+    """The adjoint of a step by hand (top of :mod:`warp_splat.kernels.splat`), of the Gaussian."""
+    fall_at = make_falloff(falloff).value
 
     @wp.func
     def adj_step(
@@ -108,7 +76,7 @@ def make_manual(exp_degree: int | None, number: type) -> wp.Function:
         lit: number,  # color . u
     ):
         """T in front, T dL/dT in front, the weight, and dL/dopacity of every pixel (times opacity: -dL/dq)."""
-        fall = exp2_minus(z)
+        fall = fall_at(z)
         raw = where_less(here, walked, fall * opacity, fill(-1.0, z))
         odds = odds_of(alpha_of(raw, alpha_min))
         w = times(t, odds)
@@ -128,12 +96,12 @@ class Stepwise(NamedTuple):
 
 
 @functools.cache
-def make_stepwise(depth: bool, exp_degree: int | None, number: type) -> Stepwise:
+def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
     """A step whose adjoint is wp.grad(step), as in the rasterizer written in Slang (Bangaru et al. 2023).
 
     A kernel may call a function that calls wp.grad, but no deeper: Warp 1.19 emits the functions in the wrong order.
     """
-    exp2_minus = make_exp(exp_degree)
+    (fall_at, fall_known, _), CHANNELS = make_falloff(variant.falloff), variant.channels
 
     @wp.struct
     class Parcel:
@@ -152,8 +120,8 @@ def make_stepwise(depth: bool, exp_degree: int | None, number: type) -> Stepwise
 
     @wp.func
     def undo(parcel: Parcel, t: number, alpha_min: float, here: number, walked: number):
-        """2^-z and the transmittance in front, from that behind."""
-        fall = exp2_minus(exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy))
+        """The falloff and the transmittance in front, from that behind."""
+        fall = fall_at(exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy))
         odds = odds_of(opaque(times(fall, parcel.opacity), alpha_min, here, walked))
         return fall, t + times(t, odds)
 
@@ -173,10 +141,10 @@ def make_stepwise(depth: bool, exp_degree: int | None, number: type) -> Stepwise
     ):
         """What the step adds to the loss, T behind it seen as a quantity of weight dL/dT."""
         z = exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy)
-        alpha = opaque(times(exp2_known(z, fall), parcel.opacity), alpha_min, here, walked)
+        alpha = opaque(times(fall_known(z, fall), parcel.opacity), alpha_min, here, walked)
         w = times(alpha, t)
         lit = times(parcel.red, red) + times(parcel.green, green) + times(parcel.blue, blue)
-        if wp.static(depth):
+        if wp.static(CHANNELS > 3):
             lit = lit + times(parcel.depth, far)
         return inner(w, lit) + inner(adj_behind, t - w)
 

@@ -22,11 +22,14 @@ A GPU stores splats by depth and sorts the instances. There one kernel runs twic
 then to write them: it is the same machine code, and rounds alike.
 """
 
+import functools
+
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.splat import LOG2_E, Splat2D, reach_of
+from warp_splat.kernels.falloff import LOG2_E, reach_of
+from warp_splat.kernels.splat import Splat2D
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -52,40 +55,46 @@ def square_of(extent: wp.vec2, conic: wp.vec3, reach: float):
     return wp.vec2(side, side)
 
 
-@wp.kernel
-def pack(
-    first: int,  # splat of this slice
-    gaussians: wp.array[int],  # [V] Gaussian of each splat
-    means2d: wp.array[wp.vec2],  # [N]
-    conics: wp.array[wp.vec3],  # [N]
-    opacities: wp.array[float],  # [N]
-    colors: wp.array[wp.vec3],  # [N]
-    depths: wp.array[float],  # [N]
-    extents: wp.array[wp.vec2],  # [N]
-    height: int,
-    alpha_min: float,
-    square: int,  # 1: look at the square of the reference instead of the ellipse
-    # out
-    splats_out: wp.array[Splat2D],  # [V]
-    rows_out: wp.array[int],  # [V] rows of tiles that the box touches
-):
-    v = first + wp.tid()
-    i = gaussians[v]
-    splat = Splat2D()
-    splat.mean = means2d[i]
-    splat.extent = extents[i]
-    # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
-    root = wp.sqrt(0.5 * LOG2_E * conics[i][0])
-    splat.opacity = opacities[i]
-    reach = reach_of(splat.opacity, alpha_min)
-    splat.root = wp.vec3(root, 0.5 * LOG2_E * conics[i][1] / root, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
-    if square != 0:
-        splat.extent = square_of(splat.extent, conics[i], reach)
-    splat.color = colors[i]
-    splat.depth = depths[i]
-    splats_out[v] = splat
-    span = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
-    rows_out[v] = wp.max(span[1] // TILE - span[0] // TILE + 1, 0)
+@functools.cache
+def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
+    """Splats, as the blends read them; ``reach_of`` says where their falloff ends."""
+
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
+    def pack(
+        first: int,  # splat of this slice
+        gaussians: wp.array[int],  # [V] Gaussian of each splat
+        means2d: wp.array[wp.vec2],  # [N]
+        conics: wp.array[wp.vec3],  # [N]
+        opacities: wp.array[float],  # [N]
+        colors: wp.array[wp.vec3],  # [N]
+        depths: wp.array[float],  # [N]
+        extents: wp.array[wp.vec2],  # [N]
+        height: int,
+        alpha_min: float,
+        square: int,  # 1: look at the square of the reference instead of the ellipse
+        # out
+        splats_out: wp.array[Splat2D],  # [V]
+        rows_out: wp.array[int],  # [V] rows of tiles that the box touches
+    ):
+        v = first + wp.tid()
+        i = gaussians[v]
+        splat = Splat2D()
+        splat.mean = means2d[i]
+        splat.extent = extents[i]
+        # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
+        root = wp.sqrt(0.5 * LOG2_E * conics[i][0])
+        splat.opacity = opacities[i]
+        reach = reach_of(splat.opacity, alpha_min)
+        splat.root = wp.vec3(root, 0.5 * LOG2_E * conics[i][1] / root, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
+        if square != 0:
+            splat.extent = square_of(splat.extent, conics[i], reach)
+        splat.color = colors[i]
+        splat.depth = depths[i]
+        splats_out[v] = splat
+        span = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
+        rows_out[v] = wp.max(span[1] // TILE - span[0] // TILE + 1, 0)
+
+    return pack
 
 
 @wp.struct

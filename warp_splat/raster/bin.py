@@ -13,7 +13,7 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D
+from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D, falloff_of
 from warp_splat.runtime.launch import (
     available_memory,
     empty,
@@ -47,7 +47,8 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions) 
     gaussians, square = _array(drawn), int(options.extent == "square")
     inputs = [gaussians, *splats2d.views(), camera.height, options.alpha_min, square]
     # one thread sorts while others pack
-    launch(tiles.pack, count, inputs, [splats, _array(rows)], beside=partial(order_by_depth, nearness, order))
+    pack = tiles.make_pack(falloff_of(options).reach_of)
+    launch(pack, count, inputs, [splats, _array(rows)], beside=partial(order_by_depth, nearness, order))
     by_depth = _taken(rows, order)
     row_ends = np.cumsum(by_depth, dtype=np.int64)  # a 32-bit scan wraps without a word
     _check_count(_last(row_ends), camera, count, splats2d.radii.device)
@@ -79,7 +80,8 @@ def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -
     rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
     square = int(options.extent == "square")
     inputs = [order, *splats2d.views(), camera.height, options.alpha_min, square]
-    launch(tiles.pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
+    pack = tiles.make_pack(falloff_of(options).reach_of)
+    launch(pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
     inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
 
     def list_tiles(place_ends: torch.Tensor, *lists: torch.Tensor) -> None:

@@ -7,6 +7,7 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
+from warp_splat.errors import InputError
 from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import stage
@@ -38,7 +39,13 @@ class Blend(torch.autograd.Function):
     def forward(
         ctx, means2d, conics, opacities, colors, depths, background, bins, camera, options, adjoint, driver, dropped
     ):
-        keep = adjoint == "stored" and any(ctx.needs_input_grad)
+        differentiated = any(ctx.needs_input_grad)
+        if adjoint == "manual" and options.falloff is not None and differentiated:
+            raise InputError(
+                "adjoint: 'manual' is the derivative of the Gaussian, and options.falloff is another falloff; use "
+                "'stepwise', 'reversible' or 'stored'."
+            )
+        keep = adjoint == "stored" and differentiated
         background = background.contiguous()
         pixels, saved = driver.blend(bins, camera, background, options, keep)
         ctx.save_for_backward(background, *saved)

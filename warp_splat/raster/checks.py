@@ -11,6 +11,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.kernels.falloff import Falloff
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import DRIVERS
 
@@ -44,6 +45,8 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         if not is_one_of(getattr(options, name), choices):
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
+    if not (options.falloff is None or isinstance(options.falloff, Falloff)):
+        raise InputError(f"options.falloff: expected a warp_splat.Falloff or None, got {options.falloff!r:.80}.")
     for name in ("depth", "antialiasing"):
         if not isinstance(getattr(options, name), bool):
             raise InputError(f"options.{name}: expected True or False, got {getattr(options, name)!r}.")

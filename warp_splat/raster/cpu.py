@@ -20,7 +20,7 @@ from warp_splat.kernels.cpu.taped import make_walk, rows_of_copies
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.bin import room_for_states
-from warp_splat.raster.data import Bins, Pixels, limits_of
+from warp_splat.raster.data import Bins, Pixels, limits_of, variant_of
 from warp_splat.runtime.launch import empty, in_slices, launch, view
 
 #: Gaussians whose slots a thread sums at a time. Fresh pages for the sums of all would cost 15 to 50 ms at 1M
@@ -45,7 +45,7 @@ def blend(
     final, count = new(tile_count, BLOCKS, LANES), new(tile_count, BLOCKS, LANES)
     kept = room_for_states(bins).view(-1, BLOCKS, LANES) if keep else new(0, 0, LANES)
     launch(
-        make_blend(options.depth, options.exp_degree, keep),
+        make_blend(variant_of(options, keep)),
         tile_count,
         [*bins.views(options), *limits_of(options), view(background, wp.float32)],
         [*pixels.views(), *_in_lanes(final, count, kept)],
@@ -81,13 +81,13 @@ def _spread_upstream(bins: Bins, options: RasterOptions, background, final, coun
     The zeros are for the instances that the adjoint does not walk.
     """
     tile_count, new = len(bins.ranges), background.new_empty
-    up = new(tile_count, BLOCKS * (4 if options.depth else 3), LANES)
+    up = new(tile_count, BLOCKS * variant_of(options).channels, LANES)
     adj_final, adj_background = torch.empty_like(final), new(tile_count, 3)
     dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
     tiles_x, ranges, *_ = bins.views(options)
     slot = wp.types.vector(length=slots.shape[1], dtype=float)
     launch(
-        make_upstream(options.depth),
+        make_upstream(variant_of(options)),
         tile_count,
         [tiles_x, ranges, view(background, wp.float32), *_in_lanes(final, count), *adj_pixels.views()],
         [
@@ -105,9 +105,9 @@ def differentiate(mode: str, bins: Bins, options: RasterOptions, saved, upstream
     (final, count, kept), steps, rows = saved, view(steps, wp.int32), view(slots, wp.float32)
     if mode in ("manual", "stepwise"):
         inputs = [*lists, final, count, steps, *upstream]
-        launch(make_reverse(mode, options.depth, options.exp_degree), tile_count, inputs, [rows], bounds=bins.slices)
+        launch(make_reverse(mode, variant_of(options)), tile_count, inputs, [rows], bounds=bins.slices)
         return
-    walk, inputs = make_walk(mode, options.depth, options.exp_degree), [final, count, kept, steps, rows]
+    walk, inputs = make_walk(mode, variant_of(options)), [final, count, kept, steps, rows]
     # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``rows``
     if mode != "generated":
         inputs = [*lists, *inputs]

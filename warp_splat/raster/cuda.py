@@ -12,7 +12,7 @@ from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_bl
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.raster.bin import room_for_states
-from warp_splat.raster.data import WIDTHS, Bins, Pixels, limits_of
+from warp_splat.raster.data import WIDTHS, Bins, Pixels, limits_of, variant_of
 from warp_splat.runtime.launch import launch_blocks, view
 
 THREADS = TILE * TILE
@@ -27,7 +27,7 @@ def blend(
     final, count = new(tile_count, THREADS), new(tile_count, THREADS, dtype=torch.int32)
     kept = room_for_states(bins) if keep else new(0, THREADS)
     launch_blocks(
-        make_blend_block(options.depth, options.exp_degree, keep),
+        make_blend_block(variant_of(options, keep)),
         tile_count,
         [*bins.views(options), *limits_of(options), _float(background)],
         [*pixels.views(), _float(final), view(count, wp.int32), _float(kept)],
@@ -48,10 +48,10 @@ def adjoint(
     inputs = [*bins.views(options), _float(final), view(count, wp.int32)]
     upstream, steps, rows = [view(up, wp.vec4), _float(adj_final)], view(steps, wp.int32), _float(slots)
     if mode in ("manual", "stepwise"):
-        kernel = make_reverse_block(mode, options.depth, options.exp_degree)
+        kernel = make_reverse_block(mode, variant_of(options))
         launch_blocks(kernel, tile_count, [*inputs, steps, *upstream], [rows], device)
     else:
-        walk, inputs = make_walk_block(mode, options.depth, options.exp_degree), [*inputs, _float(kept), steps, rows]
+        walk, inputs = make_walk_block(mode, variant_of(options)), [*inputs, _float(kept), steps, rows]
         adjoint = {"adj_inputs": [None] * len(inputs), "adj_outputs": upstream}
         launch_blocks(walk, tile_count, inputs, upstream, device, **adjoint)
     return slots, adj_background.sum(0), dropped
@@ -68,7 +68,7 @@ def spread_upstream(bins: Bins, options: RasterOptions, background, final, count
     tiles_x, ranges, *_ = bins.views(options)
     outputs = [view(up, wp.vec4), _float(adj_final), _float(adj_background)]
     launch_blocks(
-        make_upstream_block(options.depth),
+        make_upstream_block(variant_of(options)),
         tile_count,
         [tiles_x, ranges, _float(background), _float(final), view(count, wp.int32), *adj_pixels.views()],
         [*outputs, view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],

@@ -13,6 +13,8 @@ import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import T_LEAST, RasterOptions
+from warp_splat.kernels.falloff import FalloffFunctions, make_falloff
+from warp_splat.kernels.splat import BlendVariant
 from warp_splat.runtime.launch import view
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
@@ -69,7 +71,7 @@ class Bins:
 
     def new_slots(self, options: RasterOptions) -> torch.Tensor:
         """Room for a row of gradients per tile instance, [M, 9 or 10]."""
-        count, columns = len(self.instances), sum(WIDTHS) - (not options.depth)
+        count, columns = len(self.instances), variant_of(options).columns
         return torch.empty(count, columns, dtype=torch.float32, device=self.instances.device)
 
     def new_gradients(self, slots: torch.Tensor) -> list[torch.Tensor]:
@@ -114,6 +116,16 @@ class Dropped:
     def gaussians(self) -> int:
         """Gaussians whose own gradient was not finite."""
         return int(self.gaussian_count)
+
+
+def falloff_of(options: RasterOptions) -> FalloffFunctions:
+    """What kernels call for the falloff of ``options``."""
+    return make_falloff(variant_of(options).falloff)
+
+
+def variant_of(options: RasterOptions, keep: bool = False) -> BlendVariant:
+    """What the kernels are compiled for; with ``keep``, every transmittance is stored."""
+    return BlendVariant(3 + options.depth, options.exp_degree if options.falloff is None else options.falloff, keep)
 
 
 def limits_of(options: RasterOptions) -> list:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade, mat53, mat73
 from warp_splat.kernels.simd import TYPES
-from warp_splat.raster.data import Dropped, Gaussians, Splats2D
+from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import SMALLEST_SLICE, even_slices, in_slices, launch, stage, torch_slices, view
 
@@ -50,11 +50,13 @@ def project(
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options)
     driver = driver or driver_of(gaussians.means.device)
-    return Splats2D(*Project.apply(*gaussians, cam, driver, dropped or Dropped()))
+    reach_of = falloff_of(options).reach_of
+    return Splats2D(*Project.apply(*gaussians, cam, reach_of, driver, dropped or Dropped()))
 
 
 def _project_geometry(
     cam: CameraView,
+    reach_of: wp.Function,
     lanes: int,
     inputs: Sequence[torch.Tensor],
     outputs: Sequence[torch.Tensor],
@@ -67,6 +69,7 @@ def _project_geometry(
 
     Args:
         cam: camera.
+        reach_of: where the falloff ends.
         lanes: Gaussians that a kernel takes at once.
         inputs: means, quats, scales, opacities.
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
@@ -76,10 +79,11 @@ def _project_geometry(
     count = len(outputs[-1])
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
-    _project_groups(cam, lanes, *([tensor[:whole] for tensor in table] for table in tables))
+    kernel = make_project(lanes, reach_of)
+    _project_groups(kernel, cam, lanes, *([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
         last = [[_filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
-        _project_groups(cam, lanes, *last)
+        _project_groups(kernel, cam, lanes, *last)
         for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
             tensor[whole:] = group[: count - whole]
 
@@ -90,7 +94,7 @@ def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     return full
 
 
-def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> None:
+def _project_groups(kernel, cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> None:
     """See :func:`_project_geometry`; N is a multiple of ``lanes``."""
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
@@ -105,7 +109,7 @@ def _project_groups(cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> Non
         adj_in, adj_out = in_groups(adj_inputs, types_in), in_groups(adj_outputs[:4], types_out)
         adjoint = {"adj_inputs": [cam, *adj_in], "adj_outputs": [*adj_out, None, None]}
     given, found = [cam, *in_groups(inputs, types_in)], in_groups(outputs, types_out)
-    _launch_groups(make_project, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
+    _launch_groups(kernel, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
 
 
 def _by_degree(sh_rest: torch.Tensor) -> list:
@@ -116,32 +120,30 @@ def _by_degree(sh_rest: torch.Tensor) -> list:
     ]
 
 
-def _launch_groups(
-    make_kernel: Callable[[int], wp.Kernel], lanes: int, count: int, inputs, outputs, device, **adjoint
-) -> None:
-    """Launch a kernel for groups of lanes on ``count`` Gaussians."""
+def _launch_groups(kernel: wp.Kernel, lanes: int, count: int, inputs, outputs, device, **adjoint) -> None:
+    """Launch a kernel for groups of ``lanes`` on ``count`` Gaussians."""
     groups = -(-count // lanes)
     bounds = even_slices(groups, SMALLEST_SLICE // lanes)
-    launch(make_kernel(lanes), groups, inputs, outputs, bounds=bounds, device=device, **adjoint)
+    launch(kernel, groups, inputs, outputs, bounds=bounds, device=device, **adjoint)
 
 
 class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, driver, dropped):
+    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, reach_of, driver, dropped):
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
         count, new, lanes = means.shape[0], means.new_zeros, driver.lanes
         splats = Splats2D(
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
             radii=torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device),
         )
-        _project_geometry(cam, lanes, _shapes(gaussians), _geometry(splats))
+        _project_geometry(cam, reach_of, lanes, _shapes(gaussians), _geometry(splats))
         given = [cam, *_views3d([gaussians.means, gaussians.sh_dc[:, 0]]), *_by_degree(gaussians.sh_rest)]
         found = [*splats.views(), view(splats.radii, wp.int32)]
-        _launch_groups(make_shade, lanes, count, given, found, means.device)
+        _launch_groups(make_shade(lanes), lanes, count, given, found, means.device)
         ctx.save_for_backward(*gaussians, *splats)
-        ctx.cam, ctx.driver, ctx.dropped = cam, driver, dropped
+        ctx.cam, ctx.reach_of, ctx.driver, ctx.dropped = cam, reach_of, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
         return tuple(splats)
 
@@ -158,10 +160,11 @@ class Project(torch.autograd.Function):
             means, colors, adj_colors = _views3d([given.means, splats.colors, adj_splats.colors])
             inputs = [ctx.cam, means, *_by_degree(rest), seen, colors, adj_colors]
             outputs = [*_views3d([adj_placed, adj_dc[:, 0]]), *_by_degree(adj_rest)]
-            _launch_groups(make_adj_shade, lanes, count, inputs, outputs, device)
+            _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
             shapes = (torch.zeros_like(tensor) for tensor in (given.quats, given.scales, given.opacities))
             adj = Gaussians(adj_placed, *shapes, adj_dc, adj_rest)
-            _project_geometry(ctx.cam, lanes, _shapes(given), _geometry(splats), _shapes(adj), _geometry(adj_splats))
+            outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
+            _project_geometry(ctx.cam, ctx.reach_of, lanes, _shapes(given), outputs, _shapes(adj), adj_outputs)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)
@@ -170,7 +173,7 @@ class Project(torch.autograd.Function):
                 launch(quarantine, count, [seen], found, device=device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
-        return *(tensor if wants else None for tensor, wants in wanted), None, None, None
+        return *(tensor if wants else None for tensor, wants in wanted), *[None] * 4
 
 
 def _geometry(splats: Splats2D) -> list[torch.Tensor]:

@@ -11,7 +11,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
 from warp_splat.kernels.simd import LANES, times, vec16
-from warp_splat.kernels.splat import Splat2D, exponent
+from warp_splat.kernels.splat import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
 
 vec5 = wp.types.vector(length=5, dtype=float)
@@ -32,10 +32,10 @@ def folded(halves: wp.array[vec8], quarters: wp.array[wp.vec4], row: int):
 
 
 @functools.cache
-def _make_manual_body(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.Function]:
+def _make_manual_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
     """What the loop does with a Gaussian and a block, and how its sums become gradients."""
-    adj_step = make_manual(exp_degree, vec16)
-    mat_grads = _mat_grads(depth)
+    adj_step, CHANNELS = make_manual(variant.falloff, vec16), variant.channels
+    mat_grads = wp.types.matrix(shape=(variant.columns, LANES), dtype=float)
 
     @wp.func
     def body(
@@ -54,40 +54,40 @@ def _make_manual_body(depth: bool, exp_degree: int | None) -> tuple[wp.Function,
     ):
         """Both in front, and what to sum over pixels: d, d d', 1 times dL/dopacity, and the channels' gradients."""
         lit = red * splat.color[0] + green * splat.color[1] + blue * splat.color[2]
-        if wp.static(depth):
+        if wp.static(CHANNELS > 3):
             lit = lit + far * splat.depth
         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
         front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
         part = mat_grads()
         adj_x = times(adj_opacity, dx)
         adj_y = times(adj_opacity, dy)
-        part[0] = adj_x
-        part[1] = adj_y
-        part[2] = times(adj_x, dx)
-        part[3] = times(adj_x, dy)
-        part[4] = times(adj_y, dy)
-        part[5] = adj_opacity
-        part[6] = times(w, red)
-        part[7] = times(w, green)
-        part[8] = times(w, blue)
-        if wp.static(depth):
-            part[9] = times(w, far)
+        part[MEAN_X] = adj_x
+        part[MEAN_Y] = adj_y
+        part[XX] = times(adj_x, dx)
+        part[XY] = times(adj_x, dy)
+        part[YY] = times(adj_y, dy)
+        part[OPACITY] = adj_opacity
+        part[CHANNEL] = times(w, red)
+        part[CHANNEL + 1] = times(w, green)
+        part[CHANNEL + 2] = times(w, blue)
+        if wp.static(CHANNELS > 3):
+            part[CHANNEL + 3] = times(w, far)
         return front, adj_front, part
 
     @wp.func
     def adj_geometry(sums: vec5, splat: Splat2D):
         """dL/d(mean, conic)."""
-        s = wp.vec2(sums[0], sums[1])
-        return geometry_from_moments(s, sums[2], sums[3], sums[4], splat.root, splat.opacity)
+        s = wp.vec2(sums[MEAN_X], sums[MEAN_Y])
+        return geometry_from_moments(s, sums[XX], sums[XY], sums[YY], splat.root, splat.opacity)
 
     return body, adj_geometry
 
 
 @functools.cache
-def _make_stepwise_body(depth: bool, exp_degree: int | None) -> tuple[wp.Function, wp.Function]:
+def _make_stepwise_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
     """What the loop does with a Gaussian and a block, and how its sums become gradients."""
-    Parcel, undo, step = make_stepwise(depth, exp_degree, vec16)
-    mat_grads = _mat_grads(depth)
+    (Parcel, undo, step), CHANNELS = make_stepwise(variant, vec16), variant.channels
+    mat_grads = wp.types.matrix(shape=(variant.columns, LANES), dtype=float)
 
     @wp.func
     def body(
@@ -121,45 +121,38 @@ def _make_stepwise_body(depth: bool, exp_degree: int | None) -> tuple[wp.Functio
             parcel, fall, front, adj_t, alpha_min, here, walked, red, green, blue, far
         )
         part = mat_grads()
-        part[0] = adj.dx
-        part[1] = adj.dy
-        part[2] = adj.xx
-        part[3] = adj.xy
-        part[4] = adj.yy
-        part[5] = adj.opacity
-        part[6] = adj.red
-        part[7] = adj.green
-        part[8] = adj.blue
-        if wp.static(depth):
-            part[9] = adj.depth
+        part[MEAN_X] = adj.dx
+        part[MEAN_Y] = adj.dy
+        part[XX] = adj.xx
+        part[XY] = adj.xy
+        part[YY] = adj.yy
+        part[OPACITY] = adj.opacity
+        part[CHANNEL] = adj.red
+        part[CHANNEL + 1] = adj.green
+        part[CHANNEL + 2] = adj.blue
+        if wp.static(CHANNELS > 3):
+            part[CHANNEL + 3] = adj.depth
         return front, adj_front, part
 
     @wp.func
     def adj_geometry(sums: vec5, splat: Splat2D):
         """dL/d(mean, conic)."""
-        adj_root = wp.vec3(sums[2], sums[3], sums[4])
-        return wp.vec2(sums[0], sums[1]), conic_from_root(adj_root, splat.root)
+        adj_root = wp.vec3(sums[XX], sums[XY], sums[YY])
+        return wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic_from_root(adj_root, splat.root)
 
     return body, adj_geometry
 
 
 @functools.cache
-def _mat_grads(depth: bool) -> type:
-    """A row in lanes for each gradient of a tile instance: mean 2, conic 3, opacity 1, channels."""
-    return wp.types.matrix(shape=(10 if depth else 9, LANES), dtype=float)
-
-
-@functools.cache
-def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
+def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The reverse loop with the body of ``mode``."""
-    CHANNELS = 4 if depth else 3
-    GRADS = 6 + CHANNELS
+    CHANNELS, GRADS = variant.channels, variant.columns
     # all in one matrix: a matrix of which only rows of known numbers are used would be taken apart into scalars
-    ADJ_T, WALKED, UP, SUMS = BLOCKS, 2 * BLOCKS, 3 * BLOCKS, (3 + CHANNELS) * BLOCKS
+    T, ADJ_T, WALKED, UP, SUMS = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS, (3 + CHANNELS) * BLOCKS
     mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
     vec_grads = wp.types.vector(length=GRADS, dtype=float)
     make_body = {"manual": _make_manual_body, "stepwise": _make_stepwise_body}[mode]
-    body, adj_geometry = make_body(depth, exp_degree)
+    body, adj_geometry = make_body(variant)
 
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
     def adj_blend(
@@ -182,11 +175,11 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
         x0 = float((tile % tiles_x) * TILE) + 0.5
         y0 = float((tile // tiles_x) * TILE) + 0.5
         room = mat_room()
-        # T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
+        # rows of lanes: T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * (SUMS + GRADS)), shape=(AHEAD,), dtype=Splat2D)
         for block in range(BLOCKS):
-            s[block] = final[tile, block]
+            s[T + block] = final[tile, block]
             s[ADJ_T + block] = adj_final[tile, block]
             if wp.static(mode == "manual"):
                 s[ADJ_T + block] = times(final[tile, block], adj_final[tile, block])
@@ -218,13 +211,13 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
                 while bx <= box[1]:
                     block = (4 * by + bx) & (BLOCKS - 1)
                     dx = offset_x(splat.mean, x0, bx)
-                    if wp.static(depth):
+                    if wp.static(CHANNELS > 3):
                         far = s[UP + 3 * BLOCKS + block]
                     front, adj_front, part = body(
-                        splat, dx, dy, s[block], s[ADJ_T + block], alpha_min, here, s[WALKED + block],
+                        splat, dx, dy, s[T + block], s[ADJ_T + block], alpha_min, here, s[WALKED + block],
                         s[UP + block], s[UP + BLOCKS + block], s[UP + 2 * BLOCKS + block], far,
                     )  # fmt: skip
-                    s[block] = front
+                    s[T + block] = front
                     s[ADJ_T + block] = adj_front
                     for grad in range(GRADS):
                         s[SUMS + grad] = s[SUMS + grad] + part[grad]
@@ -234,13 +227,13 @@ def make_reverse(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
             while grad < GRADS:  # as a range, which Warp unrolls, 10 % of the loop slower
                 sums[grad] = folded(halves, quarters, grad)
                 grad += 1
-            adj_mean, adj_conic = adj_geometry(vec5(sums[0], sums[1], sums[2], sums[3], sums[4]), splat)
-            slots_out[k, 0] = adj_mean[0]
-            slots_out[k, 1] = adj_mean[1]
-            slots_out[k, 2] = adj_conic[0]
-            slots_out[k, 3] = adj_conic[1]
-            slots_out[k, 4] = adj_conic[2]
-            for grad in range(5, GRADS):
+            adj_mean, adj_conic = adj_geometry(vec5(sums[MEAN_X], sums[MEAN_Y], sums[XX], sums[XY], sums[YY]), splat)
+            slots_out[k, MEAN_X] = adj_mean[0]
+            slots_out[k, MEAN_Y] = adj_mean[1]
+            slots_out[k, XX] = adj_conic[0]
+            slots_out[k, XY] = adj_conic[1]
+            slots_out[k, YY] = adj_conic[2]
+            for grad in range(OPACITY, GRADS):
                 slots_out[k, grad] = sums[grad]
 
     return adj_blend

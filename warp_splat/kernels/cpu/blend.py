@@ -34,8 +34,9 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
+from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
-from warp_splat.kernels.splat import Splat2D, advance, alpha_of, exponent, make_exp, weight
+from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 
 BLOCKS = TILE * TILE // LANES  # per tile
 AHEAD = 32  # instances that are copied, and their boxes found, together; then, whether the whole tile has stopped
@@ -79,12 +80,12 @@ def aligned(address: wp.uint64):
 
 
 @functools.cache
-def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
-    """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
-    WALKED, RGB, DEPTH = BLOCKS, 2 * BLOCKS, 5 * BLOCKS
-    STATE = DEPTH + BLOCKS if depth else DEPTH
+def make_blend(variant: BlendVariant) -> wp.Kernel:
+    """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
+    CHANNELS = variant.channels
+    T, WALKED, RGB, DEPTH, STATE = 0, BLOCKS, 2 * BLOCKS, 5 * BLOCKS, (2 + CHANNELS) * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
-    exp2_minus = make_exp(exp_degree)
+    fall_at = make_falloff(variant.falloff).value
 
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
     def blend(
@@ -112,11 +113,11 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
         x0 = float(column) + 0.5
         y0 = float(line) + 0.5
         room = mat_room()
-        # T, instances walked, sums of w color and w z
+        # rows of lanes: T, instances walked, sums of w color and of w z
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
         for block in range(BLOCKS):
-            s[block] = vec16(1.0)
+            s[T + block] = vec16(1.0)
         for row in range(WALKED, s.shape[0]):  # as a constant, a blend that takes half as long again
             s[row] = vec16(0.0)
         end = span[0] + wp.min(span[1] - span[0], max_steps)
@@ -138,29 +139,29 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
                 while bx <= box[1]:
                     block = (4 * by + bx) & (BLOCKS - 1)
                     dx = offset_x(splat.mean, x0, bx)
-                    fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+                    fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
                     alpha = alpha_of(fall * splat.opacity, alpha_min)
-                    behind = advance(s[block], alpha, t_min)
-                    w = weight(s[block], alpha, behind)
-                    if wp.static(keep):
-                        kept_out[k, block] = s[block]
+                    behind = advance(s[T + block], alpha, t_min)
+                    w = weight(s[T + block], alpha, behind)
+                    if wp.static(variant.keep):
+                        kept_out[k, block] = s[T + block]
                     for channel in range(3):
                         s[RGB + channel * BLOCKS + block] = s[RGB + channel * BLOCKS + block] + w * splat.color[channel]
-                    if wp.static(depth):
+                    if wp.static(CHANNELS > 3):
                         s[DEPTH + block] = s[DEPTH + block] + w * splat.depth
-                    s[block] = behind
+                    s[T + block] = behind
                     s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
                     bx += 1
                 by += 1
             if ahead == AHEAD - 1:
                 alive = vec16(0.0)
                 for block in range(BLOCKS):
-                    alive = alive + where_less(s[block], vec16(0.0), vec16(0.0), s[block])
+                    alive = alive + where_less(s[T + block], vec16(0.0), vec16(0.0), s[T + block])
                 if total(alive) == 0.0:
                     break
         for block in range(BLOCKS):
-            s[block] = wp.max(s[block], -s[block])
-            final_out[tile, block] = s[block]
+            s[T + block] = wp.max(s[T + block], -s[T + block])
+            final_out[tile, block] = s[T + block]
             count_out[tile, block] = s[WALKED + block]
         block = int(0)
         while block < BLOCKS:
@@ -170,12 +171,12 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
                 x = left + lane % 4
                 y = top + lane // 4
                 if y < image_out.shape[0] and x < image_out.shape[1]:
-                    final = s[block][lane]
+                    final = s[T + block][lane]
                     for channel in range(3):
                         light = s[RGB + channel * BLOCKS + block][lane] + final * background[channel]
                         image_out[y, x, channel] = light
                     alpha_out[y, x] = 1.0 - final
-                    if wp.static(depth):
+                    if wp.static(CHANNELS > 3):
                         depth_out[y, x] = s[DEPTH + block][lane]
             block += 1
 
@@ -183,10 +184,10 @@ def make_blend(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
 
 
 @functools.cache
-def make_upstream(depth: bool) -> wp.Kernel:
+def make_upstream(variant: BlendVariant) -> wp.Kernel:
     """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
-    CHANNELS = 4 if depth else 3
-    vec_grads = wp.types.vector(length=CHANNELS + 6, dtype=float)
+    CHANNELS = variant.channels
+    vec_grads = wp.types.vector(length=variant.columns, dtype=float)
     mat_background = wp.types.matrix(shape=(3, LANES), dtype=float)
     mat_up = wp.types.matrix(shape=(CHANNELS + 1, LANES), dtype=float)
 
@@ -228,7 +229,7 @@ def make_upstream(depth: bool) -> wp.Kernel:
                 for channel in range(3):
                     u[channel, lane] = adj_image[y, x, channel]
                 u[CHANNELS, lane] = adj_alpha[y, x]
-                if wp.static(depth):
+                if wp.static(CHANNELS > 3):
                     u[3, lane] = adj_depth[y, x]
             inside = where_less(LANE_X, vec16(float(width - left)), vec16(1.0), zero)
             inside = where_less(LANE_Y, vec16(float(height - top)), inside, zero)

@@ -11,7 +11,7 @@ A replay cannot follow a break. So the loop runs over the instances that some pi
 skips those that a pixel did not. What a loop carries has to be an element of a kernel-local array, changed by += and
 -=. Their adjoint is right; that of a[i] = a[i] + x is not.
 
-Pieces with a gradient by hand: the clamp (``opaque``), the exponential (``exp2_known``), and the reading of a Gaussian
+Pieces with a gradient by hand: the clamp (``opaque``), the falloff (``fall_known``), and the reading of a Gaussian
 (``spread`` into lanes, ``collect`` into its row). ``generated`` does without them. It reads a copy of the Gaussian per
 tile instance: Warp adds the adjoint of a read to the Gaussian's own, which would be a race between threads.
 """
@@ -23,9 +23,23 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, reach
+from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import LANE_X, LANE_Y, times, total, vec16, where_less
-from warp_splat.kernels.splat import Splat2D, alpha_of, exponent, make_exp, odds_of
-from warp_splat.kernels.step import conic_from_root, exp2_known, opaque
+from warp_splat.kernels.splat import (
+    CHANNEL,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    XX,
+    XY,
+    YY,
+    BlendVariant,
+    Splat2D,
+    alpha_of,
+    exponent,
+    odds_of,
+)
+from warp_splat.kernels.step import conic_from_root, opaque
 
 
 @wp.func
@@ -97,14 +111,14 @@ def collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slot: i
 
 @wp.func_grad(collect)
 def adj_collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slot: int):
-    adj_root = wp.vec3(total(wp.adjoint[m][2]), total(wp.adjoint[m][3]), total(wp.adjoint[m][4]))
+    adj_root = wp.vec3(total(wp.adjoint[m][XX]), total(wp.adjoint[m][XY]), total(wp.adjoint[m][YY]))
     adj_conic = conic_from_root(adj_root, root)
-    slots[slot, 0] = total(wp.adjoint[m][0])
-    slots[slot, 1] = total(wp.adjoint[m][1])
-    slots[slot, 2] = adj_conic[0]
-    slots[slot, 3] = adj_conic[1]
-    slots[slot, 4] = adj_conic[2]
-    for grad in range(5, slots.shape[1]):
+    slots[slot, MEAN_X] = total(wp.adjoint[m][MEAN_X])
+    slots[slot, MEAN_Y] = total(wp.adjoint[m][MEAN_Y])
+    slots[slot, XX] = adj_conic[0]
+    slots[slot, XY] = adj_conic[1]
+    slots[slot, YY] = adj_conic[2]
+    for grad in range(OPACITY, slots.shape[1]):
         slots[slot, grad] = total(wp.adjoint[m][grad])
     for grad in range(slots.shape[1]):
         wp.adjoint[m][grad] = vec16(0.0)
@@ -122,31 +136,30 @@ def rows_of_copies(
     k = first + wp.tid()
     adj = adj_copies[k]
     conic = conic_from_root(adj.root, copies[k].root)
-    slots_out[k, 0] = adj.mean[0]
-    slots_out[k, 1] = adj.mean[1]
+    slots_out[k, MEAN_X] = adj.mean[0]
+    slots_out[k, MEAN_Y] = adj.mean[1]
     for i in range(3):
-        slots_out[k, 2 + i] = conic[i]
-        slots_out[k, 6 + i] = adj.color[i]
-    slots_out[k, 5] = adj.opacity
-    if slots_out.shape[1] > 9:
-        slots_out[k, 9] = adj.depth
+        slots_out[k, XX + i] = conic[i]
+        slots_out[k, CHANNEL + i] = adj.color[i]
+    slots_out[k, OPACITY] = adj.opacity
+    if slots_out.shape[1] > CHANNEL + 3:
+        slots_out[k, CHANNEL + 3] = adj.depth
 
 
 @functools.cache
-def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
+def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
-    CHANNELS = 4 if depth else 3
-    GRADS = 6 + CHANNELS
+    CHANNELS, GRADS = variant.channels, variant.columns
     STATE = BLOCKS * CHANNELS
-    exp2_minus = make_exp(exp_degree)
+    fall_at, fall_known, _ = make_falloff(variant.falloff)
 
     @wp.func
-    def exp2_value(z: vec16):
-        """2^-z without its gradient, which :func:`exp2_known` supplies."""
-        return exp2_minus(z)
+    def fall_value(z: vec16):
+        """The falloff without its gradient, which ``fall_known`` supplies."""
+        return fall_at(z)
 
-    @wp.func_grad(exp2_value)
-    def adj_exp2_value(z: vec16, adj_ret: vec16):
+    @wp.func_grad(fall_value)
+    def adj_fall_value(z: vec16, adj_ret: vec16):
         pass
 
     @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
@@ -197,15 +210,15 @@ def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
                         dx = vec16(x) - LANE_X - column
                         dy = vec16(y) - LANE_Y - row
                         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
-                        raw = exp2_minus(z) * splat.opacity
+                        raw = fall_at(z) * splat.opacity
                         alpha = alpha_of(where_less(here, count[tile, block], raw, vec16(-1.0)), alpha_min)
                     else:
-                        dx = spread(m, 0, x) - LANE_X - column
-                        dy = spread(m, 1, y) - LANE_Y - row
-                        xx = spread(m, 2, splat.root[0])
-                        xy = spread(m, 3, splat.root[1])
-                        z = exponent(dx, dy, xx, xy, spread(m, 4, splat.root[2]))
-                        raw = times(exp2_known(z, exp2_value(z)), spread(m, 5, splat.opacity))
+                        dx = spread(m, MEAN_X, x) - LANE_X - column
+                        dy = spread(m, MEAN_Y, y) - LANE_Y - row
+                        xx = spread(m, XX, splat.root[0])
+                        xy = spread(m, XY, splat.root[1])
+                        z = exponent(dx, dy, xx, xy, spread(m, YY, splat.root[2]))
+                        raw = times(fall_known(z, fall_value(z)), spread(m, OPACITY, splat.opacity))
                         alpha = opaque(raw, alpha_min, here, count[tile, block])
                     if wp.static(mode == "stored"):
                         front = front_of_kept(t, block, kept, k)
@@ -217,13 +230,15 @@ def make_walk(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
                     if wp.static(mode == "generated"):
                         for channel in range(3):
                             c[block * CHANNELS + channel] += w * splat.color[channel]
-                        if wp.static(depth):
+                        if wp.static(CHANNELS > 3):
                             c[block * CHANNELS + 3] += w * splat.depth
                     else:
                         for channel in range(3):
-                            c[block * CHANNELS + channel] += times(w, spread(m, 6 + channel, splat.color[channel]))
-                        if wp.static(depth):
-                            c[block * CHANNELS + 3] += times(w, spread(m, 9, splat.depth))
+                            c[block * CHANNELS + channel] += times(
+                                w, spread(m, CHANNEL + channel, splat.color[channel])
+                            )
+                        if wp.static(CHANNELS > 3):
+                            c[block * CHANNELS + 3] += times(w, spread(m, CHANNEL + 3, splat.depth))
                     t[block] -= w
         for i in range(STATE):
             color_out[tile, i] = c[i]

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
-from warp_splat.kernels.splat import Splat2D, exponent
+from warp_splat.kernels.splat import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import (
     conic_from_root,
     geometry_from_moments,
@@ -22,28 +22,36 @@ from warp_splat.kernels.step import (
 
 @wp.func
 def row_of(mean: wp.vec2, conic: wp.vec3, rest: vec10):
-    """A row of gradients: mean 2, conic 3, then opacity and channels as they are."""
-    return vec10(mean[0], mean[1], conic[0], conic[1], conic[2], rest[5], rest[6], rest[7], rest[8], rest[9])
+    """A slot: mean and conic, then opacity and channels as they are in ``rest``."""
+    row = rest
+    row[MEAN_X] = mean[0]
+    row[MEAN_Y] = mean[1]
+    row[XX] = conic[0]
+    row[XY] = conic[1]
+    row[YY] = conic[2]
+    return row
 
 
 @wp.func
 def row_from_moments(sums: vec10, g: vec10):
     """From sums of d, d d', 1 (weighted by dL/dopacity) and of the channels' gradients."""
-    root = wp.vec3(g[2], g[3], g[4])
-    mean, conic = geometry_from_moments(wp.vec2(sums[0], sums[1]), sums[2], sums[3], sums[4], root, g[5])
+    root = wp.vec3(g[XX], g[XY], g[YY])
+    s = wp.vec2(sums[MEAN_X], sums[MEAN_Y])
+    mean, conic = geometry_from_moments(s, sums[XX], sums[XY], sums[YY], root, g[OPACITY])
     return row_of(mean, conic, sums)
 
 
 @wp.func
 def row_from_root(sums: vec10, root: wp.vec3):
     """From sums of the gradients of mean, root, opacity and channels."""
-    conic = conic_from_root(wp.vec3(sums[2], sums[3], sums[4]), root)
-    return row_of(wp.vec2(sums[0], sums[1]), conic, sums)
+    conic = conic_from_root(wp.vec3(sums[XX], sums[XY], sums[YY]), root)
+    return row_of(wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic, sums)
 
 
 @functools.cache
-def make_upstream_block(depth: bool) -> wp.Kernel:
+def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
     """The start of every adjoint: upstream gradients by tile and thread, those that are not finite dropped."""
+    CHANNELS = variant.channels
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def upstream(
@@ -72,7 +80,7 @@ def make_upstream_block(depth: bool) -> wp.Kernel:
         dropped = int(0)
         if line < adj_image.shape[0] and column < adj_image.shape[1]:
             u = wp.vec4(adj_image[line, column, 0], adj_image[line, column, 1], adj_image[line, column, 2], 0.0)
-            if wp.static(depth):
+            if wp.static(CHANNELS > 3):
                 u[3] = adj_depth[line, column]
             if wp.isfinite(u) and wp.isfinite(adj_alpha[line, column]):
                 up = u
@@ -109,11 +117,11 @@ def put(slots: wp.array2d[float], instance: int, splat: int, column: int, value:
 
 
 @functools.cache
-def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp.Function = put) -> wp.Kernel:
+def make_reverse_block(mode: str, variant: BlendVariant, write: wp.Function = put) -> wp.Kernel:
     """The reverse loop by hand, its step by hand (``manual``) or by Warp (``stepwise``)."""
-    GRADS = 10 if depth else 9
-    adj_step = make_manual(exp_degree, float)
-    Parcel, undo, step = make_stepwise(depth, exp_degree, float)
+    GRADS = variant.columns
+    adj_step = make_manual(variant.falloff, float)
+    Parcel, undo, step = make_stepwise(variant, float)
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def adj_blend(
@@ -128,7 +136,7 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
         up: wp.array2d[wp.vec4],
         adj_final: wp.array2d[float],
         # out
-        slots_out: wp.array2d[float],  # [M, GRADS] mean 2, conic 3, opacity 1, channels: one row per tile instance
+        slots_out: wp.array2d[float],  # [M, GRADS]
     ):
         tile, thread = wp.tid()
         x = float((tile % tiles_x) * TILE + thread % TILE) + 0.5
@@ -148,13 +156,13 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
             staged = wp.tile(mine, preserve_type=True)
             for j in range(wp.min(THREADS, last + 1)):
                 g = staged[j]
-                dx = g[0] - x
-                dy = g[1] - y
+                dx = g[MEAN_X] - x
+                dy = g[MEAN_Y] - y
                 here = float(last - j)
                 if wp.static(mode == "manual"):
-                    lit = u[0] * g[6] + u[1] * g[7] + u[2] * g[8] + u[3] * g[9]
-                    z = exponent(dx, dy, g[2], g[3], g[4])
-                    front, beyond, w, s = adj_step(z, g[5], t, adj_t, alpha_min, here, walked, lit)
+                    lit = u[0] * g[CHANNEL] + u[1] * g[CHANNEL + 1] + u[2] * g[CHANNEL + 2] + u[3] * g[CHANNEL + 3]
+                    z = exponent(dx, dy, g[XX], g[XY], g[YY])
+                    front, beyond, w, s = adj_step(z, g[OPACITY], t, adj_t, alpha_min, here, walked, lit)
                     sx = s * dx
                     sy = s * dy
                     grads = vec10(sx, sy, sx * dx, sx * dy, sy * dy, s, w * u[0], w * u[1], w * u[2], w * u[3])
@@ -163,14 +171,14 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
                     parcel = Parcel()
                     parcel.dx = dx
                     parcel.dy = dy
-                    parcel.xx = g[2]
-                    parcel.xy = g[3]
-                    parcel.yy = g[4]
-                    parcel.opacity = g[5]
-                    parcel.red = g[6]
-                    parcel.green = g[7]
-                    parcel.blue = g[8]
-                    parcel.depth = g[9]
+                    parcel.xx = g[XX]
+                    parcel.xy = g[XY]
+                    parcel.yy = g[YY]
+                    parcel.opacity = g[OPACITY]
+                    parcel.red = g[CHANNEL]
+                    parcel.green = g[CHANNEL + 1]
+                    parcel.blue = g[CHANNEL + 2]
+                    parcel.depth = g[CHANNEL + 3]
                     fall, front = undo(parcel, t, alpha_min, here, walked)
                     p, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
                         parcel, fall, front, adj_t, alpha_min, here, walked, u[0], u[1], u[2], u[3]
@@ -183,7 +191,7 @@ def make_reverse_block(mode: str, depth: bool, exp_degree: int | None, write: wp
                     if wp.static(mode == "manual"):
                         row = row_from_moments(sums, g)
                     else:
-                        row = row_from_root(sums, wp.vec3(g[2], g[3], g[4]))
+                        row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
                     k = start + last - j
                     for grad in range(GRADS):
                         write(slots_out, k, instances[k], grad, row[grad])

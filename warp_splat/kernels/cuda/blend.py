@@ -9,7 +9,22 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.splat import Splat2D, advance, alpha_of, exponent, make_exp, weight
+from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.splat import (
+    CHANNEL,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    XX,
+    XY,
+    YY,
+    BlendVariant,
+    Splat2D,
+    advance,
+    alpha_of,
+    exponent,
+    weight,
+)
 
 THREADS = wp.constant(TILE * TILE)  # per block
 vec10 = wp.types.vector(length=10, dtype=float)
@@ -20,7 +35,7 @@ BLOCK_OPTIONS = {"enable_backward": False, "block_dim": TILE * TILE}
 
 @wp.func
 def staged_of(splat: Splat2D):
-    """What the loops read of a Gaussian, as one element of a tile: mean 2, root 3, opacity, color 3, depth."""
+    """What the loops read of a Gaussian, as one element of a tile, in a slot's columns; XX to YY are the root's."""
     return vec10(
         splat.mean[0], splat.mean[1], splat.root[0], splat.root[1], splat.root[2], splat.opacity,
         splat.color[0], splat.color[1], splat.color[2], splat.depth,
@@ -28,9 +43,9 @@ def staged_of(splat: Splat2D):
 
 
 @functools.cache
-def make_blend_block(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kernel:
-    """The blend; with ``depth``, a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
-    exp2_minus = make_exp(exp_degree)
+def make_blend_block(variant: BlendVariant) -> wp.Kernel:
+    """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
+    fall_at, CHANNELS = make_falloff(variant.falloff).value, variant.channels
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def blend(
@@ -72,15 +87,15 @@ def make_blend_block(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kern
             staged = wp.tile(mine, preserve_type=True)
             for j in range(wp.min(THREADS, length - first)):
                 g = staged[j]
-                fall = exp2_minus(exponent(g[0] - x, g[1] - y, g[2], g[3], g[4]))
-                alpha = alpha_of(fall * g[5], alpha_min)
+                fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
+                alpha = alpha_of(fall * g[OPACITY], alpha_min)
                 behind = advance(t, alpha, t_min)
                 w = weight(t, alpha, behind)
-                if wp.static(keep):
+                if wp.static(variant.keep):
                     kept_out[start + first + j, thread] = t
-                color += wp.vec3(g[6], g[7], g[8]) * w
-                if wp.static(depth):
-                    far += g[9] * w
+                color += wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2]) * w
+                if wp.static(CHANNELS > 3):
+                    far += g[CHANNEL + 3] * w
                 t = behind
                 if behind >= 0.0:
                     count = first + j + 1
@@ -93,7 +108,7 @@ def make_blend_block(depth: bool, exp_degree: int | None, keep: bool) -> wp.Kern
             for channel in range(3):
                 image_out[line, column, channel] = color[channel] + t * background[channel]
             alpha_out[line, column] = 1.0 - t
-            if wp.static(depth):
+            if wp.static(CHANNELS > 3):
                 depth_out[line, column] = far
 
     return blend

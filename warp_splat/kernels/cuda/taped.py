@@ -12,8 +12,21 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.cuda.adjoint import row_from_root
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of, vec10
-from warp_splat.kernels.splat import Splat2D, exponent, make_exp, odds_of
-from warp_splat.kernels.step import exp2_known, opaque
+from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.splat import (
+    CHANNEL,
+    MEAN_X,
+    MEAN_Y,
+    OPACITY,
+    XX,
+    XY,
+    YY,
+    BlendVariant,
+    Splat2D,
+    exponent,
+    odds_of,
+)
+from warp_splat.kernels.step import opaque
 
 
 @wp.func
@@ -81,10 +94,10 @@ def adj_behind_of(front: float, w: float, adj_ret: float):
 
 
 @functools.cache
-def make_walk_block(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel:
+def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
-    GRADS = 10 if depth else 9
-    exp2_minus = make_exp(exp_degree)
+    CHANNELS, GRADS = variant.channels, variant.columns
+    fall_at, fall_known, _ = make_falloff(variant.falloff)
 
     @wp.func
     def read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int):
@@ -100,12 +113,12 @@ def make_walk_block(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel
                 slots[slot, grad] = row[grad]
 
     @wp.func
-    def exp2_value(z: float):
-        """2^-z without its gradient, which :func:`exp2_known` supplies."""
-        return exp2_minus(z)
+    def fall_value(z: float):
+        """The falloff without its gradient, which ``fall_known`` supplies."""
+        return fall_at(z)
 
-    @wp.func_grad(exp2_value)
-    def adj_exp2_value(z: float, adj_ret: float):
+    @wp.func_grad(fall_value)
+    def adj_fall_value(z: float, adj_ret: float):
         pass
 
     @wp.kernel(module="unique", module_options={**BLOCK_OPTIONS, "enable_backward": True})
@@ -133,18 +146,18 @@ def make_walk_block(mode: str, depth: bool, exp_degree: int | None) -> wp.Kernel
         color = wp.vec4(0.0)
         for k in range(start, start + steps[tile]):
             g = read(splats[instances[k]], slots, k, thread)
-            z = exponent(g[0] - x, g[1] - y, g[2], g[3], g[4])
-            raw = exp2_known(z, exp2_value(z)) * g[5]
+            z = exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY])
+            raw = fall_known(z, fall_value(z)) * g[OPACITY]
             alpha = opaque(raw, alpha_min, float(k - start), walked)
             if wp.static(mode == "stored"):
                 front = front_of_kept(t, kept, k, thread)
             else:
                 front = front_of(t, alpha)
             w = alpha * front
-            if wp.static(depth):
-                color += wp.vec4(g[6], g[7], g[8], g[9]) * w
+            if wp.static(CHANNELS > 3):
+                color += wp.vec4(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2], g[CHANNEL + 3]) * w
             else:
-                color += wp.vec4(g[6], g[7], g[8], 0.0) * w
+                color += wp.vec4(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2], 0.0) * w
             t = behind_of(front, w)
         color_out[tile, thread] = color
         final_out[tile, thread] = t

@@ -1,0 +1,90 @@
+"""A falloff of the user's own, on both drivers, against the formulas in torch, pixel by pixel and in float64."""
+
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+import torch
+from heavy_tails import fall, heavy_tails, reach
+from scenes import SCENES
+
+from warp_splat import Falloff, InputError, RasterOptions, check_gradients, rasterize
+from warp_splat.config import ALPHA_MAX
+from warp_splat.raster.drivers import CUDA, using
+
+OPTIONS = RasterOptions(falloff=heavy_tails, alpha_min=0.02, t_min=0.0, depth=True)
+
+
+def dense(out):
+    """Image and depth of the splats of ``out``: every one of them at every pixel, by the formulas."""
+    drawn = torch.nonzero(out.radii > 0)[:, 0]
+    drawn = drawn[torch.argsort(out.depths[drawn], stable=True)]
+    splats = [getattr(out, name) for name in ("means2d", "conics", "opacities2d", "colors", "depths")]
+    leaves = [tensor.detach().double().requires_grad_() for tensor in splats]
+    means2d, conics, opacities, colors, depths = (leaf[drawn] for leaf in leaves)
+    height, width, _ = out.image.shape
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    dx, dy = (means2d[:, axis, None, None] - pixel for axis, pixel in enumerate((x, y)))
+    xx, xy, yy = (entry[:, None, None] for entry in conics.unbind(1))
+    alpha = opacities[:, None, None] / (1 + 0.5 * (xx * dx**2 + 2 * xy * dx * dy + yy * dy**2))
+    alpha = torch.where(alpha < OPTIONS.alpha_min, 0.0, alpha.clamp(max=ALPHA_MAX))
+    front = torch.cat([torch.ones_like(alpha[:1]), (1 - alpha).cumprod(0)])
+    weights = alpha * front[:-1]
+    image = torch.einsum("nyx,nc->yxc", weights, colors)
+    return leaves, image, torch.einsum("nyx,n->yx", weights, depths) / (1 - front[-1]).clamp_min(1e-10)
+
+
+@pytest.mark.parametrize("driver", ["CPU", "CUDA"])
+@pytest.mark.parametrize("adjoint", ["stepwise", "reversible", "stored"])
+def test_against_a_dense_formula(adjoint, driver):
+    scene = SCENES["degree1"]()
+    generator = torch.Generator().manual_seed(3)
+    leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
+    with using(CUDA) if driver == "CUDA" else nullcontext():
+        out = rasterize(*leaves, scene.camera, adjoint=adjoint, options=OPTIONS)
+        upstream = torch.randn(out.image.shape, generator=generator)
+        exact, image, depth = dense(out)
+        splats = [out.means2d, out.conics, out.opacities2d, out.colors, out.depths]
+        found = torch.autograd.grad((out.image * upstream).sum() + 0.1 * out.depth.sum(), splats)
+    assert (out.image - image).abs().max() < 1e-5 and (out.depth - depth).abs().max() < 1e-4
+    wanted = torch.autograd.grad((image * upstream).sum() + 0.1 * depth.sum(), exact)
+    for gradient, truth in zip(found, wanted, strict=True):
+        assert (gradient - truth).norm() < 1e-4 * truth.norm()
+
+
+@pytest.mark.parametrize("adjoint", ["stepwise", "reversible", "stored"])
+def test_gradients_agree_with_differences(adjoint):
+    scene = SCENES["degree1"]()
+    assert check_gradients(*scene.parameters(), scene.camera, adjoint=adjoint, options=OPTIONS, directions=3).ok
+
+
+def test_manual_refuses_another_falloff_where_a_gradient_is_asked_for():
+    scene = SCENES["degree1"]()
+    leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
+    with pytest.raises(InputError, match=r"'manual' is the derivative of the Gaussian, and options.falloff is another"):
+        rasterize(*leaves, scene.camera, options=OPTIONS)
+    image = rasterize(*scene.parameters(), scene.camera, options=OPTIONS).image
+    assert torch.equal(image, rasterize(*leaves, scene.camera, adjoint="stored", options=OPTIONS).image)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((lambda q: q, reach), "Falloff.fall: expected a wp.func of one Any"),
+        ((reach, reach), "Falloff.fall: expected a wp.func of one Any"),
+        ((fall, 3.0), "Falloff.reach: expected a wp.func of one float, got 3.0"),
+    ],
+)
+def test_what_is_no_falloff_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Falloff(*arguments)
+
+
+def test_it_is_the_one_of_the_page():
+    root = Path(__file__).parents[1]
+    assert (root / "tests/heavy_tails.py").read_text() in (root / "docs/extending.md").read_text()
+
+
+def test_options_take_nothing_else():
+    with pytest.raises(InputError, match=r"options\.falloff: expected a warp_splat.Falloff or None, got 'wide'"):
+        rasterize(*SCENES["single"]().parameters(), SCENES["single"]().camera, options=RasterOptions(falloff="wide"))
