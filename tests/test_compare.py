@@ -11,6 +11,8 @@ from scenes import SCENES
 
 from warp_splat import RasterOptions, cli
 from warp_splat.compare import adjoints, knobs, oracle, plots, truth, workloads
+from warp_splat.compare.stability import cases
+from warp_splat.compare.volume import measure as physics
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
@@ -170,7 +172,18 @@ def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
     assert message in error and error.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(("what", "failed", "code"), [("stability", 2, 1), ("stability", 0, 0), ("volume", 0, 0)])
+def test_command_runs_what_it_is_asked_for(what, failed, code, tmp_path, monkeypatch):
+    """What it runs has its own tests; here it says a line and how many verdicts failed."""
+    for module, name in ((cases, "run_cases"), (physics, "compare_with_physics")):
+        monkeypatch.setattr(module, name, lambda *given, name=name: given[-1](f"{name} in {given[0]}") or failed)
+    assert cli.main(["compare", f"--{what}", "--out", str(tmp_path)]) == code
+    text = (tmp_path / f"{what}.txt").read_text()
+    assert text.startswith(f"{'run_cases' if what == 'stability' else 'compare_with_physics'} in {tmp_path}\n")
+    assert "Measured on" in text and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.long
 def test_whole_commands(tmp_path, capsys):
     """The three commands at their default size, but for the number of trainings, which has a test of its own."""
     for arguments, files in (

@@ -159,12 +159,19 @@ sys.exit(main(["train", *sys.argv[1:]]))
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("failure", "said"),
     [
-        ("raise MemoryError", ["Out of memory on cpu", "Process 0: expected an answer", "but one has ended"]),
-        ("os.kill(os.getpid(), signal.SIGSTOP)", ["Process 0: expected an answer", "but one was silent"]),
+        pytest.param(
+            "raise MemoryError",
+            ["Out of memory on cpu", "Process 0: expected an answer", "but one has ended"],
+            marks=pytest.mark.long,  # the gate kills one
+        ),
+        pytest.param(
+            "os.kill(os.getpid(), signal.SIGSTOP)",
+            ["Process 0: expected an answer", "but one was silent"],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_when_a_process_fails_or_hangs_the_other_saves_and_stops(failure, said, tmp_path):
