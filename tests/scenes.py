@@ -11,8 +11,8 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
-from warp_splat.formats.splats import SH_C0
 
+C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -49,7 +49,7 @@ def pack(means, scales, opacities, sh, camera, rng, quats=None, background=(0.2,
 def colors(rng, count, degree, low=0.0, high=1.0, rest=0.15):
     """SH coefficients [N, K, 3]: base colors in low..high, the rest normal."""
     sh = rng.normal(size=(count, (degree + 1) ** 2, 3)) * rest
-    sh[:, 0] = (rng.uniform(low, high, (count, 3)) - 0.5) / SH_C0
+    sh[:, 0] = (rng.uniform(low, high, (count, 3)) - 0.5) / C0
     return sh
 
 

@@ -269,7 +269,7 @@ def test_other_numbers_of_processes(scene, tmp_path):
     assert torch.equal(other.growth.radius, trainer.growth.radius)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_stop_and_resume(tmp_path):
     """The same bytes as without a stop; one process goes on as well."""
 

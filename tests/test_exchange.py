@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import (
     ENDINGS,
@@ -33,8 +34,6 @@ from warp_splat.rendering.command import make_picture
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward
-
-C0 = 0.28209479177387814  # color = C0 * (coefficient of degree 0) + 0.5
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])

@@ -183,27 +183,17 @@ def _loss(workload: Workload, truth: Truth, opacities: torch.Tensor) -> float:
 
 def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:
     """A row per scene, variant and parameter, for CSV and JSON."""
-    return [
-        {
-            "scene": item.scene,
-            "variant": item.variant,
-            "gaussians": item.gaussians,
-            "parameter": parameter,
-            "relative_error": error.relative,
-            "largest_error": error.largest,
-            "cosine": error.cosine,
-            "bias": error.bias,
-            "image_error": item.image_error,
-            "forward_seconds": median(item.forward),
-            "forward_spread": half_range(item.forward),
-            "backward_seconds": median(item.backward),
-            "backward_spread": half_range(item.backward),
-            "peak_memory": item.memory,
-            "note": item.note,
-        }
-        for item in measurements
-        for parameter, error in (item.errors or {"": Error(*[float("nan")] * 4)}).items()
-    ]
+    rows = []
+    for item in measurements:
+        times = {"forward": item.forward, "backward": item.backward}
+        ways = (("seconds", median), ("spread", half_range))
+        seconds = {f"{name}_{what}": way(values) for name, values in times.items() for what, way in ways}
+        for parameter, error in (item.errors or {"": Error(*[float("nan")] * 4)}).items():
+            what = {"scene": item.scene, "variant": item.variant, "gaussians": item.gaussians, "parameter": parameter}
+            errors = {"relative_error": error.relative, "largest_error": error.largest, "cosine": error.cosine}
+            errors |= {"bias": error.bias, "image_error": item.image_error}
+            rows.append({**what, **errors, **seconds, "peak_memory": item.memory, "note": item.note})
+    return rows
 
 
 def median(seconds: Sequence[float]) -> float | None:

@@ -40,13 +40,9 @@ def run_knobs(workloads: Sequence[Workload], say: Callable[[str], None]) -> list
     results = []
     for workload in workloads:
         start = time.perf_counter()
-        exact = {"t_min": 0.0, "alpha_min": 0.0}
-        truths = {
-            knob: compute_truth(replace(workload, options=replace(workload.options, **{knob: exact[knob]})))
-            if knob in exact
-            else compute_truth(workload)
-            for knob in KNOBS
-        }
+        most = {knob: {knob: 0.0} if knob in ("t_min", "alpha_min") else {} for knob in KNOBS}
+        exact = {knob: replace(workload, options=replace(workload.options, **most[knob])) for knob in KNOBS}
+        truths = {knob: compute_truth(exact[knob]) for knob in KNOBS}
         found = {variant: first_run(workload, truths[next(iter(variant.changes))], variant) for variant in variants()}
         time_all(workload, found)
         results += found.values()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
+BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.2  # Gaussians nearer than this are culled
 BLUR = 0.3  # low-pass filter, px^2
 ALPHA_MAX = 0.99
@@ -212,20 +213,7 @@ def _culling(splats, alpha, order, camera, alpha_min):
 
 
 def exact_render(
-    means,
-    quats,
-    scales,
-    opacities,
-    sh,
-    camera,
-    background=(0.0, 0.0, 0.0),
-    *,
-    sh_degree=None,
-    antialiasing=False,
-    projection="affine",
-    alpha_min=ALPHA_MIN,
-    t_min=STOP,
-    pixels=None,
+    means, quats, scales, opacities, sh, camera, background=BLACK, alpha_min=ALPHA_MIN, t_min=STOP, pixels=None, **view
 ):
     """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background.
 
@@ -235,7 +223,7 @@ def exact_render(
     shape = (camera.height, camera.width) if pixels is None else (len(pixels),)
     if pixels is None:
         pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width))
-    splats = exact_splats(means, quats, scales, opacities, sh, camera, sh_degree, antialiasing, projection)
+    splats = exact_splats(means, quats, scales, opacities, sh, camera, **view)
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]

@@ -52,7 +52,7 @@ def at_pixels(pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarr
 def cloud(
     seed: int,
     count: int,
-    camera: Camera,
+    camera: Camera | None = None,
     depth: np.ndarray | tuple[float, float] = (2.0, 8.0),
     sigma: tuple[float, float] = (1.0, 5.0),
     opacity: tuple[float, float] = (0.05, 0.9),
@@ -63,13 +63,13 @@ def cloud(
     Args:
         seed: of everything.
         count: N.
-        camera: whose image they cover.
+        camera: whose image they cover; :func:`look`'s unless given.
         depth: of each [N], or their range, world units.
         sigma: range of the largest standard deviation on the image [px].
         opacity: range.
         aspect: least ratio of the other standard deviations to the largest.
     """
-    rng = np.random.default_rng(seed)
+    rng, camera = np.random.default_rng(seed), camera or look()
     z = distinct_depths(rng, count, *depth) if isinstance(depth, tuple) else depth
     pixels = rng.uniform(-0.1, 1.1, (count, 2)) * [camera.width, camera.height]
     size = np.exp(rng.uniform(*np.log(sigma), count)) * np.abs(z) / camera.fx

@@ -21,10 +21,9 @@ EDGE_STEPS = range(-18, 19, 3)  # units in the last place that an opacity is mov
 
 def logits() -> Problem:
     """Opacity logits of +-100 among ordinary ones, through the trainer's activation."""
-    camera = look()
-    arrays = cloud(1, 40, camera)
+    arrays = cloud(1, 40)
     values = np.tile([100.0, -100.0, 40.0, -40.0, 1.0, 0.0, -1.0, -2.0], 5)
-    return Problem(tensors(arrays | {"opacities": values, "scales": np.log(arrays["scales"])}), camera, raw=True)
+    return Problem(tensors(arrays | {"opacities": values, "scales": np.log(arrays["scales"])}), raw=True)
 
 
 def clamp() -> Problem:
@@ -39,8 +38,7 @@ def clamp() -> Problem:
 
 def opacity_one() -> Problem:
     """Opacity 1 everywhere: every pixel stops after one or two."""
-    camera = look()
-    return Problem(tensors(cloud(3, 60, camera, opacity=(1.0, 1.0))), camera)
+    return Problem(tensors(cloud(3, 60, opacity=(1.0, 1.0))))
 
 
 def chain(layers: int) -> Problem:
@@ -97,8 +95,7 @@ def stop_edge(mode: str) -> Outcome:
 
 def ordinary() -> Problem:
     """Nothing extreme: what odd upstream gradients meet."""
-    camera = look()
-    return Problem(tensors(cloud(8, 60, camera)), camera)
+    return Problem(tensors(cloud(8, 60)))
 
 
 def huge_upstream() -> Problem:

@@ -38,39 +38,35 @@ def stretched(power: int, flat: bool, longest: float = 60.0, options: RasterOpti
 
 def extreme_logs() -> Problem:
     """Logarithms of scales of +100 (exp overflows) and -100 (a point) among ordinary ones."""
-    camera = look()
-    arrays = cloud(30, 40, camera)
+    arrays = cloud(30, 40)
     logs = np.log(arrays["scales"])
     logs[:4] = 100.0
     logs[4, 1] = 100.0
     logs[5:10] = -100.0
     logs[10, 0] = -100.0
     values = arrays | {"scales": logs, "opacities": np.log(arrays["opacities"] / (1 - arrays["opacities"]))}
-    return Problem(tensors(values), camera, raw=True, left_out=(0, 1, 2, 3, 4), invalid=5)
+    return Problem(tensors(values), raw=True, left_out=(0, 1, 2, 3, 4), invalid=5)
 
 
 def too_large() -> Problem:
     """Scales that float32 holds but whose square it does not."""
-    camera = look()
-    arrays = cloud(31, 40, camera)
+    arrays = cloud(31, 40)
     arrays["scales"][:3] = np.array([1e12, 1e20, 1e38])[:, None]
-    return Problem(tensors(arrays), camera, left_out=(0, 1, 2), invalid=3)
+    return Problem(tensors(arrays), left_out=(0, 1, 2), invalid=3)
 
 
 def zero_quats() -> Problem:
     """Quaternions without a direction."""
-    camera = look()
-    arrays = cloud(32, 40, camera)
+    arrays = cloud(32, 40)
     arrays["quats"][[3, 17]] = 0.0
-    return Problem(tensors(arrays), camera, left_out=(3, 17), invalid=2)
+    return Problem(tensors(arrays), left_out=(3, 17), invalid=2)
 
 
 def quat_norms(norm: float) -> Problem:
     """Every quaternion of that norm, down to denormal ones."""
-    camera = look()
-    arrays = cloud(33, 40, camera)
+    arrays = cloud(33, 40)
     arrays["quats"] *= norm / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
-    return Problem(tensors(arrays), camera)
+    return Problem(tensors(arrays))
 
 
 def far_world() -> Problem:
@@ -111,11 +107,10 @@ def equal_depths() -> Problem:
 
 def not_finite() -> Problem:
     """NaN and infinity in every parameter."""
-    camera = look()
-    arrays = cloud(41, 40, camera)
+    arrays = cloud(41, 40)
     for row, (name, value) in enumerate(itertools.product(arrays, (np.nan, np.inf))):
         arrays[name][row] = value
-    return Problem(tensors(arrays), camera, left_out=tuple(range(12)), invalid=12)
+    return Problem(tensors(arrays), left_out=tuple(range(12)), invalid=12)
 
 
 def enclosed(options: RasterOptions) -> Problem:

@@ -20,6 +20,7 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
+from warp_splat.compare.scenes import look
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
@@ -53,7 +54,7 @@ class Problem:
     """
 
     gaussians: dict[str, torch.Tensor]
-    camera: Camera
+    camera: Camera = field(default_factory=look)
     options: RasterOptions = field(default_factory=RasterOptions)
     raw: bool = False
     left_out: tuple[int, ...] = ()
