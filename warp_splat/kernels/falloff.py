@@ -5,8 +5,10 @@ At the offset d [px] the splat's opacity is opacity times fall(q), with q = d' c
     fall(q) = exp(-q) = 2^-z,   z = q log2(e)
 
 Kernels compute z, of which 2^-z needs no constant. Its derivative is a multiple of its value, which the loops know
-already; LLVM inlines a function of that size only where a kernel calls it once, and a call costs more than a step of
-the blend (Tried: three calls, 2.9 times slower). A user's falloff is differentiated by Warp.
+already. LLVM inlines a function of that size only where a kernel calls it once, and a call costs more than a step of
+the blend. Warp differentiates a user's falloff. Tried:
+
+- 2.9 x the time of ``stepwise``: three calls
 """
 
 import functools
