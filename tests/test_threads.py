@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_splat import Camera, rasterize
 from warp_splat.gaussians import GaussianModel
-from warp_splat.kernels.project import quarantine
+from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster import bin, project
 from warp_splat.runtime import launch
 from warp_splat.runtime.distributed import ALONE

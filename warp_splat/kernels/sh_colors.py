@@ -17,7 +17,8 @@ import warp as wp
 
 from warp_splat.kernels.compiler import LANES_IN_ORDER
 from warp_splat.kernels.harmonics import C0, make_harmonics
-from warp_splat.kernels.project import INVALID, CameraView
+from warp_splat.kernels.project.camera_view import CameraView
+from warp_splat.kernels.project.shared import INVALID
 from warp_splat.kernels.simd import TYPES, lane_of, pick
 
 mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
@@ -63,16 +64,16 @@ def make_shade(lanes: int) -> wp.Kernel:
         means: wp.array[wp.vec3],  # [N] world
         sh_dc: wp.array[wp.vec3],  # [N] coefficients
         sh1: wp.array[wp.mat33],  # [N] of degree 1; like the next two, empty if there are none
-        sh2: wp.array[mat53],
-        sh3: wp.array[mat73],
+        sh2: wp.array[mat53],  # [N]
+        sh3: wp.array[mat73],  # [N]
         # out
         means2d_out: wp.array[wp.vec2],  # [N] all but the colors: as of `project`, cleared where a color is not finite
-        conics_out: wp.array[wp.vec3],
-        opacities_out: wp.array[float],
+        conics_out: wp.array[wp.vec3],  # [N]
+        opacities_out: wp.array[float],  # [N]
         colors_out: wp.array[wp.vec3],  # [N] zero where culled, so the caller clears them
-        depths_out: wp.array[float],
-        extents_out: wp.array[wp.vec2],
-        radii_out: wp.array[int],  # read first
+        depths_out: wp.array[float],  # [N]
+        extents_out: wp.array[wp.vec2],  # [N]
+        radii_out: wp.array[int],  # [N] read first
     ):
         group = (first + wp.tid()) * lanes
         x, y, z = offsets(camera, means, group)
@@ -117,8 +118,8 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         camera: CameraView,
         means: wp.array[wp.vec3],  # [N]
         sh1: wp.array[wp.mat33],  # [N]
-        sh2: wp.array[mat53],
-        sh3: wp.array[mat73],
+        sh2: wp.array[mat53],  # [N]
+        sh3: wp.array[mat73],  # [N]
         radii: wp.array[int],  # [N]
         colors: wp.array[wp.vec3],  # [N]
         adj_colors: wp.array[wp.vec3],  # [N]
@@ -126,8 +127,8 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         means_out: wp.array[wp.vec3],  # [N]
         sh_dc_out: wp.array[wp.vec3],  # [N]
         sh1_out: wp.array[wp.mat33],  # [N]
-        sh2_out: wp.array[mat53],
-        sh3_out: wp.array[mat73],
+        sh2_out: wp.array[mat53],  # [N]
+        sh3_out: wp.array[mat73],  # [N]
     ):
         group = (first + wp.tid()) * lanes
         x, y, z = offsets(camera, means, group)

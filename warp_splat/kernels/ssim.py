@@ -256,9 +256,9 @@ def compare(
     image_taps: wp.array2d[vec16],  # [H, L - 15] the same: element p holds floats p .. p + 15 of a row
     limits: wp.vec2,
     target: wp.array2d[float],  # [H, L], or nothing
-    target_taps: wp.array2d[vec16],
+    target_taps: wp.array2d[vec16],  # [H, L - 15], or nothing
     levels: wp.array2d[wp.uint8],  # [H, L], to be divided by 255, or nothing
-    level_taps: wp.array2d[vec16b],
+    level_taps: wp.array2d[vec16b],  # [H, L - 15], or nothing
     centers: wp.vec2,  # p, q
     missing: wp.array[vec16],  # [G] share of the window beyond the ends of a row
     # out
@@ -312,12 +312,12 @@ def adj_compare(
     first: int,
     bounds: wp.array[int],  # [B + 1]
     image: wp.array2d[float],  # [H, L]
-    image_taps: wp.array2d[vec16],
+    image_taps: wp.array2d[vec16],  # [H, L - 15]
     limits: wp.vec2,
-    target: wp.array2d[float],
-    target_taps: wp.array2d[vec16],
-    levels: wp.array2d[wp.uint8],
-    level_taps: wp.array2d[vec16b],
+    target: wp.array2d[float],  # [H, L], or nothing
+    target_taps: wp.array2d[vec16],  # [H, L - 15], or nothing
+    levels: wp.array2d[wp.uint8],  # [H, L], or nothing
+    level_taps: wp.array2d[vec16b],  # [H, L - 15], or nothing
     centers: wp.vec2,
     slopes: wp.array3d[vec16],  # [H, SLOPES, G + 2]
     adj_l1: float,  # dL / d(sum of |x - y|)
@@ -326,7 +326,7 @@ def adj_compare(
     ring_out: wp.array4d[vec16],  # [B, RING, G, SLOPES]
     blurred_out: wp.array4d[vec16],  # [B, ROWS, G, SLOPES]
     adj_image_out: wp.array2d[float],  # [H, L]
-    adj_taps_out: wp.array2d[vec16],
+    adj_taps_out: wp.array2d[vec16],  # [H, L - 15]
 ):
     band = first + wp.tid()
     height = image.shape[0]

@@ -12,6 +12,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.falloff import Falloff
+from warp_splat.kernels.project import Projection
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import DRIVERS
 
@@ -41,7 +42,10 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
     if not is_one_of(options.sh_degree, (None, 0, 1, 2, 3)):
         raise InputError(f"options.sh_degree: expected 0, 1, 2, 3 or None, got {options.sh_degree!r}.")
-    for name, choices in (("projection", PROJECTIONS), ("extent", EXTENTS), ("exp_degree", EXP_DEGREES)):
+    if not isinstance(options.projection, Projection) and not is_one_of(options.projection, PROJECTIONS):
+        wanted = f"one of {', '.join(PROJECTIONS)} or a warp_splat.kernels.project.Projection"
+        raise InputError(f"options.projection: expected {wanted}, got {options.projection!r}.")
+    for name, choices in (("extent", EXTENTS), ("exp_degree", EXP_DEGREES)):
         if not is_one_of(getattr(options, name), choices):
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Sequence
 
@@ -12,7 +13,10 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
-from warp_splat.kernels.project import UNSEEN, CameraView, make_project, quarantine
+from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project.camera_view import CameraView
+from warp_splat.kernels.project.quarantine import quarantine
+from warp_splat.kernels.project.shared import UNSEEN, make_project
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade, mat53, mat73
 from warp_splat.kernels.simd import TYPES
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
@@ -34,10 +38,15 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView
     cam.slope_min = wp.vec2(*(-principal / focal - margin))
     cam.slope_max = wp.vec2(*((size - principal) / focal + margin))
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
-    cam.antialiasing = int(options.antialiasing)
-    cam.ellipsoid = int(options.projection == "ellipsoid")
     cam.alpha_min = options.alpha_min
     return cam
+
+
+def projection_of(options: RasterOptions) -> Projection:
+    """The user's own, or that of the file of that name."""
+    if isinstance(options.projection, Projection):
+        return options.projection
+    return importlib.import_module(f"warp_splat.kernels.project.{options.projection}").PROJECTION
 
 
 def project(
@@ -50,13 +59,13 @@ def project(
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options)
     driver = driver or driver_of(gaussians.means.device)
-    reach_of = falloff_of(options).reach_of
-    return Splats2D(*Project.apply(*gaussians, cam, reach_of, driver, dropped or Dropped()))
+    kernel = make_project(projection_of(options), options.antialiasing, falloff_of(options).reach_of, driver.lanes)
+    return Splats2D(*Project.apply(*gaussians, cam, kernel, driver, dropped or Dropped()))
 
 
 def _project_geometry(
     cam: CameraView,
-    reach_of: wp.Function,
+    kernel: wp.Kernel,
     lanes: int,
     inputs: Sequence[torch.Tensor],
     outputs: Sequence[torch.Tensor],
@@ -69,7 +78,7 @@ def _project_geometry(
 
     Args:
         cam: camera.
-        reach_of: where the falloff ends.
+        kernel: of the projection.
         lanes: Gaussians that a kernel takes at once.
         inputs: means, quats, scales, opacities.
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
@@ -79,7 +88,6 @@ def _project_geometry(
     count = len(outputs[-1])
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
-    kernel = make_project(lanes, reach_of)
     _project_groups(kernel, cam, lanes, *([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
         last = [[_filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
@@ -131,19 +139,19 @@ class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, reach_of, driver, dropped):
+    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, kernel, driver, dropped):
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
         count, new, lanes = means.shape[0], means.new_zeros, driver.lanes
         splats = Splats2D(
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
             radii=torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device),
         )
-        _project_geometry(cam, reach_of, lanes, _shapes(gaussians), _geometry(splats))
+        _project_geometry(cam, kernel, lanes, _shapes(gaussians), _geometry(splats))
         given = [cam, *_views3d([gaussians.means, gaussians.sh_dc[:, 0]]), *_by_degree(gaussians.sh_rest)]
         found = [*splats.views(), view(splats.radii, wp.int32)]
         _launch_groups(make_shade(lanes), lanes, count, given, found, means.device)
         ctx.save_for_backward(*gaussians, *splats)
-        ctx.cam, ctx.reach_of, ctx.driver, ctx.dropped = cam, reach_of, driver, dropped
+        ctx.cam, ctx.kernel, ctx.driver, ctx.dropped = cam, kernel, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
         return tuple(splats)
 
@@ -164,7 +172,7 @@ class Project(torch.autograd.Function):
             shapes = (torch.zeros_like(tensor) for tensor in (given.quats, given.scales, given.opacities))
             adj = Gaussians(adj_placed, *shapes, adj_dc, adj_rest)
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
-            _project_geometry(ctx.cam, ctx.reach_of, lanes, _shapes(given), outputs, _shapes(adj), adj_outputs)
+            _project_geometry(ctx.cam, ctx.kernel, lanes, _shapes(given), outputs, _shapes(adj), adj_outputs)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)

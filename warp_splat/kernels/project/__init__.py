@@ -1,0 +1,30 @@
+"""From 3D Gaussians to 2D ones: what all projections share, and one file for each of them.
+
+A projection says where a Gaussian's mean lies in the image and how the image moves with it; its outline may be
+corrected. :class:`Projection` is what it has to give; all else (reading, culling, rotation, conic, extent,
+antialiasing, writing) is :mod:`warp_splat.kernels.project.shared`. Warp derives the adjoint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import warp as wp
+
+
+class Projection(NamedTuple):
+    """What one projection does otherwise than another. Both members make a Warp function for a number of lanes.
+
+    Numbers are of ``TYPES[lanes].number``, and written with the words of :mod:`warp_splat.kernels.simd`.
+
+    lens(camera, x, y, z):
+        The mean in the camera [world units] -> (px, py, j00, j01, j02, j10, j11, j12): where it is seen [px], and the
+        derivative of that by the world's coordinates, two rows of J W [px per world unit].
+    outline(camera, z, px, py, a10, a11, a12, a20, a21, a22, t0, t1, t2, sx, sy, sz, drawn):
+        a1, a2: rows of J W R S [px]; t: third row of W R, times the scales s the extent along the optical axis; a mask.
+        -> (px, py, a10, a11, a12, a20, a21, a22, drawn): the corrected ones. None: all stays as it is.
+    """
+
+    lens: Callable[[int], wp.Function]
+    outline: Callable[[int], wp.Function] | None = None
