@@ -29,13 +29,9 @@ from warp_splat.config import ALPHA_MAX
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.simd import fill, over, times, where_less
+from warp_splat.kernels.slots import CHANNEL
 
 wp.set_module_options(FORWARD_ONLY)
-
-
-#: Columns of a slot, which is the row of gradients of a tile instance, and of what leads to it. In a slot, XX to YY are
-#: the conic's; elsewhere they are mostly the root's.
-MEAN_X, MEAN_Y, XX, XY, YY, OPACITY, CHANNEL = range(7)
 
 
 class BlendVariant(NamedTuple):

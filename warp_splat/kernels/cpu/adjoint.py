@@ -11,7 +11,8 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
 from warp_splat.kernels.simd import LANES, times, vec16
-from warp_splat.kernels.splat import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, BlendVariant, Splat2D, exponent
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
 
 vec5 = wp.types.vector(length=5, dtype=float)

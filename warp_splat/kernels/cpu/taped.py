@@ -25,20 +25,8 @@ from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, reach
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import LANE_X, LANE_Y, times, total, vec16, where_less
-from warp_splat.kernels.splat import (
-    CHANNEL,
-    MEAN_X,
-    MEAN_Y,
-    OPACITY,
-    XX,
-    XY,
-    YY,
-    BlendVariant,
-    Splat2D,
-    alpha_of,
-    exponent,
-    odds_of,
-)
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
 from warp_splat.kernels.step import conic_from_root, opaque
 
 

@@ -11,7 +11,8 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
-from warp_splat.kernels.splat import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, BlendVariant, Splat2D, exponent
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import (
     conic_from_root,
     geometry_from_moments,

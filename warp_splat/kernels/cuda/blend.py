@@ -10,21 +10,8 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.falloff import make_falloff
-from warp_splat.kernels.splat import (
-    CHANNEL,
-    MEAN_X,
-    MEAN_Y,
-    OPACITY,
-    XX,
-    XY,
-    YY,
-    BlendVariant,
-    Splat2D,
-    advance,
-    alpha_of,
-    exponent,
-    weight,
-)
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 
 THREADS = wp.constant(TILE * TILE)  # per block
 vec10 = wp.types.vector(length=10, dtype=float)

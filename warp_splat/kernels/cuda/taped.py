@@ -13,19 +13,8 @@ from warp_splat.config import TILE
 from warp_splat.kernels.cuda.adjoint import row_from_root
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of, vec10
 from warp_splat.kernels.falloff import make_falloff
-from warp_splat.kernels.splat import (
-    CHANNEL,
-    MEAN_X,
-    MEAN_Y,
-    OPACITY,
-    XX,
-    XY,
-    YY,
-    BlendVariant,
-    Splat2D,
-    exponent,
-    odds_of,
-)
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent, odds_of
 from warp_splat.kernels.step import opaque
 
 
