@@ -327,6 +327,11 @@ def halved(x: vec16, n: vec16i):
 
 
 @wp.func_grad(halved)
+def adj_halved(x: float, n: int, adj_ret: float):
+    wp.adjoint[x] += adj_ret * halved(1.0, n)
+
+
+@wp.func_grad(halved)
 def adj_halved(x: vec16, n: vec16i, adj_ret: vec16):  # bits have no derivative that Warp could find
     wp.adjoint[x] += times(adj_ret, halved(vec16(1.0), n))
 

@@ -1,0 +1,108 @@
+"""How kernels are written: what they write is named so and stands last, arrays say their shape, none is too long."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
+MOST_PARAMETERS, MOST_LINES = 12, 100
+
+#: Kernels with more parameters, and why: a struct of arrays would be packed at every launch.
+MANY_PARAMETERS = {
+    "blend": "tile lists, limits, and what the adjoint reads",
+    "upstream": "tile lists, and upstream gradients in another layout",
+    "walk": "as blend, of which it is the differentiated loop",
+    "shade": "coefficients come by degree; all outputs are cleared where a color is not finite",
+    "adj_shade": "coefficients and their gradients come by degree",
+    "compare": "image and target are given as numbers and as lanes, the target as bytes or floats",
+    "adj_compare": "as compare",
+    "pack": "seven arrays of a 2D Gaussian become one",
+}
+#: Kernels whose inputs are those of `blend` and `upstream`, where their shapes stand.
+INPUTS_OF_THE_BLEND = {"cpu/adjoint:adj_blend", "cpu/taped:walk", "cuda/adjoint:adj_blend", "cuda/taped:walk"}
+
+
+def is_kernel(node):
+    """Whether a function is decorated as one: by ``wp.kernel`` or by what assembles kernels."""
+    return isinstance(node, ast.FunctionDef) and any("kernel" in ast.unparse(item) for item in node.decorator_list)
+
+
+def find_kernels():
+    """Each kernel of the package: its name, its lines of source and its definition."""
+    for path in sorted(KERNELS.rglob("*.py")):
+        text = path.read_text()
+        for node in ast.walk(ast.parse(text)):
+            if is_kernel(node):
+                yield pytest.param(
+                    text.splitlines(), node, id=f"{path.relative_to(KERNELS).with_suffix('')}:{node.name}"
+                )
+
+
+def base_of(target):
+    """The name of the variable that ``a[i, j]`` or ``a[i][j].x`` is part of."""
+    while isinstance(target, ast.Subscript | ast.Attribute):
+        target = target.value
+    return target.id if isinstance(target, ast.Name) else ""
+
+
+def written(kernel):
+    """Variables of which elements are assigned."""
+    for node in ast.walk(kernel):
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
+        )
+        yield from (base_of(target) for target in targets if isinstance(target, ast.Subscript))
+
+
+def parameters(kernel):
+    return [parameter.arg for parameter in kernel.args.args]
+
+
+def comment(lines, parameter):
+    """What stands behind a parameter on its line."""
+    return lines[parameter.end_lineno - 1].partition("#")[2]
+
+
+def test_kernels_are_found():
+    assert len(list(find_kernels())) > 15
+
+
+@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+def test_what_is_written_is_named_so(lines, kernel):
+    """And what is named so is used: written here, or given to a function that writes it."""
+    changed = {name for name in written(kernel) if name in parameters(kernel)}
+    assert all(name.endswith("_out") for name in changed)
+    used = {node.id for statement in kernel.body for node in ast.walk(statement) if isinstance(node, ast.Name)}
+    assert {name for name in parameters(kernel) if name.endswith("_out")} <= used
+
+
+@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+def test_order_of_parameters(lines, kernel):
+    """``first`` (of a slice; blocks have none), inputs, a line ``# out``, outputs."""
+    names = parameters(kernel)
+    assert "first" not in names[1:]
+    assert "first" in names or "tile" in ast.unparse(kernel.body[0]), "no index of the launch"
+    outputs = [parameter for parameter in kernel.args.args if parameter.arg.endswith("_out")]
+    assert names[len(names) - len(outputs) :] == [parameter.arg for parameter in outputs]
+    if outputs:
+        assert lines[outputs[0].lineno - 2].strip().startswith("# out")
+
+
+@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+def test_arrays_say_their_shape(lines, kernel, request):
+    repeats = request.node.callspec.id in INPUTS_OF_THE_BLEND
+    for parameter in kernel.args.args:
+        if "wp.array" in ast.unparse(parameter.annotation) and not (repeats and not parameter.arg.endswith("_out")):
+            assert comment(lines, parameter).strip().startswith("["), f"{parameter.arg}: no shape"
+
+
+@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+def test_size(lines, kernel):
+    assert len(kernel.args.args) <= MOST_PARAMETERS or kernel.name in MANY_PARAMETERS
+    assert kernel.end_lineno - kernel.lineno < MOST_LINES
+
+
+def test_exceptions_are_needed():
+    kernels = [param.values[1] for param in find_kernels()]
+    assert set(MANY_PARAMETERS) == {kernel.name for kernel in kernels if len(kernel.args.args) > MOST_PARAMETERS}
