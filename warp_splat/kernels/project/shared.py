@@ -145,7 +145,7 @@ def make_project(projection: Projection, antialiasing: bool, reach_of: wp.Functi
 
     @wp.func
     def covers_pixel(mean: number, extent: number, size: float):
-        """Mask: a pixel centre of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
+        """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
         first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
         last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
         return fill(1.0, mean) - less(last, first)
