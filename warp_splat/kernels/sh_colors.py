@@ -19,7 +19,7 @@ from warp_splat.kernels.compiler import LANES_IN_ORDER
 from warp_splat.kernels.harmonics import C0, make_harmonics
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.shared import INVALID
-from warp_splat.kernels.simd import TYPES, lane_of, pick
+from warp_splat.kernels.simd import TYPES, pick
 
 mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
 mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
@@ -178,6 +178,9 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         for lane in range(lanes):
             i = group + lane
             if i < radii.shape[0]:
-                means_out[i] = wp.vec3(lane_of(adj_x, lane), lane_of(adj_y, lane), lane_of(adj_z, lane))
+                if wp.static(lanes == 1):
+                    means_out[i] = wp.vec3(adj_x, adj_y, adj_z)
+                else:
+                    means_out[i] = wp.vec3(adj_x[lane], adj_y[lane], adj_z[lane])
 
     return adj_shade

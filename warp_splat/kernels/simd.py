@@ -73,17 +73,6 @@ def adj_fill(value: float, like: vec16, adj_ret: vec16):
 
 
 @wp.func
-def lane_of(x: float, lane: int):
-    """The number of one lane."""
-    return x
-
-
-@wp.func
-def lane_of(x: vec16, lane: int):
-    return x[lane]
-
-
-@wp.func
 def times(a: float, b: float):
     return a * b
 
