@@ -50,7 +50,7 @@ def test_images_grow_to_their_full_size(scene):
     view = scene.train[0]
     shrinks = []
     for iteration in range(1, 12):
-        camera, photograph = trainer._at_size(view, iteration)
+        camera, photograph = trainer.photographs.at_size(view, iteration)
         assert photograph.image.shape == (camera.height, camera.width, 3)
         assert (camera.fx / camera.width, camera.cy / camera.height) == pytest.approx(
             (view.camera.fx / view.camera.width, view.camera.cy / view.camera.height)
@@ -63,7 +63,9 @@ def test_images_grow_to_their_full_size(scene):
 def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):
     image = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
     camera = scene.train[0].camera.resized(48, 40)
-    _, photograph = Trainer(scene, TrainConfig(device="cpu", coarse=4))._at_size(View("a", camera, image, camera), 1)
+    _, photograph = Trainer(scene, TrainConfig(device="cpu", coarse=4)).photographs.at_size(
+        View("a", camera, image, camera), 1
+    )
     means = image.reshape(10, 4, 12, 4, 3).mean((1, 3))
     assert np.abs(photograph.image.numpy() - means).max() <= 0.5 + 1e-3
 
@@ -71,10 +73,10 @@ def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):
 def test_a_coarse_step_trains_on_a_coarse_image(scene):
     trainer = Trainer(scene, TrainConfig(device="cpu", coarse=4, coarse_until_iter=100))
     trainer.differentiate(1)
-    assert trainer._photographs and all(
-        photograph.image.shape[0] == view.image.shape[0] // 4 for view, photograph in trainer._photographs.items()
+    assert trainer.photographs.kept and all(
+        photograph.image.shape[0] == view.image.shape[0] // 4 for view, photograph in trainer.photographs.kept.items()
     )
     trainer.differentiate(60)
     assert all(
-        photograph.image.shape[0] == view.image.shape[0] // 2 for view, photograph in trainer._photographs.items()
+        photograph.image.shape[0] == view.image.shape[0] // 2 for view, photograph in trainer.photographs.kept.items()
     )

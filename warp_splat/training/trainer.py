@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from torch.nn import functional
 
 from warp_splat.camera import Camera
 from warp_splat.color import to_bytes, to_srgb
@@ -29,6 +28,7 @@ from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS, choose
+from warp_splat.training.photographs import Photographs
 from warp_splat.training.seams import Setting, Step, having
 
 T = TypeVar("T")
@@ -50,14 +50,6 @@ class Quarantine:
         processes.sum(counts)  # but a refused pruning is the same one everywhere
         names = (item.name for item in fields(self))
         return dict(zip(names, [*counts.tolist(), self.prunings], strict=True))
-
-
-class Photograph(NamedTuple):
-    """A photograph on a device, at the size of this iteration."""
-
-    image: torch.Tensor  # [H, W, 3], as in View
-    alpha: torch.Tensor | None  # [H, W, 1] uint8, if it is needed
-    mask: torch.Tensor | None  # [H, W, 1] uint8
 
 
 class Trainer:
@@ -106,8 +98,7 @@ class Trainer:
         self.degree = 0
         self._views_random = random.Random(seed)
         self._deck: list[View] = []
-        self._shrink = 1  # of the images in this step
-        self._photographs: dict[View, Photograph] = {}  # those that were used, at that size
+        self.photographs = Photographs(config, self.device, any(having(self.parts, "reads_alpha")))
         self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
 
     def differentiate(self, iteration: int) -> torch.Tensor:
@@ -121,7 +112,7 @@ class Trainer:
         learn = self.config.learn
         self._set_iteration(iteration)
         step = Step(iteration, self._next_view())
-        camera, photograph = self._at_size(step.view, iteration)
+        camera, photograph = self.photographs.at_size(step.view, iteration)
         options = self._through("asks", self.options, step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
         out = self._render(camera, background, options)
@@ -239,37 +230,6 @@ class Trainer:
             if self._deck[index] not in dealt:  # a new deck holds those of this step again
                 dealt.append(self._deck.pop(index))
         return dealt[self.processes.rank]
-
-    def _at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
-        """Camera and photograph of ``view`` at this iteration's size: coarse to fine, if so configured."""
-        learn = self.config.learn
-        doublings = (learn.coarse.bit_length() - 1) * iteration // learn.coarse_until_iter
-        shrink = max(learn.coarse >> doublings, 1)
-        if shrink != self._shrink:
-            self._shrink = shrink
-            self._photographs.clear()
-        width, height = (max(size // shrink, 1) for size in (view.camera.width, view.camera.height))
-        camera = view.camera if shrink == 1 else view.camera.resized(width, height)
-        return camera, self._photograph(view, height, width)
-
-    def _photograph(self, view: View, height: int, width: int) -> Photograph:
-        """The photograph of ``view`` on the device; for a GPU, it waits there or in page-locked memory of the host."""
-        kept = self._photographs.get(view)
-        if kept is None:
-            with stage("photographs"):
-                alpha = view.alpha if any(having(self.parts, "reads_alpha")) else None
-                planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
-                kept = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
-            self._photographs[view] = kept
-        return Photograph(*(None if p is None else p.to(self.device, non_blocking=True) for p in kept))
-
-    def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
-        kept = torch.from_numpy(pixels).to(self.config.machine.data_device)
-        if kept.shape[:2] != (height, width):
-            planes = kept.permute(2, 0, 1)[None].float()
-            means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
-            kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
-        return kept if kept.device.type == self.device.type else kept.pin_memory()
 
     def _render(self, camera: Camera, background: torch.Tensor, options: RasterOptions) -> RenderOutput:
         with stage("project"):

@@ -7,8 +7,8 @@ import torch
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.scene.types import Scene
 from warp_splat.training.parts import BackgroundOptions
+from warp_splat.training.photographs import Photograph
 from warp_splat.training.seams import Setting, Step, Verdict
-from warp_splat.training.trainer import Photograph
 
 GENERATOR = "random.background"  # in a checkpoint
 

@@ -1,0 +1,63 @@
+"""Photographs as a step needs them: on its device and at its size, from coarse to fine if so configured."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from warp_splat.camera import Camera
+from warp_splat.runtime.launch import stage
+from warp_splat.scene.types import View
+from warp_splat.training.options import TrainConfig
+
+
+class Photograph(NamedTuple):
+    """A photograph on a device, at the size of this iteration."""
+
+    image: torch.Tensor  # [H, W, 3], as in View
+    alpha: torch.Tensor | None  # [H, W, 1] uint8, if it is needed
+    mask: torch.Tensor | None  # [H, W, 1] uint8
+
+
+class Photographs:
+    """Those that were used, kept until their size changes; for a GPU, there or in page-locked memory of the host.
+
+    Args:
+        config: says how coarse they are, and where they are kept.
+        device: where they are compared.
+        with_alpha: whether they bring their transparency along.
+    """
+
+    def __init__(self, config: TrainConfig, device: torch.device, with_alpha: bool):
+        self.config, self.device, self.with_alpha = config, device, with_alpha
+        self.kept: dict[View, Photograph] = {}
+        self._shrink = 1  # of those that are kept
+
+    def at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
+        """Camera and photograph of ``view`` at the size of this iteration, the photograph on the device."""
+        learn = self.config.learn
+        doublings = (learn.coarse.bit_length() - 1) * iteration // learn.coarse_until_iter
+        shrink = max(learn.coarse >> doublings, 1)
+        if shrink != self._shrink:
+            self._shrink = shrink
+            self.kept.clear()
+        width, height = (max(size // shrink, 1) for size in (view.camera.width, view.camera.height))
+        camera = view.camera if shrink == 1 else view.camera.resized(width, height)
+        if view not in self.kept:
+            with stage("photographs"):
+                alpha = view.alpha if self.with_alpha else None
+                planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
+                self.kept[view] = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
+        here = (None if p is None else p.to(self.device, non_blocking=True) for p in self.kept[view])
+        return camera, Photograph(*here)
+
+    def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
+        kept = torch.from_numpy(pixels).to(self.config.machine.data_device)
+        if kept.shape[:2] != (height, width):
+            planes = kept.permute(2, 0, 1)[None].float()
+            means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
+            kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
+        return kept if kept.device.type == self.device.type else kept.pin_memory()
