@@ -1,7 +1,6 @@
 """The handlers of the viewer, with the place of browsers taken by a fake, and its command."""
 
 from contextlib import contextmanager, nullcontext
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,20 +10,22 @@ from scene_files import write_colmap
 
 from warp_splat.cli import main
 from warp_splat.color import to_srgb
-from warp_splat.config import ViewConfig
+from warp_splat.config import RasterOptions, ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.command import make_renderer
 from warp_splat.viewer import server
-from warp_splat.viewer.command import make_draw, view_model
+from warp_splat.viewer.command import view_model
 from warp_splat.viewer.pace import MOST
 
 
 @pytest.fixture
 def viewer(fake_viser):
     model, scene = GaussianModel.from_splats(some_gaussians(50)), some_scene()
-    with server.Viewer(make_draw(model, {}), lambda: model.parameters["means"], scene, 8080) as viewer:
+    draw = make_renderer(model, False, RasterOptions())
+    with server.Viewer(draw, lambda: model.parameters["means"], scene, 8080) as viewer:
         yield viewer
     assert viewer.server.stopped
 
@@ -140,7 +141,8 @@ def test_windows_of_strange_sizes(viewer, monkeypatch, size):
 def test_small_models(fake_viser, count, coefficients):
     """Also an empty one, and one without spherical harmonics."""
     model = GaussianModel.from_splats(some_gaussians(count, coefficients))
-    with server.Viewer(make_draw(model, {}), lambda: model.parameters["means"], None, 8080) as viewer:
+    draw = make_renderer(model, False, RasterOptions())
+    with server.Viewer(draw, lambda: model.parameters["means"], None, 8080) as viewer:
         client = FakeClient(1, PHOTO)
         viewer.server.enter(client)
         for kind in ("image", "depth", "alpha"):
@@ -168,20 +170,25 @@ def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, so
     """A file does not say what light it was trained in; its scene does."""
     root = write_colmap(tmp_path / "scene", ["a.exr", "b.exr"], np.full((32, 48, 3), 0.2, np.float32))
     save_gaussians(tmp_path / "a.ply", SplatFile(some_gaussians(50)))
-    draws = []
+    client, served = FakeClient(1, PHOTO), []
 
     @contextmanager
-    def served(draw, *_):
-        draws.append(draw)
-        yield SimpleNamespace(announcement="")
+    def serve(*arguments):
+        with server.Viewer(*arguments) as viewer:
+            viewer.server.enter(client)
+            served.append(viewer.watchers[1].camera(MOST)[0])
+            drawn(viewer)
+            yield viewer
 
-    monkeypatch.setattr("warp_splat.viewer.command.Viewer", served)
+    monkeypatch.setattr("warp_splat.viewer.command.Viewer", serve)
     monkeypatch.setattr("warp_splat.viewer.command.interruptible", lambda: nullcontext([2]))
+    at_rest(monkeypatch)
     assert view_model(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
-    draws.append(make_draw(GaussianModel.from_splats(some_gaussians(50)), {}))
-    drawn, plain = (draw(PHOTO, False).image for draw in draws)
+    draw = make_renderer(GaussianModel.from_splats(some_gaussians(50)).arranged(), False, RasterOptions())
+    plain = draw(served[0], False).image.clamp(0, 1)
     assert plain.std() > 0.1
-    torch.testing.assert_close(drawn, to_srgb(plain.clamp(0, 1), torch.where) if source else plain)
+    shown = to_srgb(plain, torch.where) if source else plain
+    np.testing.assert_array_equal(client.frames[-1][0], np.rint(255 * shown.numpy()))
 
 
 def test_flags_of_training(capsys):

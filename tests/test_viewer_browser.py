@@ -15,12 +15,13 @@ from torch.nn import functional
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import to_bytes
+from warp_splat.config import RasterOptions
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.command import make_renderer
 from warp_splat.scene import load_scene
 from warp_splat.viewer.browser_camera import framed
-from warp_splat.viewer.command import make_draw
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 WIDTH, HEIGHT = 1000, 600
@@ -86,7 +87,7 @@ def test_view(scene, model, tmp_path):
     """
     shot = lambda: screenshot(page, tmp_path)  # noqa: E731
     view = scene.train[0]
-    draw = make_draw(GaussianModel.load(model), {})
+    draw = make_renderer(GaussianModel.load(model), False, RasterOptions())
     camera, box = framed(view.camera, WIDTH, HEIGHT)
     wanted = to_bytes(draw(camera, False).image)
     aside = Camera(WIDTH, HEIGHT, camera.fx, camera.fy, camera.cx + 1, camera.cy, camera.rotation, camera.translation)

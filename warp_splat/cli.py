@@ -8,6 +8,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from typing import Any
 
 from warp_splat import __version__
 from warp_splat.config import (
@@ -25,16 +26,6 @@ from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
 
-Config = (
-    SfmConfig
-    | InspectConfig
-    | TrainConfig
-    | RenderConfig
-    | ViewConfig
-    | ConvertConfig
-    | ExportHtmlConfig
-    | CompareConfig
-)
 #: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
 COMMANDS = {
     "sfm": (SfmConfig, "sfm.command.sfm", "compute the cameras of photographs or of a video: a scene to train on"),
@@ -99,8 +90,8 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parse(arguments: list[str]) -> Config:
-    """The configuration that the arguments ask for.
+def parse(arguments: list[str]) -> Any:
+    """The configuration that the arguments ask for, of a type of COMMANDS.
 
     Raises:
         InputError: for a flag that does not exist here, or that cannot change when a training is continued; for a
@@ -150,7 +141,7 @@ def _continued(given: dict) -> dict:
     return {**options, **given}
 
 
-def _function_of(config: Config) -> Callable[[Config], int]:
+def _function_of(config: Any) -> Callable[[Any], int]:
     """The function that runs the command of this configuration, loaded now."""
     module, name = next(place for kind, place, _ in COMMANDS.values() if isinstance(config, kind)).rsplit(".", 1)
     return getattr(importlib.import_module(f"warp_splat.{module}"), name)
@@ -169,15 +160,11 @@ def main(arguments: list[str] | None = None) -> int:
         with leaving_at_once():
             run = _function_of(config)
         return run(config)
-    except InputError as error:
+    except (InputError, OSError) as error:
         if os.environ.get("WARP_SPLAT_TRACEBACK"):
             raise
-        print(f"warp-splat: error: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        if os.environ.get("WARP_SPLAT_TRACEBACK"):
-            raise
-        print(f"warp-splat: error: {error.filename or 'file'}: {error.strerror or error}.", file=sys.stderr)
+        text = f"{error.filename or 'file'}: {error.strerror or error}." if isinstance(error, OSError) else error
+        print(f"warp-splat: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("warp-splat: interrupted; what was saved before stays.", file=sys.stderr)

@@ -163,11 +163,8 @@ def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
 
 def _smooth(values: np.ndarray) -> np.ndarray:
     """Running mean over a twentieth of the values, centered, or what there is of it at the ends."""
-    half = len(values) // 40
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    index = np.arange(len(values))
-    first, last = np.maximum(index - half, 0), np.minimum(index + half + 1, len(values))
-    return (sums[last] - sums[first]) / (last - first)
+    window = np.ones(2 * (len(values) // 40) + 1)
+    return np.convolve(values, window, "same") / np.convolve(np.ones_like(values), window, "same")
 
 
 def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] | None = None) -> Figure:

@@ -9,7 +9,7 @@ import math
 import os
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from warp_splat.errors import InputError
@@ -41,7 +41,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
                 os.fsync(file.fileno())
             os.replace(temporary, path)
         finally:
-            _remove(temporary)
+            with suppress(OSError):  # failing to tidy up must not hide the error that made it necessary
+                temporary.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"{path}: could not be written ({error.strerror or error}); an older file of this name is untouched. "
@@ -95,11 +96,3 @@ def _without_infinities(value):
     if isinstance(value, list):
         return [_without_infinities(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _remove(path: Path) -> None:
-    """Remove ``path`` if it is there; failing to tidy up must not hide the error that made it necessary."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        pass

@@ -58,9 +58,11 @@ class Document:
             else:
                 text = source.read()
         self.json = _parse(text)
-        if len(self.entries("buffers")) > MOST_BUFFERS:
-            raise Unexpected(f"{len(self.entries('buffers'))} buffers, more than {MOST_BUFFERS}")
-        self.buffers = [self._open(entry, chunk if index == 0 else None) for index, entry in enumerate(self._buffers())]
+        count = len(self.entries("buffers"))
+        if count > MOST_BUFFERS:
+            raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
+        entries = [self.entry("buffers", index) for index in range(count)]
+        self.buffers = [self._open(entry, chunk if index == 0 else None) for index, entry in enumerate(entries)]
 
     @property
     def data_bytes(self) -> int:
@@ -131,9 +133,6 @@ class Document:
                 found.append((self.entry("meshes", node["mesh"]), world))
             open_nodes += [(child, world) for child in reversed(_list(node, "children"))]
         return found
-
-    def _buffers(self) -> list[dict]:
-        return [self.entry("buffers", index) for index in range(len(self.entries("buffers")))]
 
     def _open(self, entry: dict, chunk: Buffer | None) -> Buffer:
         if "uri" not in entry:
@@ -207,10 +206,7 @@ def _parse(text: bytes) -> dict:
     def refuse(name: str):
         raise ValueError(f"the JSON holds {name}")
 
-    try:
-        parsed = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    except RecursionError as error:
-        raise ValueError("the JSON is nested too deeply") from error
+    parsed = json.loads(text.decode("utf-8"), parse_constant=refuse)
     if not isinstance(parsed, dict):
         raise Unexpected("JSON that is no object")
     return parsed

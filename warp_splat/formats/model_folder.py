@@ -198,12 +198,11 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
     Raises:
         InputError: if the file cannot be written.
     """
-    cameras = [_camera_entry(index, view) for index, view in enumerate([*views_test, *views_train])]
+    cameras = [
+        {"id": index, "img_name": view.name, **camera_entry(view.original)}
+        for index, view in enumerate([*views_test, *views_train])
+    ]
     write_text(Path(folder) / "cameras.json", json.dumps(cameras, allow_nan=False))
-
-
-def _camera_entry(index: int, view: View) -> dict[str, object]:
-    return {"id": index, "img_name": view.name, **camera_entry(view.original)}
 
 
 def camera_entry(camera: Camera) -> dict[str, object]:
@@ -232,10 +231,7 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     if not path.exists():
         return []
     with reading(path, "a list of cameras as training writes it"):
-        try:
-            entries = json.loads(path.read_text(encoding="utf-8"))
-        except RecursionError as error:
-            raise Unexpected("lists in lists without end") from error
+        entries = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             raise Unexpected("other JSON")
         try:

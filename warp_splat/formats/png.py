@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -86,14 +87,12 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
     with atomic_write(path) as temporary:
         with av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as container:
             stream = _h264_stream(container, width + width % 2, height + height % 2, fps)
-            frame = first
-            while frame is not None:
+            for frame in itertools.chain([first], frames):
                 if frame.shape != first.shape or frame.dtype != np.uint8:
                     raise InputError(f"frames: expected {first.shape} uint8 each, got {frame.shape} {frame.dtype}.")
                 padded = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
                 picture = av.VideoFrame.from_ndarray(padded, format="rgb24")
                 container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
-                frame = next(frames, None)
             container.mux(stream.encode())
 
 

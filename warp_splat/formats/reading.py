@@ -22,7 +22,8 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
         expected: what it should be: "a PLY file with ...".
 
     Raises:
-        InputError: if the block raises it, ``Unexpected``, ValueError (damaged), OSError or MemoryError.
+        InputError: if the block raises it, ``Unexpected``, ValueError or RecursionError (damaged), OSError or
+            MemoryError.
     """
     try:
         yield
@@ -36,7 +37,6 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
         raise InputError(f"{path}: could not be read ({error}); it needs more memory than there is.") from error
     except Unexpected as error:
         raise InputError(f"{path}: expected {expected}, found {error}.") from error
-    except (ValueError, OverflowError) as error:
-        raise InputError(
-            f"{path}: the file is damaged or cut short ({error!s:.200}); copy or save it again."
-        ) from error
+    except (ValueError, OverflowError, RecursionError) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else f"{error!s:.200}"
+        raise InputError(f"{path}: the file is damaged or cut short ({reason}); copy or save it again.") from error

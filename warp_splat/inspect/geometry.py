@@ -33,6 +33,11 @@ class Measured:
     pixels: dict[str, np.ndarray] = field(default_factory=dict)  # [n, 2] px in the model's image, of each observation
     seen: dict[str, int] = field(default_factory=dict)  # points inside an image
 
+    @property
+    def medians(self) -> dict[str, float]:
+        """The median error of each image, px."""
+        return {name: float(np.median(errors)) for name, errors in self.errors.items()}
+
 
 def sample(items: list, count: int) -> list:
     """At most ``count`` of the items, evenly."""
@@ -64,7 +69,7 @@ def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding
         text = "the model keeps no observations to compare points with; look at the picture."
         yield Finding("reprojection", "note", text)
         return
-    medians = {name: float(np.median(errors)) for name, errors in measured.errors.items()}
+    medians = measured.medians
     every = np.concatenate(list(measured.errors.values()))
     typical, width = float(np.median(every)), float(np.median(list(widths.values())))
     behind = np.count_nonzero(~np.isfinite(every))
@@ -167,6 +172,6 @@ TURNS = {
 
 def worst_and_best(measured: Measured, photos: list[Photo], count: int) -> list[Photo]:
     """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
-    medians = {name: float(np.median(errors)) for name, errors in measured.errors.items()}
+    medians = measured.medians
     ranked = sorted(photos, key=lambda photo: -medians.get(photo.name, 0.0))
     return ranked[: count // 2] + sample(ranked[count // 2 :], count - count // 2)

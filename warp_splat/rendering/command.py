@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +58,20 @@ def render_model(config: RenderConfig) -> int:
             output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
-            evaluate = partial(evaluate_views, extra={"split": "test", "gaussians": len(model)}, metrics=metrics)
             for sentence in absent:
                 say(sentence)
-            _write_splits(picture, scene, config, folder, iteration, evaluate, say)
+            if scene.train and not config.skip_train:
+                written = folder / "train" / f"ours_{iteration}"
+                write_views(picture, scene.train, written)
+                print(f"  train  {len(scene.train)} views in {written}")
+            if scene.test and not config.skip_test:
+                extra = {"split": "test", "gaussians": len(model)}
+                means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics)
+                show_views(compared, folder, "test", iteration, say)
+                print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
+                print(
+                    f"  {metrics_line(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}"
+                )
     return 0
 
 
@@ -92,26 +101,6 @@ def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene |
     fewer = ["trained with fewer Gaussians (--max_gaussians)", *(["on smaller images (-r)"] if scene else [])]
     elsewhere = ", or use --device cpu" if device.type == "cuda" else ""
     return memory_explained(device, model, sizes, f"render a model {' or '.join(fewer)}{elsewhere}")
-
-
-def _write_splits(
-    picture: Callable[[Camera], np.ndarray],
-    scene: Scene,
-    config: RenderConfig,
-    folder: Path,
-    iteration: int,
-    evaluate: Callable,
-    say: Callable[[str], None],
-) -> None:
-    """The views of both splits, and what ``evaluate`` finds of those held out."""
-    if scene.train and not config.skip_train:
-        write_views(picture, scene.train, folder / "train" / f"ours_{iteration}")
-        print(f"  train  {len(scene.train)} views in {folder / 'train' / f'ours_{iteration}'}")
-    if scene.test and not config.skip_test:
-        means, compared = evaluate(picture, scene.test, folder, "test", iteration)
-        show_views(compared, folder, "test", iteration, say)
-        print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-        print(f"  {metrics_line(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
 
 
 def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
@@ -205,11 +194,9 @@ def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:
         return spiral_cameras(scene, config.frames, lens)
     if config.video == "path":
         return path_cameras(scene, config.frames, lens)
-    return (
-        origin_orbit(config.frames, lens)
-        if config.orbit_center == "origin"
-        else focus_orbit(scene, config.frames, lens)
-    )
+    if config.orbit_center == "origin":
+        return origin_orbit(config.frames, lens)
+    return focus_orbit(scene, config.frames, lens)
 
 
 def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output: str, config: RenderConfig) -> None:

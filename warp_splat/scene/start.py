@@ -11,7 +11,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.ply import GRAY
 from warp_splat.formats.splats import SH_C0, SplatFile
-from warp_splat.scene.types import visible
+from warp_splat.scene.types import spread_of, visible
 
 COUNT = 50_000
 DEPTHS = 0.2, 8.0  # of the cameras' extent: from near the middle of an orbit to far behind what a walk shows
@@ -29,10 +29,7 @@ def random_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
         Points [P, 3] float32, P = 50,000; gray colors [P, 3] uint8.
     """
     random = np.random.default_rng(0)
-    centers = np.stack([camera.center for camera in cameras])
-    extent = np.linalg.norm(centers - centers.mean(0), axis=1).max()
-    if extent < 1e-6 * np.abs(centers).max() or extent == 0:
-        extent = 1.0
+    extent = spread_of(np.stack([camera.center for camera in cameras])) or 1.0
     kept: list[np.ndarray] = []
     for _ in range(ROUNDS):
         drawn = _along_rays(cameras, extent, random)

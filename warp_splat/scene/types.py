@@ -18,6 +18,12 @@ def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
     return (z > 0) & in_width & in_height
 
 
+def spread_of(centers: np.ndarray) -> float:
+    """The largest distance of cameras' centers [C, 3] from their mean; 0 if all stand at one place."""
+    largest = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    return largest if largest >= 1e-6 * np.abs(centers).max() else 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """One photograph and the camera that took it."""
@@ -69,7 +75,4 @@ class Scene:
         points from there.
         """
         centers = np.stack([view.camera.center for view in self.train])
-        extent = np.linalg.norm(centers - centers.mean(0), axis=1).max()
-        if extent < 1e-6 * np.abs(centers).max() or extent == 0:
-            extent = np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))
-        return float(1.1 * extent)
+        return float(1.1 * (spread_of(centers) or np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))))

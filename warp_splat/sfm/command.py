@@ -66,8 +66,9 @@ def sfm(config: SfmConfig) -> int:
         root = _frames(source, work, config, threads, say) if is_video(source) else photo_root(source)
         names = find_files(root, PHOTOS, None if is_video(source) else scene)
         with _explained(work):
-            _reconstruct(root, names, scene, work, config, threads, say)
-        _note_time(work, time.perf_counter() - started)
+            summary = _reconstruct(root, names, scene, work, config, threads, say)
+        summary["seconds_of_last_run"] = round(time.perf_counter() - started, 1)
+        write_json(work / "summary.json", summary)
     _summarize(scene, json.loads((work / "summary.json").read_text()))
     return 0
 
@@ -173,8 +174,10 @@ def _frames(video: Path, work: Path, config: SfmConfig, threads: int, say) -> Pa
     return frames
 
 
-def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: SfmConfig, threads: int, say) -> None:
-    """All stages, the largest model as the scene, and a summary of it in the folder ``work``."""
+def _reconstruct(
+    root: Path, names: list[str], scene: Path, work: Path, config: SfmConfig, threads: int, say
+) -> dict[str, Any]:
+    """All stages, the largest model as the scene; returns what there is to say of it."""
     groups, broken = _groups(root, names, threads, say)
     names = [name for group in groups for name in group]
     if len(names) < LEAST:
@@ -203,20 +206,17 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
     stages.write_undistorted(
         work / "models" / str(best), root, scene, work / "scene.part", sizes[best], threads, config.quiet
     )
-    write_json(
-        work / "summary.json",
-        {
-            "photographs": len(names) + len(broken),
-            "unreadable": broken,
-            "registered": sizes[best],
-            "unregistered": sorted(set(names) - registered),
-            "registered_by_model": sorted(sizes.values(), reverse=True),
-            "points": model.num_points3D(),
-            "reprojection_error_px": model.compute_mean_reprojection_error(),
-            "track_length": model.compute_mean_track_length(),
-            "threads": threads,
-        },
-    )
+    return {
+        "photographs": len(names) + len(broken),
+        "unreadable": broken,
+        "registered": sizes[best],
+        "unregistered": sorted(set(names) - registered),
+        "registered_by_model": sorted(sizes.values(), reverse=True),
+        "points": model.num_points3D(),
+        "reprojection_error_px": model.compute_mean_reprojection_error(),
+        "track_length": model.compute_mean_track_length(),
+        "threads": threads,
+    }
 
 
 def _groups(root: Path, names: list[str], threads: int, say) -> tuple[list[list[str]], list[str]]:
@@ -237,11 +237,6 @@ def _groups(root: Path, names: list[str], threads: int, say) -> tuple[list[list[
         groups[key].append(name)
     broken = groups.pop(None, [])
     return list(groups.values()), broken
-
-
-def _note_time(work: Path, seconds: float) -> None:
-    summary = json.loads((work / "summary.json").read_text())
-    write_json(work / "summary.json", {**summary, "seconds_of_last_run": round(seconds, 1)})
 
 
 def _summarize(scene: Path, summary: dict[str, Any]) -> None:

@@ -161,15 +161,8 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
     saves = set(report.save_iterations) - {end}
     profiled, before_profile = max(end - report.profile, run.iteration), run.seconds
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
-    bar = tqdm(
-        total=end,
-        initial=run.iteration,
-        disable=report.quiet,
-        unit="it",
-        mininterval=pause,
-        maxinterval=pause,
-        miniters=0,
-    )
+    often = {"mininterval": pause, "maxinterval": pause, "miniters": 0}
+    bar = tqdm(total=end, initial=run.iteration, disable=report.quiet, unit="it", **often)
     trainer.check_identical(run.iteration)
     with bar, launch.profile(report.profile > 0) as stages:
         for iteration in range(run.iteration + processes.count, end + 1, processes.count):

@@ -8,13 +8,10 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
-from warp_splat.camera import Camera
-from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime import launch
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.training.record import Run
 from warp_splat.training.trainer import Trainer
-from warp_splat.viewer.picture import on_screen
 from warp_splat.viewer.server import Viewer
 
 IDLE = 0.2  # seconds between two looks at Ctrl-C
@@ -124,9 +121,6 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
     Raises:
         InputError: if no port is free.
     """
-
-    def draw(camera: Camera, depth: bool) -> RenderOutput:
-        return on_screen(trainer.look(camera, depth), trainer.scene.linear)
-
-    with Viewer(draw, lambda: trainer.model.parameters["means"], trainer.scene, trainer.config.report.port) as viewer:
+    scene, port = trainer.scene, trainer.config.report.port
+    with Viewer(trainer.look, lambda: trainer.model.parameters["means"], scene, port, scene.linear) as viewer:
         yield TrainingViewer(trainer, run, viewer)

@@ -21,7 +21,7 @@ from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
 from warp_splat.training.config_file import write_config
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.tensorboard import check_available
+from warp_splat.training.tensorboard import writer_class
 
 Say = Callable[[str], None]
 
@@ -42,7 +42,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     threads = machine.threads or max(1, launch.get_threads() // processes.local_count)
     choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
     if config.report.tensorboard:
-        check_available()
+        writer_class()
     begun = load_header(data.start_checkpoint) if data.start_checkpoint else None
     done = begun.count("iteration") if begun else 0
     if begun and done > iterations:  # at the end, what is written there is written again

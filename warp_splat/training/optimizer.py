@@ -44,8 +44,7 @@ class Optimizer:
         self.model, self.options, self.extent, self.scale = model, options, extent, math.sqrt(batch)
         self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
         self._part_rates = {group["name"]: group["lr"] for group in parts}
-        names = ("means", "sh_dc", "sh_rest", "opacities", "scales", "quats")
-        groups = [{"name": name, "params": [model.parameters[name]]} for name in names]
+        groups = [{"name": name, "params": [leaf]} for name, leaf in model.parameters.items()]
         betas = (BETAS[0] ** batch, BETAS[1] ** batch)
         self.adam = torch.optim.Adam([*groups, *parts], lr=0.0, betas=betas, eps=EPS / self.scale)
         self._groups = {group["name"]: group for group in self.adam.param_groups}

@@ -21,7 +21,7 @@ class EventLog:
     @classmethod
     def open(cls, folder: Path, begun: int) -> EventLog:
         """A log in ``folder``; what an earlier run logged after iteration ``begun`` is no longer shown."""
-        return cls(_writer_class()(str(folder), purge_step=begun + 1, flush_secs=10))
+        return cls(writer_class()(str(folder), purge_step=begun + 1, flush_secs=10))
 
     def write_losses(self, iteration: int, losses: Sequence[float], stride: int) -> None:
         """The losses of the steps up to ``iteration``, ``stride`` iterations apart."""
@@ -47,16 +47,12 @@ class EventLog:
             self.writer.close()
 
 
-def check_available() -> None:
-    """Say now what would end a training later.
+def writer_class() -> type[SummaryWriter]:
+    """What writes event files.
 
     Raises:
         InputError: if tensorboardX is not installed.
     """
-    _writer_class()
-
-
-def _writer_class() -> type[SummaryWriter]:
     try:
         from tensorboardX import SummaryWriter  # noqa: PLC0415 - optional
     except ImportError as error:

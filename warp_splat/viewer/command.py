@@ -13,8 +13,7 @@ from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.scene.types import Scene
 from warp_splat.viewer.pace import LARGEST
-from warp_splat.viewer.picture import on_screen
-from warp_splat.viewer.server import Draw, Viewer, free_port
+from warp_splat.viewer.server import Viewer, free_port
 
 IDLE = 0.2  # seconds between two looks at Ctrl-C
 
@@ -33,12 +32,12 @@ def view_model(config: ViewConfig) -> int:
     model = GaussianModel.from_splats(gaussians.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
     scene = _find_scene(config, trained)
-    draw = make_draw(model, trained, is_linear(scene, trained))
+    draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained))
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
         memory_explained(device, model, [LARGEST], advice),
-        Viewer(draw, lambda: model.parameters["means"], scene, config.port) as viewer,
+        Viewer(draw, lambda: model.parameters["means"], scene, config.port, is_linear(scene, trained)) as viewer,
     ):
         with interruptible() as interrupted:
             print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
@@ -46,18 +45,6 @@ def view_model(config: ViewConfig) -> int:
                 if not viewer.draw():
                     viewer.wait(IDLE)
     return 0
-
-
-def make_draw(model: GaussianModel, trained: dict, linear: bool = False) -> Draw:
-    """A function from a camera, and whether depth is wanted, to what the model looks like.
-
-    Args:
-        model: the Gaussians.
-        trained: options of the training.
-        linear: its colors are in linear light.
-    """
-    render = make_renderer(model, bool(trained.get("white_background")), options_of(trained))
-    return lambda camera, depth: on_screen(render(camera, depth), linear)
 
 
 def _find_scene(config: ViewConfig, trained: dict) -> Scene | None:

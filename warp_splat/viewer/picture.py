@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from warp_splat.color import to_bytes, to_srgb
+from warp_splat.color import to_bytes
 from warp_splat.config import NEAR
 from warp_splat.raster.api import RenderOutput
 from warp_splat.viewer.browser_camera import Box
@@ -19,19 +18,14 @@ DEPTH_SHARES = (0.02, 0.98)  # of the pixels; what is nearer or farther has the 
 SAMPLES = 20_000  # pixels from which these are taken
 
 
-def paint(out: RenderOutput, kind: str) -> tuple[np.ndarray, str]:
-    """One of KINDS as [H, W, 3] uint8, and a word on it: the range of the depths."""
+def paint(out: RenderOutput, kind: str, linear: bool = False) -> tuple[np.ndarray, str]:
+    """One of KINDS as [H, W, 3] uint8, and the range of the depths in words; ``linear``: colors are in linear light."""
     if kind == "alpha":
         return to_bytes(out.alpha[..., None].expand(-1, -1, 3)), ""
     if kind == "depth":
         near, far = depth_range(out.depth, out.alpha)
         return to_bytes(depth_colors(out.depth, out.alpha, near, far)), f"depth {near:.3g} (red) to {far:.3g} (blue)"
-    return to_bytes(out.image), ""
-
-
-def on_screen(out: RenderOutput, linear: bool) -> RenderOutput:
-    """The colors as a screen shows them; ``linear``: they are in linear light."""
-    return replace(out, image=to_srgb(out.image.clamp(0.0, 1.0), torch.where)) if linear else out
+    return to_bytes(out.image, linear), ""
 
 
 def depth_range(depth: torch.Tensor, alpha: torch.Tensor) -> tuple[float, float]:

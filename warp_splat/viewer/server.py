@@ -48,13 +48,16 @@ class Viewer:
         means: where the Gaussians are at present, [N, 3].
         scene: its photographs can be jumped to; None if there are none.
         port: where to serve; if it is busy, the next free one.
+        linear: the colors are in linear light.
 
     Raises:
         InputError: if no port is free.
     """
 
-    def __init__(self, draw: Draw, means: Callable[[], torch.Tensor], scene: Scene | None, port: int):
-        self.draw_camera, self.means = draw, means
+    def __init__(
+        self, draw: Draw, means: Callable[[], torch.Tensor], scene: Scene | None, port: int, linear: bool = False
+    ):
+        self.draw_camera, self.means, self.linear = draw, means, linear
         self.views: dict[str, View] = {}
         if scene:
             self.views = {view.name: view for view in (*scene.train, *scene.test)}
@@ -84,7 +87,7 @@ class Viewer:
         """Compile and load the kernels of every kind of frame, so that no frame waits for them."""
         camera = Camera(TILE, TILE, TILE, TILE, 0.5 * TILE, 0.5 * TILE, np.eye(3), np.zeros(3))
         for kind in KINDS:
-            paint(self.draw_camera(camera, kind == "depth"), kind)
+            paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
 
     def __enter__(self) -> Viewer:
         return self
@@ -148,7 +151,7 @@ class Viewer:
         except InputError:  # a window that was folded up; it will send another camera when it opens
             return
         kind = watcher.kind.value
-        frame, note = paint(self.draw_camera(camera, kind == "depth"), kind)
+        frame, note = paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
         if view is not None and watcher.opacity.value > 0:
             frame = overlay(frame, view.picture, box, watcher.opacity.value)
         if watcher.client.client_id not in self.watchers:

@@ -69,9 +69,8 @@ class Reference:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Statistics since the last densification, [R, N] with a row for each process, and the random state."""
-        gather = self.processes.gather
-        statistics = {"gradient": gather(self.gradient), "views": gather(self.views), "radius": gather(self.radius)}
-        found = {f"statistics.{name}": rows for name, rows in statistics.items()}
+        statistics = {"gradient": self.gradient, "views": self.views, "radius": self.radius}
+        found = {f"statistics.{name}": self.processes.gather(rows) for name, rows in statistics.items()}
         return {**found, "random.densification": self.random.get_state()}
 
     def restore(self, checkpoint: Checkpoint) -> None:
