@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN
-from warp_splat.kernels import simd, splat
-from warp_splat.kernels.falloff import exp2_known
+from warp_splat.kernels import falloff, simd, splat
+from warp_splat.kernels.falloff import exp2_known, make_exp
 from warp_splat.kernels.simd import vec16
 from warp_splat.kernels.step import opaque
 
@@ -174,7 +174,7 @@ def test_a_pixel_stops_before_the_gaussian_that_would_darken_it():
 
 @pytest.mark.parametrize(("degree", "allowed"), [(3, 8e-5), (4, 4e-6), (5, 1e-6), (6, 1e-6), (None, 1e-6)])
 def test_exp(degree, allowed):
-    exp2_minus = splat.make_exp(degree)
+    exp2_minus = make_exp(degree)
 
     @wp.kernel(module="unique")
     def evaluate(z: wp.array[float], scalar_out: wp.array[float], lanes_out: wp.array[vec16]):
@@ -194,7 +194,7 @@ def test_exp(degree, allowed):
 
 
 def test_log():
-    log_of = splat.log_of
+    log_of = falloff.log_of
 
     @wp.kernel(module="unique")
     def evaluate(x: wp.array[float], out: wp.array[float]):
