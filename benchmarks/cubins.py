@@ -18,11 +18,15 @@ import warp as wp
 from common import write_table
 
 from warp_splat.config import ADJOINTS
-from warp_splat.kernels import project, sh_colors, tiles
+from warp_splat.kernels import sh_colors, tiles
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
+from warp_splat.kernels.falloff import reach_of
+from warp_splat.kernels.project import affine, ellipsoid
+from warp_splat.kernels.project.quarantine import quarantine
+from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.splat import BlendVariant
 
 BLOCK = 256
@@ -36,10 +40,11 @@ PROPERTIES = re.compile(r"Function (\S+):\s+REG:(\d+) STACK:(\d+) SHARED:(\d+)")
 def modules() -> dict[str, wp.Module]:
     """What runs on CUDA, by the name under which it is listed."""
     found = {
-        "project": project.make_project(1).module,
+        "project": make_project(affine.PROJECTION, reach_of, 1).module,
+        "project, ellipsoid": make_project(ellipsoid.PROJECTION, reach_of, 1).module,
         "shade": sh_colors.make_shade(1).module,
         "adjoint of shade": sh_colors.make_adj_shade(1).module,
-        "quarantine": project.quarantine.module,
+        "quarantine": quarantine.module,
         "adam": make_adam(15, 3).module,
         "pack": tiles.make_pack().module,
         "tiles": tiles.find_spans.module,

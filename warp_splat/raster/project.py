@@ -38,6 +38,7 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView
     cam.slope_min = wp.vec2(*(-principal / focal - margin))
     cam.slope_max = wp.vec2(*((size - principal) / focal + margin))
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
+    cam.antialiasing = int(options.antialiasing)
     cam.alpha_min = options.alpha_min
     return cam
 
@@ -59,7 +60,7 @@ def project(
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options)
     driver = driver or driver_of(gaussians.means.device)
-    kernel = make_project(projection_of(options), options.antialiasing, falloff_of(options).reach_of, driver.lanes)
+    kernel = make_project(projection_of(options), falloff_of(options).reach_of, driver.lanes)
     return Splats2D(*Project.apply(*gaussians, cam, kernel, driver, dropped or Dropped()))
 
 

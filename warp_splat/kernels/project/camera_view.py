@@ -18,6 +18,7 @@ class CameraView:
     slope_min: wp.vec2  # clamp of (x/z, y/z) in the Jacobian
     slope_max: wp.vec2
     sh_degree: int
+    antialiasing: int
     alpha_min: float
 
 

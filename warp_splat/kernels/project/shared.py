@@ -56,7 +56,7 @@ INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a qua
 
 
 @functools.cache
-def make_project(projection: Projection, antialiasing: bool, reach_of: wp.Function, lanes: int) -> wp.Kernel:
+def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> wp.Kernel:
     """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU.
 
     ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`).
@@ -232,7 +232,7 @@ def make_project(projection: Projection, antialiasing: bool, reach_of: wp.Functi
         xx = xx + blur
         yy = yy + blur
         opacity = pick(here, opacity, one)
-        if wp.static(antialiasing):  # before any test of the opacity
+        if camera.antialiasing != 0:  # before any test of the opacity
             least = fill(COMPENSATION_MIN, one)
             share = over(sharp, det)
             opacity = times(opacity, root(pick(less(least, share), share, least)))
