@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,20 +54,20 @@ def sfm(config: SfmConfig) -> int:
     """
     started = time.perf_counter()
     source, scene = Path(config.photos), Path(config.scene)
-    threads = min(config.threads or CORES, CORES)
     say = (lambda *_: None) if config.quiet else tqdm.write
     _check_numbers(config)
     _check_source(source)
     work = _claim(source, scene, config)
+    config = replace(config, threads=min(config.threads or CORES, CORES))
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its progress is ours to tell
     pycolmap.set_random_seed(config.seed)
     if (scene / "sparse").is_dir():
         say(f"{scene} is complete already; remove it to start anew.")
     else:
-        root = _frames(source, work, config, threads, say) if is_video(source) else photo_root(source)
+        root = _frames(source, work, config, say) if is_video(source) else photo_root(source)
         names = find_files(root, PHOTOS, None if is_video(source) else scene)
         with _explained(work):
-            summary = _reconstruct(root, names, scene, work, config, threads, say)
+            summary = _reconstruct(root, names, scene, work, config, say)
         summary["seconds_of_last_run"] = round(time.perf_counter() - started, 1)
         write_json(work / "summary.json", summary)
     _summarize(scene, json.loads((work / "summary.json").read_text()))
@@ -156,7 +157,7 @@ def _nothing_found(source: Path) -> InputError:
     return InputError(f"{source}: expected photographs ({', '.join(PHOTOS)}), found none; {hint}.")
 
 
-def _frames(video: Path, work: Path, config: SfmConfig, threads: int, say) -> Path:
+def _frames(video: Path, work: Path, config: SfmConfig, say) -> Path:
     """The folder of the frames taken from ``video``."""
     from warp_splat.sfm.video import sample_frames  # noqa: PLC0415 - only videos need PyAV
 
@@ -165,7 +166,8 @@ def _frames(video: Path, work: Path, config: SfmConfig, threads: int, say) -> Pa
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         with tqdm(total=100, desc="frames", unit="%", disable=config.quiet) as bar:
-            count = sample_frames(video, part, config.frames, threads, say, lambda share: bar.update(share - bar.n))
+            advance = lambda share: bar.update(share - bar.n)  # noqa: E731
+            count = sample_frames(video, part, config.frames, config.threads, say, advance)
             bar.update(100 - bar.n)
         if count < LEAST:
             raise InputError(f"{video}: expected a video of at least {LEAST} frames, {count} could be decoded.")
@@ -174,25 +176,24 @@ def _frames(video: Path, work: Path, config: SfmConfig, threads: int, say) -> Pa
     return frames
 
 
-def _reconstruct(
-    root: Path, names: list[str], scene: Path, work: Path, config: SfmConfig, threads: int, say
-) -> dict[str, Any]:
+def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: SfmConfig, say) -> dict[str, Any]:
     """All stages, the largest model as the scene; returns what there is to say of it."""
-    groups, broken = _groups(root, names, threads, say)
+    groups, broken = _groups(root, names, config.threads, say)
     names = [name for group in groups for name in group]
     if len(names) < LEAST:
         raise InputError(
             f"{root}: expected at least {LEAST} photographs that can be read, found {len(names)}; add photographs."
         )
-    say(f"{len(names)} photographs, {len(groups)} lens{'es' * (len(groups) > 1)}, {threads} threads; work in {work}")
+    lenses = f"{len(groups)} lens{'es' * (len(groups) > 1)}"
+    say(f"{len(names)} photographs, {lenses}, {config.threads} threads; work in {work}")
     database = work / "database.db"
-    stages.extract(database, root, groups, threads, config.quiet)
+    stages.extract(database, root, groups, config)
     matching = config.matching
     if matching == "auto":
         many = root.parent == work and len(names) > EXHAUSTIVE_FRAMES
         matching = "sequential" if many else "exhaustive"
-    pairs = stages.match(database, matching, config.seed, threads, config.quiet)
-    models = stages.reconstruct(database, root, work / "models", config.seed, threads, config.quiet)
+    pairs = stages.match(database, matching, config)
+    models = stages.reconstruct(database, root, work / "models", config)
     sizes = {index: model.num_reg_images() for index, model in models.items()}
     best = max(sizes, key=lambda index: sizes[index], default=None)
     if best is None or sizes[best] < LEAST:
@@ -203,9 +204,7 @@ def _reconstruct(
         )
     model = models[best]
     registered = {model.image(index).name for index in model.reg_image_ids()}
-    stages.write_undistorted(
-        work / "models" / str(best), root, scene, work / "scene.part", sizes[best], threads, config.quiet
-    )
+    stages.write_undistorted(work / "models" / str(best), root, scene, work / "scene.part", sizes[best], config)
     return {
         "photographs": len(names) + len(broken),
         "unreadable": broken,
@@ -215,7 +214,7 @@ def _reconstruct(
         "points": model.num_points3D(),
         "reprojection_error_px": model.compute_mean_reprojection_error(),
         "track_length": model.compute_mean_track_length(),
-        "threads": threads,
+        "threads": config.threads,
     }
 
 

@@ -18,6 +18,7 @@ import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with it
 import pycolmap
 from tqdm import tqdm
 
+from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.runtime.interrupts import interruptible
 
@@ -71,10 +72,10 @@ def opened(database: Path) -> Iterator[pycolmap.Database]:
         connection.close()
 
 
-def extract(database: Path, root: Path, groups: list[list[str]], threads: int, quiet: bool) -> None:
+def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig) -> None:
     """Find SIFT features in the photographs below ``root``; those of a group share a lens."""
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = threads, False
+    options.num_threads, options.use_gpu = config.threads, False
 
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = LENS
@@ -99,19 +100,19 @@ def extract(database: Path, root: Path, groups: list[list[str]], threads: int, q
     with opened(database) as connection:
         numbers = [image.image_id for image in connection.read_all_images()]
         found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
-        run_watched("features", len(numbers), work, found, quiet)
+        run_watched("features", len(numbers), work, found, config.quiet)
 
 
-def match(database: Path, matching: str, seed: int, threads: int, quiet: bool) -> int:
+def match(database: Path, matching: str, config: SfmConfig) -> int:
     """Match all pairs of photographs or, "sequential", neighbors by name; returns how many pairs fit together."""
     options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    options.num_threads, options.use_gpu = threads, False
-    verification.ransac.random_seed = seed
+    options.num_threads, options.use_gpu = config.threads, False
+    verification.ransac.random_seed = config.seed
     with opened(database) as connection:
         images = connection.num_images()
     if matching == "sequential":
         pairing = pycolmap.SequentialPairingOptions()
-        pairing.num_threads = threads
+        pairing.num_threads = config.threads
         # neighbors up to `overlap`, and at distances 2, 4, 8 ... up to 2^(overlap - 1)
         total, run = _sequential_pairs(images, pairing.overlap), pycolmap.match_sequential
     else:
@@ -130,7 +131,7 @@ def match(database: Path, matching: str, seed: int, threads: int, quiet: bool) -
         )
 
     with opened(database) as connection:
-        run_watched("matches", total, work, connection.num_matched_image_pairs, quiet)
+        run_watched("matches", total, work, connection.num_matched_image_pairs, config.quiet)
         _, inliers = connection.read_two_view_geometry_num_inliers()
     return sum(count > 0 for count in inliers)
 
@@ -140,9 +141,7 @@ def _sequential_pairs(images: int, overlap: int) -> int:
     return sum(max(images - gap, 0) for gap in gaps)
 
 
-def reconstruct(
-    database: Path, root: Path, models: Path, seed: int, threads: int, quiet: bool
-) -> dict[int, pycolmap.Reconstruction]:
+def reconstruct(database: Path, root: Path, models: Path, config: SfmConfig) -> dict[int, pycolmap.Reconstruction]:
     """Cameras and points, incrementally; the models are in the folder ``models``, empty if no two photographs fit.
 
     This stage starts anew when it was stopped: it is the shortest on a CPU.
@@ -152,8 +151,8 @@ def reconstruct(
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads, options.random_seed = threads, seed
-        options.mapper.random_seed = options.triangulation.random_seed = seed
+        options.num_threads, options.random_seed = config.threads, config.seed
+        options.mapper.random_seed = options.triangulation.random_seed = config.seed
         registered = []
         with opened(database) as connection:
             images = connection.num_images()
@@ -169,23 +168,23 @@ def reconstruct(
                 cancellation_token=token,
             )
 
-        run_watched("cameras", images, work, lambda: len(registered), quiet)
+        run_watched("cameras", images, work, lambda: len(registered), config.quiet)
         os.replace(part, models)
     return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir() if folder.is_dir()}
 
 
-def write_undistorted(model: Path, root: Path, scene: Path, part: Path, count: int, threads: int, quiet: bool) -> None:
+def write_undistorted(model: Path, root: Path, scene: Path, part: Path, count: int, config: SfmConfig) -> None:
     """Write the photographs without distortion to ``scene``/images and their pinhole cameras to ``scene``/sparse/0."""
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
 
     def work(token):
-        pycolmap.undistort_images(part, model, root, num_threads=threads, cancellation_token=token)
+        pycolmap.undistort_images(part, model, root, num_threads=config.threads, cancellation_token=token)
 
     def written() -> int:
         return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
 
-    run_watched("undistortion", count, work, written, quiet)
+    run_watched("undistortion", count, work, written, config.quiet)
     if written() < count:
         raise InputError(f"{part}: only {written()} of {count} images could be written; free some space and run again.")
     os.replace(part / "images", scene / "images")
