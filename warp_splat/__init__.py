@@ -1,4 +1,4 @@
-"""3D Gaussian Splatting in NVIDIA Warp: train, render and differentiate on the CPU.
+"""3D Gaussian Splatting in NVIDIA Warp: train, render and differentiate, with or without an NVIDIA GPU.
 
 Names are loaded when first used, so that ``warp-splat --help`` does not wait for torch and Warp.
 """

@@ -1,4 +1,7 @@
-"""Everything that can be chosen, with units and sources. Standard library only, so that ``--help`` answers at once."""
+"""What can be chosen, with units and sources; for training: :mod:`warp_splat.training.options`.
+
+Standard library only, so that ``--help`` answers at once.
+"""
 
 from __future__ import annotations
 

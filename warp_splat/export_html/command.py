@@ -1,4 +1,4 @@
-"""The command: one HTML file with the Gaussians, the cameras and the program that draws them; it needs nothing else."""
+"""``warp-splat export-html``: one file with the Gaussians, the cameras and the program that draws them."""
 
 from __future__ import annotations
 

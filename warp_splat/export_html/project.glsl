@@ -1,4 +1,4 @@
-// From 3D Gaussians to 2D ones, a pixel for each: the mathematics of warp_splat/kernels/project.py.
+// From 3D Gaussians to 2D ones, a pixel for each: the mathematics of warp_splat/kernels/project/.
 uniform highp usampler2D gaussians; // STRIDE texels each, as warp_splat/export_html/pack.py lays them out
 uniform int count;
 uniform mat3 rotation; // camera from world

@@ -1,4 +1,4 @@
-"""The command: all checks, a line for each finding, a page with pictures."""
+"""``warp-splat inspect``: all checks, a line for each finding, a page with pictures."""
 
 from __future__ import annotations
 

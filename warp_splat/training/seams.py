@@ -2,7 +2,7 @@
 
 A part (``training/parts/``) is something that is learned or done besides the Gaussians. A growth (``training/growth/``)
 is the rules by which their set grows and shrinks. Each is a class in a file there, and a line in that folder's table
-with its options, whose fields are flags. Trainer and command line know none by name.
+with its options, whose fields are flags: no two may share a name. Trainer and command line know none by name.
 
 A growth is made of (options, setting, optimizer); the optimizer's ``replace`` and ``arrange`` change the set:
 
@@ -10,9 +10,10 @@ A growth is made of (options, setting, optimizer); the optimizer's ``replace`` a
     update(iteration) -> Change | None      change the set if it is time; None: nothing changed
     grows(iterations) -> bool               whether a training of this length gains Gaussians
 
-A part is made of (options, setting). It has any of these methods. In each step they run in this order:
+A part is made of (options, setting). It has any of these methods; ``tests/test_seams.py`` has an example. In each step
+they run in this order:
 
-    needed(scene) -> Verdict                of the class: whether ``--parts auto`` takes it, measured on the scene
+    needed(scene) -> Verdict                of the class: whether ``--parts auto`` takes it; without, it never does
     parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, with a name that no other has
     camera(camera, step) -> camera          to render with
     background(color, step) -> color        [3], to render on

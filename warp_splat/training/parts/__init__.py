@@ -34,7 +34,7 @@ def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
     for name, entry in PARTS.items():
         if name in named or getattr(config.plugins[name], name, False):
             used.append(name)
-        elif named == [AUTO]:
+        elif named == [AUTO] and hasattr(entry.load(), "needed"):
             verdict = entry.load().needed(scene)
             told.append(f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}.")
             used += [name] * verdict.needed
