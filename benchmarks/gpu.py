@@ -222,7 +222,7 @@ def main() -> None:
         return
     results, driver = Results(arguments.out, device, arguments.seconds), nullcontext()
     if device == "cpu":  # the kernels of a GPU, in fibers
-        case, driver = (500, 64, 40), using(CUDA)
+        case, driver, wp.config.enable_cpu_blocks = (500, 64, 40), using(CUDA), True
     expected = expectation(arguments.expected, case)
     with driver:
         check(results, device, case, expected)

@@ -17,7 +17,7 @@ from warp_splat.raster.drivers import CUDA
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, launch_blocks, view
 
-#: Floating-point operations for one Gaussian at one pixel (operators of kernels/blend.py and kernels/step.py).
+#: Floating-point operations for one Gaussian at one pixel (operators of splat.py, falloff.py and step.py).
 #: Forward: offset 2, exponent 7, exponential 14, alpha 3, transmittance and weight 6, color 6, stop 1.
 #: Adjoint: lit 7, offset 2, exponent 7, exponential 14, alpha 4, odds 2, transmittance 2, dL/dalpha 9, moments 5,
 #: channels 4, and an addition for each of the ten sums over the block.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
 
 TOE = 0.0031308  # below, sRGB is linear (IEC 61966-2-1)
 
@@ -23,5 +24,7 @@ def from_srgb(encoded: Any, where: Callable) -> Any:
 
 def to_bytes(image: torch.Tensor, linear: bool = False) -> np.ndarray:
     """[H, W, 3] float image, clamped to 0..1, as uint8 for a screen; ``linear``: it is in linear light."""
+    import torch  # noqa: PLC0415 - whoever reads scenes only need not wait for it
+
     image = image.detach().clamp(0.0, 1.0)
     return ((to_srgb(image, torch.where) if linear else image) * 255.0).round().to(torch.uint8).cpu().numpy()

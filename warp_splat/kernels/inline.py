@@ -14,20 +14,29 @@ from collections.abc import Callable
 
 import warp as wp
 
+from warp_splat.errors import InputError
+
 
 def kernel_of_parts(module_options: dict, **parts: wp.Function) -> Callable:
     """A decorator: the kernel with the bodies of ``parts`` in place of ``a, b = part(c, d)``, in a module of its own.
 
     Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end.
+
+    Raises:
+        InputError: if a part does otherwise.
     """
 
     def decorate(function: Callable) -> wp.Kernel:
         definition, names = _parsed(function)
+        taken = {
+            node.id for node in ast.walk(definition) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        }
+        taken |= {parameter.arg for parameter in definition.args.args}
         definition.decorator_list = []
         for parameter in definition.args.args:
             parameter.annotation = ast.Name(f"type_of_{parameter.arg}", ast.Load())
             names[parameter.annotation.id] = function.__annotations__[parameter.arg]
-        definition.body = [line for old in definition.body for line in _expanded(old, parts, names)]
+        definition.body = [line for old in definition.body for line in _expanded(old, parts, names, taken)]
         source = ast.unparse(ast.fix_missing_locations(ast.Module([definition], [])))
         path = f"<{function.__qualname__} {zlib.crc32(source.encode())}>"
         linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
@@ -44,18 +53,20 @@ def _parsed(function: Callable) -> tuple[ast.FunctionDef, dict]:
     return definition, {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
 
 
-def _expanded(line: ast.stmt, parts: dict[str, wp.Function], names: dict) -> list[ast.stmt]:
-    """What stands for a statement of the kernel."""
+def _expanded(line: ast.stmt, parts: dict[str, wp.Function], names: dict, taken: set[str]) -> list[ast.stmt]:
+    """What stands for a statement of the kernel, whose own variables are ``taken``."""
     if isinstance(line, ast.If):
-        line.body = [new for old in line.body for new in _expanded(old, parts, names)]
+        line.body = [new for old in line.body for new in _expanded(old, parts, names, taken)]
     if isinstance(line, ast.Assign) and isinstance(line.value, ast.Call) and isinstance(line.value.func, ast.Name):
         part = line.value.func.id
         if part in parts:
-            return _inlined(part, parts[part].func, line.targets[0], line.value.args, names)
+            return _inlined(part, parts[part].func, line.targets[0], line.value.args, names, taken)
     return [line]
 
 
-def _inlined(part: str, function: Callable, target: ast.expr, arguments: list[ast.expr], names: dict) -> list[ast.stmt]:
+def _inlined(
+    part: str, function: Callable, target: ast.expr, arguments: list[ast.expr], names: dict, taken: set[str]
+) -> list[ast.stmt]:
     """The body of ``function``, its own names behind that of the part; ``names`` learns what it refers to."""
     definition, known = _parsed(function)
     given = {parameter.arg: argument for parameter, argument in zip(definition.args.args, arguments, strict=True)}
@@ -63,7 +74,7 @@ def _inlined(part: str, function: Callable, target: ast.expr, arguments: list[as
     own = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
     renamed = {}
     for name in {node.id for node in nodes} - set(given):
-        if name in own or (name in known and names.get(name, known[name]) is not known[name]):
+        if name in own or (name in known and (name in taken or names.get(name, known[name]) is not known[name])):
             renamed[name] = f"{part}_{name}"
         if name in known:
             names[renamed.get(name, name)] = known[name]
@@ -72,8 +83,18 @@ def _inlined(part: str, function: Callable, target: ast.expr, arguments: list[as
     body = [
         line for line in definition.body if not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))
     ]
-    answer = body.pop()
-    assert isinstance(answer, ast.Return) and not own & set(given), f"{part}: one return, and no parameter changed"
+    answer, returns = body.pop(), [node for node in ast.walk(definition) if isinstance(node, ast.Return)]
+    if returns != [answer] or own & set(given):
+        raise InputError(
+            f"{part} {function.__name__}: expected a function that returns once, at its end, and changes none of its "
+            "parameters; give what changes a name of its own, and choose with pick instead of if."
+        )
     targets = target.elts if isinstance(target, ast.Tuple) else [target]
     values = answer.value.elts if isinstance(answer.value, ast.Tuple) else [answer.value]
-    return body + [ast.Assign([place], value) for place, value in zip(targets, values, strict=True)]
+    read = {node.id for value in values for node in ast.walk(value) if isinstance(node, ast.Name)}
+    if read.isdisjoint({place.id for place in targets}):
+        return body + [ast.Assign([place], value) for place, value in zip(targets, values, strict=True)]
+    # a target may be an argument: all values come before it changes
+    found = [f"{part}_returned{i}" for i in range(len(values))]
+    body += [ast.Assign([ast.Name(name, ast.Store())], value) for name, value in zip(found, values, strict=True)]
+    return body + [ast.Assign([place], ast.Name(name, ast.Load())) for place, name in zip(targets, found, strict=True)]

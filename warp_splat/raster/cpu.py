@@ -84,12 +84,17 @@ def _spread_upstream(bins: Bins, options: RasterOptions, background, final, coun
     up = new(tile_count, BLOCKS * variant_of(options).channels, LANES)
     adj_final, adj_background = torch.empty_like(final), new(tile_count, 3)
     dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
-    tiles_x, ranges, *_ = bins.views(options)
     slot = wp.types.vector(length=slots.shape[1], dtype=float)
     launch(
         make_upstream(variant_of(options)),
         tile_count,
-        [tiles_x, ranges, view(background, wp.float32), *_in_lanes(final, count), *adj_pixels.views()],
+        [
+            bins.tiles_x,
+            view(bins.ranges, wp.vec2i),
+            view(background, wp.float32),
+            *_in_lanes(final, count),
+            *adj_pixels.views(),
+        ],
         [
             *(*_in_lanes(up, adj_final), view(adj_background, wp.float32)),
             *(view(dropped, wp.int32), view(steps, wp.int32), view(slots, slot)),

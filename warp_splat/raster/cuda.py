@@ -65,12 +65,18 @@ def spread_upstream(bins: Bins, options: RasterOptions, background, final, count
     tile_count, new = len(bins.ranges), background.new_empty
     up, adj_final, adj_background = new(tile_count, THREADS, 4), torch.empty_like(final), new(tile_count, 3)
     dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
-    tiles_x, ranges, *_ = bins.views(options)
     outputs = [view(up, wp.vec4), _float(adj_final), _float(adj_background)]
     launch_blocks(
         make_upstream_block(variant_of(options)),
         tile_count,
-        [tiles_x, ranges, _float(background), _float(final), view(count, wp.int32), *adj_pixels.views()],
+        [
+            bins.tiles_x,
+            view(bins.ranges, wp.vec2i),
+            _float(background),
+            _float(final),
+            view(count, wp.int32),
+            *adj_pixels.views(),
+        ],
         [*outputs, view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],
         background.device,
     )

@@ -176,7 +176,13 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
     if isinstance(seed, bool) or not (isinstance(seed, Integral) and 0 <= int(seed) < 2**63):
         raise InputError(f"seed: expected a whole number from 0 to below 2^63, got {seed!r}.")
     check_camera(camera)
-    return check_options(ADJOINTS[0], options)
+    options = check_options(ADJOINTS[0], options)
+    if options.falloff and not {"conics", "opacities2d"}.isdisjoint(parameters or ()):
+        raise InputError(
+            "parameters: expected no conics and no opacities2d with a falloff of your own, since differences know "
+            "the Gaussian's reach alone; leave them out."
+        )
+    return options
 
 
 def _rms(values: Sequence[float]) -> float:

@@ -10,13 +10,17 @@ to 1.13 of them over its sweeps. Tried:
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import psutil
 import torch
 
 from warp_splat.config import TILE
 from warp_splat.runtime.launch import available_memory
 from warp_splat.training.seams import having
-from warp_splat.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from warp_splat.training.trainer import Trainer
 
 FLOAT, GIB = 4, 2**30  # bytes
 INSTANCES = 3  # of a Gaussian, guessed: 1.4 to 2.8 on photographs of 270 x 480 and 540 x 960 px

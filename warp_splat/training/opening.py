@@ -11,7 +11,7 @@ from tqdm import tqdm
 from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
-from warp_splat.formats.checkpoint import LAST, Checkpoint, load_header, remove_leftovers
+from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
 from warp_splat.formats.ply import save_points
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch
@@ -43,7 +43,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
     if config.report.tensorboard:
         writer_class()
-    begun = load_header(data.start_checkpoint) if data.start_checkpoint else None
+    begun = _verified(data.start_checkpoint) if data.start_checkpoint else None
     done = begun.count("iteration") if begun else 0
     if begun and done > iterations:  # at the end, what is written there is written again
         raise InputError(
@@ -70,6 +70,13 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         start_ply=data.start_ply and os.path.abspath(data.start_ply),
     )
     return config, begun
+
+
+def _verified(path: str) -> Checkpoint:
+    """A checkpoint that is whole, without its arrays: beside the trainer's they would take as much memory again."""
+    begun = load_checkpoint(path)
+    begun.arrays.clear()
+    return begun
 
 
 def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:

@@ -203,7 +203,7 @@ class Optimizer:
         """The gradients of what parts learn, zeros where there are none."""
         for leaf in self.parts.values():
             leaf.grad = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
-        return [leaf.grad for leaf in self.parts.values() if leaf.grad is not None]
+        return [leaf.grad for leaf in self.parts.values()]
 
     def _swap(self, name: str, values: torch.Tensor) -> None:
         """Put a new leaf, without a gradient, in the place of a parameter; its state moves along."""

@@ -106,7 +106,7 @@ class ReportOptions:
     lpips_weights: str = reporting("", LPIPS_HELP)
     tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
     viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
-    port: int = reporting(PORT, PORT_HELP, least=1)
+    port: int = reporting(PORT, PORT_HELP)
     profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot")
 
 
@@ -177,6 +177,10 @@ FIXED_OPTIONS = {
 def check_train(config: TrainConfig) -> str | None:
     """What is wrong with the values of ``config``, in one sentence, or None."""
     learn, values = config.learn, config.flat()
+    if not 1 <= config.report.port <= 65535:
+        return f"--port: expected 1 to 65535, got {config.report.port}."
+    if not 0 <= learn.seed < 2**63:
+        return f"--seed: expected 0 to 2^63 - 1, got {learn.seed}."
     for item in flags_of(TrainConfig):
         name, value = f"--{item.name}", values[item.name]
         if isinstance(value, list) and min(value, default=1) < 1:
@@ -185,10 +189,6 @@ def check_train(config: TrainConfig) -> str | None:
             return f"{name}: expected a finite number, at least 0, got {value}."
         if type(value) is int and value < (least := item.metadata.get("least", 0)):
             return f"{name}: expected at least {least}, got {value}."
-    if config.report.port > 65535:
-        return f"--port: expected 1 to 65535, got {config.report.port}."
-    if learn.seed >= 2**63:
-        return f"--seed: expected 0 to 2^63 - 1, got {learn.seed}."
     if learn.lambda_dssim > 1:
         return f"--lambda_dssim: expected 0 to 1, got {learn.lambda_dssim}."
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:

@@ -113,12 +113,13 @@ class Trainer:
         self._set_iteration(iteration)
         step = Step(iteration, self._next_view())
         camera, photograph = self.photographs.at_size(step.view, iteration)
-        options = self._through("asks", self.options, step)
+        options = self._asked(step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
         out = self._render(camera, background, options)
         out.means2d.retain_grad()
         image = self._through("image", out.image, out, step)
-        target = self._through("photograph", photograph, step).image
+        photograph = self._through("photograph", photograph, step)
+        target = photograph.image
         if self.scene.linear:
             image, target = (LOSS_CURVES[self.config.data.loss_space](picture) for picture in (image, target))
         # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
@@ -137,10 +138,17 @@ class Trainer:
         return loss
 
     def _through(self, method: str, value: T, *arguments: Any) -> T:
-        """What parts and growth make of ``value``, one after another."""
-        for make in having((*self.parts, self.growth), method):
+        """What the parts make of ``value``, one after another."""
+        for make in having(self.parts, method):
             value = make(value, *arguments)
         return value
+
+    def _asked(self, step: Step) -> RasterOptions:
+        """What parts and growth need of the renderer."""
+        options = self._through("asks", self.options, step)
+        for asks in having([self.growth], "asks"):
+            options = asks(options, step)
+        return options
 
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
@@ -156,8 +164,8 @@ class Trainer:
 
     def warm_up(self) -> None:
         """Compile and load every kernel of a step, changing nothing."""
-        camera = self.scene.train[0].camera.resized(TILE, TILE)
-        out = self._render(camera, self.background, self.options)
+        view = self.scene.train[0]
+        out = self._render(view.camera.resized(TILE, TILE), self.background, self._asked(Step(0, view)))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.adam.zero_grad(set_to_none=True)
         load(quarantine, self.device)  # launched only where a gradient is not finite

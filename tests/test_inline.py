@@ -1,0 +1,54 @@
+"""Kernels assembled from functions: the same as if these were called, whatever their names."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_splat.errors import InputError
+from warp_splat.kernels.inline import kernel_of_parts
+
+size = 2.0  # also the name of a variable of the kernel
+
+
+@wp.func
+def turned(x: float, y: float):
+    half = 0.5 * size
+    return x + y, half * (x - y)
+
+
+def test_arguments_may_be_targets_and_names_may_meet():
+    @kernel_of_parts({}, turned=turned)
+    def kernel(values: wp.array[float], out: wp.array[float]):
+        size = values[0]
+        half = values[1]
+        size, half = turned(size, half)
+        out[0] = size
+        out[1] = half
+
+    out = wp.zeros(2, dtype=float, device="cpu")
+    wp.launch(kernel, 1, [wp.array([5.0, 3.0], dtype=float, device="cpu")], [out], device="cpu")
+    np.testing.assert_allclose(out.numpy(), [8.0, 2.0])
+
+
+@wp.func
+def hasty(x: float):
+    if x > 1.0:
+        return x
+    return 2.0 * x
+
+
+@wp.func
+def careless(x: float):
+    x = 2.0 * x
+    return x
+
+
+@pytest.mark.parametrize("part", [hasty, careless])
+def test_functions_that_cannot_be_put_in_place_are_refused(part):
+    with pytest.raises(InputError, match="returns once"):
+
+        @kernel_of_parts({}, part=part)
+        def kernel(out: wp.array[float]):
+            y = out[0]
+            y = part(y)
+            out[0] = y
