@@ -4,7 +4,7 @@ Bytes: each array that a stage must read or write, once; what it keeps for itsel
 sorting, a row of gradients per tile instance, blurred planes) is not counted. Operations: on single numbers, a
 multiply-add, a comparison with its selection, a conversion as one each, a division as four (estimate, Newton step).
 
-Per pair of a Gaussian and a pixel that it is blended into (``splat.py``, ``falloff.py`` and ``step.py`` of the kernels):
+Per pair of a Gaussian and a pixel that it is blended into (the kernels' ``splat.py``, ``falloff.py``, ``step.py``):
 
     forward   offset 2, exponent 5, exponential 11 (bound, whole, fraction 2, polynomial 5, exponent bits 2), alpha 3,
               transmittance 4, weight 2, color 3, where the pixel stops 1
