@@ -68,6 +68,7 @@ def state_of(trainer, run):
     return {name: (tensor.dtype, tensor.shape, tensor.numpy().tobytes()) for name, tensor in tensors.items()}, facts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -345,7 +346,7 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, 
         runs, reached = runs + 1, 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_that_is_printed_continues(tmp_path):
     command = [sys.executable, "train.py", "-s", SCENE, "-m", tmp_path, "-r", "8", "--iterations", "100000"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)

@@ -170,7 +170,7 @@ sys.exit(main(["train", *sys.argv[1:]]))
         pytest.param(
             "os.kill(os.getpid(), signal.SIGSTOP)",
             ["Process 0: expected an answer", "but one was silent"],
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
     ],
 )

@@ -31,7 +31,7 @@ def scene():
     [
         pytest.param((200_000, 64, 64), [], marks=pytest.mark.slow),
         pytest.param((1000, 1200, 900), [], marks=pytest.mark.long),  # less than the next
-        pytest.param((1000, 1200, 900), ["masked", "composited", "linear"], marks=pytest.mark.slow),
+        pytest.param((1000, 1200, 900), ["masked", "composited", "linear"], marks=pytest.mark.long),
     ],
     ids=str,
 )

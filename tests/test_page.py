@@ -182,6 +182,7 @@ def photographed(page, tmp_path):
     return load_png(tmp_path / "screen.png")[:, :, :3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("coefficients", "options", "white", "linear"),
     [

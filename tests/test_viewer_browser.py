@@ -125,6 +125,7 @@ def test_view(scene, model, tmp_path):
         assert end(process)[0] == 0
 
 
+@pytest.mark.long
 def test_second_browser_busy_port_and_missing_scene(model, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -157,6 +158,7 @@ def test_second_browser_busy_port_and_missing_scene(model, tmp_path):
 TRAINING = f"-s {SCENE} -r 8 --iterations 1000 --densify_from_iter 20 --max_gaussians 6000 --test_iterations 1".split()
 
 
+@pytest.mark.long
 def test_training(tmp_path):
     """Looked at, moved around in, paused, continued: the same bytes as without."""
     with (
@@ -181,6 +183,7 @@ def test_training(tmp_path):
     assert one == other
 
 
+@pytest.mark.long
 def test_interrupted_training(tmp_path):
     with (
         browser_page(WIDTH, HEIGHT) as (page, _),
