@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from tqdm import tqdm
@@ -74,9 +75,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
 
 def _verified(path: str) -> Checkpoint:
     """A checkpoint that is whole, without its arrays: beside the trainer's they would take as much memory again."""
-    begun = load_checkpoint(path)
-    begun.arrays.clear()
-    return begun
+    return replace(load_checkpoint(path), arrays={})
 
 
 def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
