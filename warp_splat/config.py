@@ -1,4 +1,4 @@
-"""What can be chosen, with units and sources; for training: :mod:`warp_splat.training.options`.
+"""What can be chosen, with units and sources (of training: in training/options.py).
 
 Standard library only, so that ``--help`` answers at once.
 """
