@@ -13,11 +13,8 @@ MANY_PARAMETERS = {
     "blend": "tile lists, limits, and what the adjoint reads",
     "upstream": "tile lists, and upstream gradients in another layout",
     "walk": "as blend, of which it is the differentiated loop",
-    "shade": "coefficients come by degree; all outputs are cleared where a color is not finite",
-    "adj_shade": "coefficients and their gradients come by degree",
     "compare": "image and target are given as numbers and as lanes, the target as bytes or floats",
     "adj_compare": "as compare",
-    "pack": "seven arrays of a 2D Gaussian become one",
 }
 #: Kernels whose inputs are those of `blend` and `upstream`, where their shapes stand.
 INPUTS_OF_THE_BLEND = {"cpu/adjoint:adj_blend", "cpu/taped:walk", "cuda/adjoint:adj_blend", "cuda/taped:walk"}
@@ -95,6 +92,16 @@ def test_arrays_say_their_shape(lines, kernel, request):
     for parameter in kernel.args.args:
         if "wp.array" in ast.unparse(parameter.annotation) and not (repeats and not parameter.arg.endswith("_out")):
             assert comment(lines, parameter).strip().startswith("["), f"{parameter.arg}: no shape"
+
+
+def test_arrays_of_structs_say_their_shape():
+    for path in sorted(KERNELS.rglob("*.py")):
+        lines = path.read_text().splitlines()
+        for struct in ast.walk(ast.parse("\n".join(lines))):
+            if isinstance(struct, ast.ClassDef) and "wp.struct" in map(ast.unparse, struct.decorator_list):
+                for field in struct.body:
+                    if isinstance(field, ast.AnnAssign) and "wp.array" in ast.unparse(field.annotation):
+                        assert comment(lines, field).strip().startswith("["), f"{struct.name}: {ast.unparse(field)}"
 
 
 @pytest.mark.parametrize(("lines", "kernel"), find_kernels())

@@ -20,9 +20,7 @@ from warp_splat.kernels.harmonics import C0, make_harmonics
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.shared import INVALID
 from warp_splat.kernels.simd import TYPES, pick
-
-mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
-mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
+from warp_splat.kernels.structs import HarmonicsView, Splats2DView, mat53, mat73
 
 OPTIONS = {**LANES_IN_ORDER, "max_unroll": 15}  # unrolls all loops but those over lanes
 
@@ -62,45 +60,36 @@ def make_shade(lanes: int) -> wp.Kernel:
         first: int,  # group of Gaussians of this slice
         camera: CameraView,
         means: wp.array[wp.vec3],  # [N] world
-        sh_dc: wp.array[wp.vec3],  # [N] coefficients
-        sh1: wp.array[wp.mat33],  # [N] of degree 1; like the next two, empty if there are none
-        sh2: wp.array[mat53],  # [N]
-        sh3: wp.array[mat73],  # [N]
+        sh: HarmonicsView,
         # out
-        means2d_out: wp.array[wp.vec2],  # [N] all but the colors: as of `project`, cleared where a color is not finite
-        conics_out: wp.array[wp.vec3],  # [N]
-        opacities_out: wp.array[float],  # [N]
-        colors_out: wp.array[wp.vec3],  # [N] zero where culled, so the caller clears them
-        depths_out: wp.array[float],  # [N]
-        extents_out: wp.array[wp.vec2],  # [N]
-        radii_out: wp.array[int],  # [N] read first
+        splats_out: Splats2DView,  # of `project`: colors where radii tell of one; cleared where a color is not finite
     ):
         group = (first + wp.tid()) * lanes
         x, y, z = offsets(camera, means, group)
         functions = evaluate(x, y, z)
         for lane in range(lanes):
             i = group + lane
-            if i < radii_out.shape[0]:
-                if radii_out[i] > 0:
-                    color = C0 * sh_dc[i] + wp.vec3(0.5)
+            if i < splats_out.radii.shape[0]:
+                if splats_out.radii[i] > 0:
+                    color = C0 * sh.dc[i] + wp.vec3(0.5)
                     if camera.sh_degree > 0:  # inactive degrees are not even read
                         for k in range(3):
-                            color += functions[k, lane] * sh1[i][k]
+                            color += functions[k, lane] * sh.degree1[i][k]
                     if camera.sh_degree > 1:
                         for k in range(5):
-                            color += functions[3 + k, lane] * sh2[i][k]
+                            color += functions[3 + k, lane] * sh.degree2[i][k]
                     if camera.sh_degree > 2:
                         for k in range(7):
-                            color += functions[8 + k, lane] * sh3[i][k]
+                            color += functions[8 + k, lane] * sh.degree3[i][k]
                     if wp.dot(color, wp.vec3(0.0)) == 0.0:
-                        colors_out[i] = wp.max(color, wp.vec3(0.0))
+                        splats_out.colors[i] = wp.max(color, wp.vec3(0.0))
                     else:
-                        means2d_out[i] = wp.vec2(0.0)
-                        conics_out[i] = wp.vec3(0.0)
-                        opacities_out[i] = 0.0
-                        depths_out[i] = 0.0
-                        extents_out[i] = wp.vec2(0.0)
-                        radii_out[i] = INVALID
+                        splats_out.means2d[i] = wp.vec2(0.0)
+                        splats_out.conics[i] = wp.vec3(0.0)
+                        splats_out.opacities[i] = 0.0
+                        splats_out.depths[i] = 0.0
+                        splats_out.extents[i] = wp.vec2(0.0)
+                        splats_out.radii[i] = INVALID
 
     return shade
 
@@ -117,18 +106,13 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
         first: int,  # group of Gaussians of this slice
         camera: CameraView,
         means: wp.array[wp.vec3],  # [N]
-        sh1: wp.array[wp.mat33],  # [N]
-        sh2: wp.array[mat53],  # [N]
-        sh3: wp.array[mat73],  # [N]
+        sh: HarmonicsView,
         radii: wp.array[int],  # [N]
         colors: wp.array[wp.vec3],  # [N]
         adj_colors: wp.array[wp.vec3],  # [N]
         # out: gradients, zero where culled and of inactive degrees
         means_out: wp.array[wp.vec3],  # [N]
-        sh_dc_out: wp.array[wp.vec3],  # [N]
-        sh1_out: wp.array[wp.mat33],  # [N]
-        sh2_out: wp.array[mat53],  # [N]
-        sh3_out: wp.array[mat73],  # [N]
+        sh_out: HarmonicsView,
     ):
         group = (first + wp.tid()) * lanes
         x, y, z = offsets(camera, means, group)
@@ -152,23 +136,23 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
                             adj[channel] = adj_colors[i][channel]
                     if camera.sh_degree > 0:
                         for k in range(3):
-                            weights[k, lane] = wp.dot(sh1[i][k], adj)
+                            weights[k, lane] = wp.dot(sh.degree1[i][k], adj)
                             adj1[k] = functions[k, lane] * adj
                     if camera.sh_degree > 1:
                         for k in range(5):
-                            weights[3 + k, lane] = wp.dot(sh2[i][k], adj)
+                            weights[3 + k, lane] = wp.dot(sh.degree2[i][k], adj)
                             adj2[k] = functions[3 + k, lane] * adj
                     if camera.sh_degree > 2:
                         for k in range(7):
-                            weights[8 + k, lane] = wp.dot(sh3[i][k], adj)
+                            weights[8 + k, lane] = wp.dot(sh.degree3[i][k], adj)
                             adj3[k] = functions[8 + k, lane] * adj
-                sh_dc_out[i] = C0 * adj
-                if sh1_out.shape[0] > 0:
-                    sh1_out[i] = adj1
-                if sh2_out.shape[0] > 0:
-                    sh2_out[i] = adj2
-                if sh3_out.shape[0] > 0:
-                    sh3_out[i] = adj3
+                sh_out.dc[i] = C0 * adj
+                if sh_out.degree1.shape[0] > 0:
+                    sh_out.degree1[i] = adj1
+                if sh_out.degree2.shape[0] > 0:
+                    sh_out.degree2[i] = adj2
+                if sh_out.degree3.shape[0] > 0:
+                    sh_out.degree3[i] = adj3
         # the weights of those not drawn are zero, and zero times what is not finite is not
         one = number(1.0)
         x = pick(drawn, x, one)

@@ -30,6 +30,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import LOG2_E, reach_of
 from warp_splat.kernels.splat import Splat2D
+from warp_splat.kernels.structs import Splats2DView
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -63,12 +64,7 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
     def pack(
         first: int,  # splat of this slice
         gaussians: wp.array[int],  # [V] Gaussian of each splat
-        means2d: wp.array[wp.vec2],  # [N]
-        conics: wp.array[wp.vec3],  # [N]
-        opacities: wp.array[float],  # [N]
-        colors: wp.array[wp.vec3],  # [N]
-        depths: wp.array[float],  # [N]
-        extents: wp.array[wp.vec2],  # [N]
+        splats2d: Splats2DView,
         height: int,
         alpha_min: float,
         square: int,  # 1: look at the square of the reference instead of the ellipse
@@ -79,17 +75,18 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
         v = first + wp.tid()
         i = gaussians[v]
         splat = Splat2D()
-        splat.mean = means2d[i]
-        splat.extent = extents[i]
+        splat.mean = splats2d.means2d[i]
+        splat.extent = splats2d.extents[i]
+        conic = splats2d.conics[i]
         # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
-        root = wp.sqrt(0.5 * LOG2_E * conics[i][0])
-        splat.opacity = opacities[i]
+        root = wp.sqrt(0.5 * LOG2_E * conic[0])
+        splat.opacity = splats2d.opacities[i]
         reach = reach_of(splat.opacity, alpha_min)
-        splat.root = wp.vec3(root, 0.5 * LOG2_E * conics[i][1] / root, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
+        splat.root = wp.vec3(root, 0.5 * LOG2_E * conic[1] / root, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
         if square != 0:
-            splat.extent = square_of(splat.extent, conics[i], reach)
-        splat.color = colors[i]
-        splat.depth = depths[i]
+            splat.extent = square_of(splat.extent, conic, reach)
+        splat.color = splats2d.colors[i]
+        splat.depth = splats2d.depths[i]
         splats_out[v] = splat
         span = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
         rows_out[v] = wp.max(span[1] // TILE - span[0] // TILE + 1, 0)

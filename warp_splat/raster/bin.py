@@ -45,7 +45,7 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions) 
     order, nearness = np.empty(count, dtype=np.int32), _taken(splats2d.depths.detach().numpy(), drawn)
     splats, rows = wp.empty(count, dtype=Splat2D, device="cpu"), np.empty(count, dtype=np.int32)
     gaussians, square = _array(drawn), int(options.extent == "square")
-    inputs = [gaussians, *splats2d.views(), camera.height, options.alpha_min, square]
+    inputs = [gaussians, splats2d.view(), camera.height, options.alpha_min, square]
     # one thread sorts while others pack
     pack = tiles.make_pack(falloff_of(options).reach_of)
     launch(pack, count, inputs, [splats, _array(rows)], beside=partial(order_by_depth, nearness, order))
@@ -79,7 +79,7 @@ def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -
     splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
     rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
     square = int(options.extent == "square")
-    inputs = [order, *splats2d.views(), camera.height, options.alpha_min, square]
+    inputs = [order, splats2d.view(), camera.height, options.alpha_min, square]
     pack = tiles.make_pack(falloff_of(options).reach_of)
     launch(pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
     inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]

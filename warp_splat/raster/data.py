@@ -15,7 +15,8 @@ from warp_splat.camera import Camera
 from warp_splat.config import T_LEAST, RasterOptions
 from warp_splat.kernels.falloff import FalloffFunctions, make_falloff
 from warp_splat.kernels.splat import BlendVariant
-from warp_splat.runtime.launch import view
+from warp_splat.kernels.structs import Splats2DView
+from warp_splat.runtime.launch import pack_struct, view
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
 WIDTHS = (2, 3, 1, 3, 1)  # columns of a slot: mean, conic, opacity, color, and depth where it is asked for
@@ -43,10 +44,11 @@ class Splats2D(NamedTuple):
     extents: torch.Tensor  # [N, 2] px, half sides of the box where alpha >= alpha_min; no gradient
     radii: torch.Tensor  # [N] int32, px; 0 if culled, -1 if invalid; no gradient
 
-    def views(self) -> list:
-        """All but the radii, as kernels take them."""
-        types = (wp.vec2, wp.vec3, wp.float32, wp.vec3, wp.float32, wp.vec2)
-        return [view(tensor, dtype) for tensor, dtype in zip(self[:-1], types, strict=True)]
+    def view(self) -> Splats2DView:
+        """As kernels take them."""
+        types = (wp.vec2, wp.vec3, wp.float32, wp.vec3, wp.float32, wp.vec2, wp.int32)
+        arrays = (view(tensor, dtype) for tensor, dtype in zip(self, types, strict=True))
+        return pack_struct(Splats2DView, **dict(zip(self._fields, arrays, strict=True)))
 
 
 @dataclass

@@ -17,11 +17,21 @@ from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import UNSEEN, make_project
-from warp_splat.kernels.sh_colors import make_adj_shade, make_shade, mat53, mat73
+from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES
+from warp_splat.kernels.structs import HarmonicsView, mat53, mat73
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.runtime.launch import SMALLEST_SLICE, even_slices, in_slices, launch, stage, torch_slices, view
+from warp_splat.runtime.launch import (
+    SMALLEST_SLICE,
+    even_slices,
+    in_slices,
+    launch,
+    pack_struct,
+    stage,
+    torch_slices,
+    view,
+)
 
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView:
@@ -121,12 +131,14 @@ def _project_groups(kernel, cam, lanes, inputs, outputs, adj_inputs, adj_outputs
     _launch_groups(kernel, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
 
 
-def _by_degree(sh_rest: torch.Tensor) -> list:
-    """The coefficients of degree 1, 2 and 3; an empty array for each degree that there is not."""
-    return [
-        view(sh_rest[:, low:high] if sh_rest.shape[1] >= high else sh_rest.new_empty(0, high - low, 3), dtype)
-        for dtype, low, high in ((wp.mat33, 0, 3), (mat53, 3, 8), (mat73, 8, 15))
-    ]
+def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
+    """The coefficients as kernels take them; an empty array for each degree that there is not."""
+    degrees = (("degree1", wp.mat33, 0, 3), ("degree2", mat53, 3, 8), ("degree3", mat73, 8, 15))
+    arrays = {
+        name: view(sh_rest[:, low:high] if sh_rest.shape[1] >= high else sh_rest.new_empty(0, high - low, 3), dtype)
+        for name, dtype, low, high in degrees
+    }
+    return pack_struct(HarmonicsView, dc=view(sh_dc[:, 0], wp.vec3), **arrays)
 
 
 def _launch_groups(kernel: wp.Kernel, lanes: int, count: int, inputs, outputs, device, **adjoint) -> None:
@@ -148,9 +160,8 @@ class Project(torch.autograd.Function):
             radii=torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device),
         )
         _project_geometry(cam, kernel, lanes, _shapes(gaussians), _geometry(splats))
-        given = [cam, *_views3d([gaussians.means, gaussians.sh_dc[:, 0]]), *_by_degree(gaussians.sh_rest)]
-        found = [*splats.views(), view(splats.radii, wp.int32)]
-        _launch_groups(make_shade(lanes), lanes, count, given, found, means.device)
+        given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
+        _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
         ctx.save_for_backward(*gaussians, *splats)
         ctx.cam, ctx.kernel, ctx.driver, ctx.dropped = cam, kernel, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
@@ -166,9 +177,10 @@ class Project(torch.autograd.Function):
             lanes, count, device = ctx.driver.lanes, len(given.means), given.means.device
             seen, rest = view(splats.radii, wp.int32), given.sh_rest
             adj_placed, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
-            means, colors, adj_colors = _views3d([given.means, splats.colors, adj_splats.colors])
-            inputs = [ctx.cam, means, *_by_degree(rest), seen, colors, adj_colors]
-            outputs = [*_views3d([adj_placed, adj_dc[:, 0]]), *_by_degree(adj_rest)]
+            tensors = (given.means, splats.colors, adj_splats.colors)
+            means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
+            inputs = [ctx.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
+            outputs = [view(adj_placed, wp.vec3), _harmonics(adj_dc, adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
             shapes = (torch.zeros_like(tensor) for tensor in (given.quats, given.scales, given.opacities))
             adj = Gaussians(adj_placed, *shapes, adj_dc, adj_rest)
@@ -204,7 +216,3 @@ def _all_finite(tensors: Sequence[torch.Tensor]) -> bool:
 
     in_slices(run, torch_slices(len(tensors[0])))
     return math.isfinite(sum(sums))
-
-
-def _views3d(tensors: Sequence[torch.Tensor]) -> list:
-    return [view(tensor, wp.vec3) for tensor in tensors]

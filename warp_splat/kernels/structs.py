@@ -1,0 +1,29 @@
+"""What travels between the stages, as kernels read and write it: the arrays of one thing are one parameter."""
+
+import warp as wp
+
+mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
+mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
+
+
+@wp.struct
+class HarmonicsView:
+    """Coefficients of spherical harmonics, or their gradients; an array is empty where there is no such degree."""
+
+    dc: wp.array[wp.vec3]  # [N]
+    degree1: wp.array[wp.mat33]  # [N]
+    degree2: wp.array[mat53]  # [N]
+    degree3: wp.array[mat73]  # [N]
+
+
+@wp.struct
+class Splats2DView:
+    """Gaussians projected."""
+
+    means2d: wp.array[wp.vec2]  # [N] px
+    conics: wp.array[wp.vec3]  # [N] 1/px^2, (xx, xy, yy)
+    opacities: wp.array[float]  # [N]
+    colors: wp.array[wp.vec3]  # [N]
+    depths: wp.array[float]  # [N]
+    extents: wp.array[wp.vec2]  # [N] px, half sides of the box where alpha >= alpha_min
+    radii: wp.array[int]  # [N] px
