@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from warp_splat import InputError, rasterize
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.harmonics import C0, C1
+from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project.ellipsoid import make_lens, make_outline
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.drivers import CPU
@@ -160,3 +163,24 @@ def test_inputs_need_not_be_contiguous():
     others, (other_grads,) = project(40, OPTIONS["plain"], spread=True)
     for found, wanted in zip((*others, *other_grads), (*outputs, *grads), strict=True):
         torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        (
+            (3.0,),
+            "Projection.lens: expected a function of the lanes .* of 4 arguments, got 3.0; see docs/extending.md.",
+        ),
+        ((lambda lanes: 3.0,), "Projection.lens: expected .*, got one that makes 3.0; see"),
+        ((make_outline,), "Projection.lens: expected .* of 4 arguments, got one that makes <Function"),
+        (
+            (make_lens, lambda lanes: None),
+            "Projection.outline: expected .* of 17 arguments, got one that makes None; see",
+        ),
+    ],
+)
+def test_what_is_no_projection_is_refused(members, message):
+    *geometry, sh_dc, _ = gaussians(1)
+    with pytest.raises(InputError, match=message):
+        rasterize(*geometry, sh_dc, CAMERA, options=RasterOptions(projection=Projection(*members)))

@@ -10,14 +10,15 @@ from test_checkpoints import begin, state_of, steps
 from test_distributed import Pretended
 from test_train import SCENE, fails, train
 
-from warp_splat.cli import main
+from warp_splat.cli import main, parse
+from warp_splat.errors import InputError
 from warp_splat.flags import growing, learning
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.model_folder import ply_path
-from warp_splat.training.config_file import load_options, read_config
+from warp_splat.training.config_file import load_options, read_config, write_config
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import PARTS
+from warp_splat.training.parts import PARTS, choose
 from warp_splat.training.record import keep, restore
 from warp_splat.training.seams import Change, Entry, Verdict
 from warp_splat.training.trainer import Trainer
@@ -43,7 +44,7 @@ class Gain:
     @classmethod
     def needed(cls, scene):
         spread = float(torch.tensor([float(view.image.mean()) for view in scene.train]).std())
-        return Verdict(spread > 1.0, spread, f"the brightness of the photographs varies by {spread:.1f}")
+        return Verdict(spread > 1.0, f"the brightness of the photographs varies by {spread:.1f}")
 
     def parameters(self):
         return [{"name": "gain", "params": [self.gains], "lr": self.options.gain_lr}]
@@ -185,3 +186,33 @@ def test_neither_trainer_nor_command_line_knows_one_by_name():
     for entry in (*PARTS.values(), *GROWTHS.values()):
         found = words & {*entry.place.split(".")[-2:], *(item.name for item in fields(entry.options))}
         assert found <= {"background"}  # that is a color, too
+
+
+def test_options_of_one_name_are_refused(monkeypatch, capsys):
+    @dataclass(frozen=True)
+    class OtherOptions:
+        faint_below: float = growing(0.5, "of another growth")
+
+    monkeypatch.setitem(GROWTHS, "other", Entry(OtherOptions, f"{__name__}.Faint"))
+    message = "--faint_below: expected one kind of options with it, found FaintOptions and OtherOptions; rename one."
+    with pytest.raises(InputError, match=message):
+        TrainConfig()
+    assert message in fails(capsys, "train")
+
+
+def test_growths_may_share_their_options(monkeypatch):
+    monkeypatch.setitem(GROWTHS, "other", Entry(FaintOptions, f"{__name__}.Faint"))
+    config = TrainConfig(faint_below=0.25, growth="other")
+    assert config.plugins["other"] == config.plugins["faint"] == FaintOptions(0.25)
+    assert config.changed(seed=1).flat()["faint_below"] == 0.25
+
+
+@pytest.mark.parametrize(("flags", "parts"), [([], "random_background,gain"), (["--no-random_background"], "gain")])
+def test_a_part_that_auto_took_is_left_out_where_its_flag_says_so(flags, parts, scene, tmp_path):
+    """Of a training that goes on, and of one that takes its options."""
+    trainer, run = begin(scene, tmp_path, parts="random_background,gain")  # as after auto
+    keep(trainer, run)
+    write_config(tmp_path, trainer.config)
+    for source in (["--resume", str(tmp_path)], ["--config", str(tmp_path / "config.toml")]):
+        config = parse(["train", *source, *flags])
+        assert config.model.parts == parts and choose(config, scene)[0] == [n for n in PARTS if n in parts.split(",")]

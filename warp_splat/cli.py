@@ -115,7 +115,7 @@ def parse(arguments: list[str]) -> Any:
     if values.get("config"):
         from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
 
-        values = {**read_config(values["config"]), **values}
+        values = _over(read_config(values["config"]), values)
     if values.get("start_checkpoint"):
         return TrainConfig(**_continued(values))
     if config_type is TrainConfig:
@@ -138,7 +138,13 @@ def _continued(given: dict) -> dict:
         if given.get(name, kept) != kept:
             kept = "none" if kept == "" else kept
             raise InputError(f"--{name} {given[name]}: expected {kept}, as in {source} ({reason}); leave it out.")
-    return {**options, **given}
+    return _over(options, given)
+
+
+def _over(kept: dict, given: dict) -> dict:
+    """Options of a file, and over them those that are given; ``--no-NAME`` of a part takes it out of the file's."""
+    used = [name for name in kept.get("parts", "").split(",") if given.get(name) is not False]
+    return {**kept, "parts": ",".join(used), **given}
 
 
 def _function_of(config: Any) -> Callable[[Any], int]:

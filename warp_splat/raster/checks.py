@@ -45,10 +45,6 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     if not isinstance(options.projection, Projection) and not is_one_of(options.projection, PROJECTIONS):
         wanted = f"one of {', '.join(PROJECTIONS)} or a warp_splat.kernels.project.Projection"
         raise InputError(f"options.projection: expected {wanted}, got {options.projection!r}.")
-    if isinstance(options.projection, Projection) and not all(callable(make) for make in options.projection if make):
-        raise InputError(
-            f"options.projection: expected functions that make a lens and an outline, got {options.projection!r:.80}."
-        )
     for name, choices in (("extent", EXTENTS), ("exp_degree", EXP_DEGREES)):
         if not is_one_of(getattr(options, name), choices):
             wanted = ", ".join(str(choice) for choice in choices)

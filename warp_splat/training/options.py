@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from warp_splat.config import ADJOINTS, LOSS_SPACES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
+from warp_splat.errors import InputError
 from warp_splat.flags import data, flag, flags_of, growing, learning, machinery, rendering, reporting
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.parts import AUTO, PARTS
@@ -140,19 +141,31 @@ class TrainConfig:
     plugins: dict[str, Any]  # the options of every growth and part, by its name
 
     def __init__(self, **values: Any):
-        def made(group: type) -> Any:
-            return group(**{item.name: values.pop(item.name) for item in fields(group) if item.name in values})
-
-        found = {name: made(group) for name, group in GROUPS.items()}
-        plugins = {name: made(entry.options) for name, entry in (GROWTHS | PARTS).items()}
+        made = {
+            group: group(**{item.name: values.pop(item.name) for item in fields(group) if item.name in values})
+            for group in self.groups()
+        }
         if values:
             raise TypeError(f"TrainConfig: no such option: {', '.join(values)}")
-        vars(self).update(found, plugins=plugins)
+        plugins = {name: made[entry.options] for name, entry in (GROWTHS | PARTS).items()}
+        vars(self).update({name: made[group] for name, group in GROUPS.items()}, plugins=plugins)
 
     @staticmethod
     def groups() -> list[type]:
-        """The type of each group, and of the options of each growth and part."""
-        return [*GROUPS.values(), *(entry.options for entry in (GROWTHS | PARTS).values())]
+        """The type of each group, and of the options of each growth and part.
+
+        Raises:
+            InputError: if two of them have an option of one name: there is one flag for it.
+        """
+        found = list(dict.fromkeys([*GROUPS.values(), *(entry.options for entry in (GROWTHS | PARTS).values())]))
+        owners: dict[str, type] = {}
+        for group in found:
+            for item in fields(group):
+                if item.name in owners:
+                    names = f"{owners[item.name].__name__} and {group.__name__}"
+                    raise InputError(f"--{item.name}: expected one kind of options with it, found {names}; rename one.")
+                owners[item.name] = group
+        return found
 
     def flat(self) -> dict[str, Any]:
         """Every option by its name."""

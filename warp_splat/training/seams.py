@@ -2,7 +2,8 @@
 
 A part (``training/parts/``) is something that is learned or done besides the Gaussians. A growth (``training/growth/``)
 is the rules by which their set grows and shrinks. Each is a class in a file there, and a line in that folder's table
-with its options, whose fields are flags: no two may share a name. Trainer and command line know none by name.
+with its options, whose fields are flags. No two types of options may share a name; growths may share a type. Trainer
+and command line know none by name.
 
 A growth is made of (options, setting, optimizer); the optimizer's ``replace`` and ``arrange`` change the set:
 
@@ -83,10 +84,9 @@ class Change(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """Whether a scene needs a part, the figure that says so, and a sentence with that figure."""
+    """Whether a scene needs a part, and a sentence with the figure that says so."""
 
     needed: bool
-    figure: float
     sentence: str
 
 

@@ -12,6 +12,10 @@ from typing import NamedTuple
 
 import warp as wp
 
+from warp_splat.errors import InputError
+
+ARGUMENTS = {"lens": 4, "outline": 17}
+
 
 class Projection(NamedTuple):
     """What one projection does otherwise than another. Both members make a Warp function for a number of lanes.
@@ -28,3 +32,21 @@ class Projection(NamedTuple):
 
     lens: Callable[[int], wp.Function]
     outline: Callable[[int], wp.Function] | None = None
+
+    def functions(self, lanes: int) -> list[wp.Function | None]:
+        """Lens and outline for a number of lanes.
+
+        Raises:
+            InputError: if a member makes no Warp function of as many arguments.
+        """
+        found = []
+        for (name, count), make in zip(ARGUMENTS.items(), self, strict=True):
+            made = make(lanes) if callable(make) else make
+            fits = isinstance(made, wp.Function) and len(made.input_types) == count
+            if not fits and (make is not None or name == "lens"):
+                raise InputError(
+                    f"Projection.{name}: expected a function of the lanes that makes a wp.func of {count} arguments, "
+                    f"got {f'one that makes {made!r:.80}' if callable(make) else repr(make)}; see docs/extending.md."
+                )
+            found.append(made)
+        return found

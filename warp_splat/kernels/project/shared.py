@@ -62,8 +62,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
     ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`).
     """
     number, integer, row2, row3, row4 = TYPES[lanes]
-    lens = projection.lens(lanes)
-    outline = projection.outline(lanes) if projection.outline else None
+    lens, outline = projection.functions(lanes)
 
     @wp.func
     def largest(a: number, b: number, c: number, d: number):

@@ -27,7 +27,7 @@ class RandomBackground:
     def needed(cls, scene: Scene) -> Verdict:
         """If photographs are transparent somewhere."""
         clear = sum(view.alpha is not None and bool((view.alpha < 255).any()) for view in scene.train)
-        return Verdict(clear > 0, clear, f"{clear} of {len(scene.train)} photographs are transparent somewhere")
+        return Verdict(clear > 0, f"{clear} of {len(scene.train)} photographs are transparent somewhere")
 
     def background(self, color: torch.Tensor, step: Step) -> torch.Tensor:
         """Draw one for each process; this one's."""
