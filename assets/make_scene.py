@@ -1,13 +1,15 @@
-"""Make the embedded test scene: 50 photographs of a ray-traced still life, and the COLMAP model that belongs to them.
+"""Make the embedded test scene: 50 photographs of a ray-traced still life, with their cameras and points.
 
     python assets/make_scene.py [--out assets/still_life]
 
 Because a ray tracer that knows nothing of Gaussians takes the pictures, cameras are exact and the truth is independent
 of the code under test. The geometry is in ``scene_geometry``, the look in ``scene_textures``, the tracer in
-``scene_trace``; this file places the cameras, takes the pictures and writes what COLMAP would have found.
+``scene_trace``; this file places the cameras, takes the pictures and writes what COLMAP would have found, as
+COLMAP's model and as transforms.json.
 """
 
 import argparse
+import json
 import pathlib
 import shutil
 
@@ -16,6 +18,8 @@ import OpenImageIO as oiio
 import pycolmap
 from scene_geometry import still_life
 from scene_trace import Tracer
+
+from warp_splat.formats.ply import save_points
 
 VIEWS, TURNS = 50, 3  # a closed spiral: each eighth view lies between its neighbors
 SIZE = (264, 248)  # width, height [px]; not multiples of a tile
@@ -83,8 +87,8 @@ def choose_tracks(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return chosen, kept & seen[:, chosen]
 
 
-def write_model(folder: pathlib.Path, names, centers, rotations, points, colors, pixels, kept) -> None:
-    """Write cameras, images, points and their tracks with pycolmap."""
+def write_model(folder: pathlib.Path, names, centers, rotations, points, colors, pixels, kept):
+    """Write cameras, images, points and their tracks with pycolmap, and return them."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[*FOCAL, *CENTER])
     model.add_camera_with_trivial_rig(camera)
@@ -101,6 +105,23 @@ def write_model(folder: pathlib.Path, names, centers, rotations, points, colors,
         model.add_point3D(points[point], track, colors[point])
     model.update_point_3d_errors()
     model.write_binary(str(folder))
+    return model
+
+
+def write_transforms(folder: pathlib.Path, model: pycolmap.Reconstruction) -> None:
+    """Write the model's cameras and points as nerfstudio does, for machines without pycolmap."""
+    lens = dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h"), (*FOCAL, *CENTER, *SIZE), strict=True))
+    frames = []
+    for image in (model.image(view + 1) for view in range(VIEWS)):
+        pose, rotation = np.eye(4), image.cam_from_world().rotation.matrix()
+        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ image.cam_from_world().translation
+        pose[:, 1:3] *= -1  # OpenGL's y and z axes point the other way
+        frames.append({"file_path": f"images/{image.name}", "transform_matrix": pose.tolist()})
+    scene = {**lens, "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(scene) + "\n")
+
+    points = [point for _, point in sorted(model.points3D.items(), key=lambda item: item[0])]
+    save_points(folder / "points.ply", np.array([point.xyz for point in points]), [point.color for point in points])
 
 
 def write_png(path: pathlib.Path, image: np.ndarray) -> None:
@@ -133,7 +154,8 @@ def main() -> None:
     chosen, kept = choose_tracks(seen)
     noise = np.random.default_rng(SEED + 2).normal(size=points.shape) * NOISE * distance[:, None]
     noisy = (points + noise)[chosen]
-    write_model(out / "sparse" / "0", names, centers, rotations, noisy, colors[chosen], pixels[:, chosen], kept)
+    model = write_model(out / "sparse" / "0", names, centers, rotations, noisy, colors[chosen], pixels[:, chosen], kept)
+    write_transforms(out, model)
 
 
 if __name__ == "__main__":

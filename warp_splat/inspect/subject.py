@@ -5,19 +5,21 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import OpenImageIO as oiio
-import pycolmap
 
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
-from warp_splat.scene import colmap, images, transforms, with_masks
+from warp_splat.scene import colmap, images, takes_colmap, transforms, with_masks
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_photo, make_sampling
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.text import few
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Level = Literal["ok", "note", "warning", "error"]
 THUMBNAIL = 240  # px, the longer side
@@ -50,7 +52,7 @@ class Subject:
 
 def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     """Read what can be read of the scene in ``source``, with its images in ``folder`` if it is COLMAP's."""
-    if (source / "sparse").is_dir():
+    if takes_colmap(source):
         subject, findings = _read_colmap(source, source / folder)
     else:
         subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []
@@ -114,7 +116,9 @@ def _match_files(subject: Subject) -> list[Finding]:
             findings.append(Finding("files", "error", str(error)))
             continue
         try:
-            subject.photos.append(make_photo(image.name, path, image.camera, colmap.pose_of(image), size, sampling))
+            subject.photos.append(
+                make_photo(image.name, path, colmap.lens_of(image), colmap.pose_of(image), size, sampling)
+            )
         except InputError as error:
             findings.append(Finding("sizes", "error", str(error)))
         if size != (image.camera.width, image.camera.height):

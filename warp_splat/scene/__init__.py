@@ -133,7 +133,7 @@ def read_photos(
     if not source.is_dir():
         found = "a file" if source.exists() else "nothing"
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
-    if (source / "sparse").is_dir():
+    if takes_colmap(source):
         photos, points, colors = colmap.read_colmap(source, folder, report)
         return with_masks(photos, source, report), [], points, colors
     if transforms.has_transforms(source):
@@ -153,6 +153,14 @@ def has_cameras(source: str | Path) -> bool:
     from warp_splat.scene import transforms  # noqa: PLC0415  keeps `import warp_splat` light
 
     return (Path(source) / "sparse").is_dir() or transforms.has_transforms(Path(source))
+
+
+def takes_colmap(source: Path) -> bool:
+    """Whether the cameras are read from sparse/: where pycolmap is missing, a transforms.json beside it comes first."""
+    from warp_splat.scene.colmap_library import pycolmap  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.transforms import has_transforms  # noqa: PLC0415
+
+    return (source / "sparse").is_dir() and (pycolmap is not None or not has_transforms(source))
 
 
 def with_masks(photos: list[Photo], source: Path, report: Callable[[str], object]) -> list[Photo]:

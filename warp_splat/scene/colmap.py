@@ -1,23 +1,24 @@
 """COLMAP models, binary or text, through pycolmap. COLMAP's poses are world to camera, as ours."""
 
+from __future__ import annotations
+
+import functools
 import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
-import pycolmap
 
 from warp_splat.errors import InputError, reason_of
 from warp_splat.scene import images
+from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
-from warp_splat.scene.lenses import make_photo, make_sampling
+from warp_splat.scene.lenses import Lens, make_photo, make_sampling
 from warp_splat.scene.photos import ImageFinder
 
 UINT32, UINT32_PAIR, UINT64 = struct.Struct("<I"), struct.Struct("<II"), struct.Struct("<Q")
 SENSOR, POSE = 8, 56  # bytes: its kind and number; quaternion and translation
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
-KNOWN_MODELS = {int(model): model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0}
 IMAGE_HEAD = 64  # bytes of id, quaternion, translation, camera id; then the name, the number of keypoints, these
 POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the track, the track
 
@@ -76,6 +77,7 @@ def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path,
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read the model in ``folder``, binary or text. Raises InputError if it is cut short, damaged or unknown."""
+    require_pycolmap(f"{folder} is a COLMAP model")
     for name, record_end in RECORD_ENDS.items():
         if (folder / name).is_file():
             _check_length(folder / name, record_end)
@@ -121,11 +123,16 @@ def _check_length(path: Path, record_end: Callable[[bytes, int], int | None]) ->
         )
 
 
+@functools.cache
+def _known_models() -> dict[int, pycolmap.CameraModelId]:
+    return {int(model): model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0}
+
+
 def _camera_end(data: bytes, start: int) -> int | None:
     _, model, width, height = CAMERA.unpack_from(data, start)
-    if model not in KNOWN_MODELS:
+    if model not in _known_models():
         return None
-    camera = pycolmap.Camera.create_from_model_id(0, KNOWN_MODELS[model], 1.0, width, height)
+    camera = pycolmap.Camera.create_from_model_id(0, _known_models()[model], 1.0, width, height)
     return start + CAMERA.size + 8 * len(camera.params)
 
 
@@ -183,7 +190,7 @@ def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: C
     photos, scaled, distorted = [], 0, []
     for image, path in zip(registered, paths, strict=True):
         size = images.read_size(path)
-        photos.append(make_photo(image.name, path, image.camera, pose_of(image), size, sampling))
+        photos.append(make_photo(image.name, path, lens_of(image), pose_of(image), size, sampling))
         scaled += size != (image.camera.width, image.camera.height)
         distorted += [] if photos[-1].sampling is None else [image.camera.model_name]
     if scaled:
@@ -192,6 +199,12 @@ def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: C
         models = ", ".join(sorted(set(distorted)))
         report(f"Undistorting {len(distorted)} of {len(photos)} images to pinhole cameras (models: {models}).")
     return photos
+
+
+def lens_of(image: pycolmap.Image) -> Lens:
+    """What took the image."""
+    camera = image.camera
+    return Lens(camera.model_name, camera.width, camera.height, tuple(camera.params))
 
 
 def pose_of(image: pycolmap.Image) -> tuple[np.ndarray, np.ndarray]:

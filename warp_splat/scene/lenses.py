@@ -1,21 +1,37 @@
-"""Lenses through pycolmap: those with distortion become pinholes. Pixel centers are at +0.5, as ours."""
+"""Lenses: those with distortion become pinholes, by pycolmap. Pixel centers are at +0.5, as ours."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
-import pycolmap
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, reason_of
 from warp_splat.scene import images
+from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
 
 Sampling = Callable[..., np.ndarray]
+PINHOLE = "PINHOLE"  # fx, fy, cx, cy: the model that needs no pycolmap
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model by COLMAP's name, and its parameters."""
+
+    model: str
+    width: int  # px, of the images that the parameters are for
+    height: int
+    params: tuple[float, ...]
+
+    def load(self) -> pycolmap.Camera:
+        """The same for pycolmap. Raises InputError where that is missing."""
+        require_pycolmap(f"lens {self.model}")
+        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=self.params)
 
 
 def make_sampling() -> Sampling:
@@ -24,33 +40,30 @@ def make_sampling() -> Sampling:
 
 
 def make_photo(
-    name: str,
-    path: Path,
-    lens: pycolmap.Camera,
-    pose: tuple[np.ndarray, np.ndarray],
-    size: tuple[int, int],
-    sampling: Sampling,
+    name: str, path: Path, lens: Lens, pose: tuple[np.ndarray, np.ndarray], size: tuple[int, int], sampling: Sampling
 ) -> Photo:
     """The photo whose file has ``size`` = (width, height) pixels, taken through ``lens`` at a pose, world to camera.
 
     Raises:
-        InputError: if the size does not fit the lens's, or it cannot become a pinhole.
+        InputError: if the size does not fit the lens's, it cannot become a pinhole, or pycolmap is needed and missing.
     """
     if not images.same_shape(size, (lens.width, lens.height)):
         raise InputError(
             f"{path}: expected {lens.width} x {lens.height} pixels as its camera has, or both scaled by one "
             f"factor, got {size[0]} x {size[1]}; use the images that the cameras were computed from."
         )
-    if lens.is_spherical() or not np.isfinite(lens.params).all():
-        raise InputError(
-            f"{path}: expected a camera model that can be undistorted to a pinhole, with finite parameters, got "
-            f"{lens.model_name} {lens.params.tolist()}; correct the model or leave this image out."
-        )
     with images.named(str(path)):
-        if lens.is_undistorted():
-            return Photo(name, path, _pinhole(lens, pose).resized(*size))
-        key = (lens.model_name, lens.width, lens.height, tuple(lens.params), size)
-        return Photo(name, path, _pinhole(_undistorted(_lens(*key)), pose), functools.partial(sampling, *key))
+        finite = np.isfinite(lens.params).all()
+        if finite and lens.model == PINHOLE:
+            return Photo(name, path, Camera(lens.width, lens.height, *lens.params, *pose).resized(*size))
+        if not finite or (loaded := lens.load()).is_spherical():
+            raise InputError(
+                "expected a camera model that can be undistorted to a pinhole, with finite parameters, got "
+                f"{lens.model} {list(lens.params)}; correct the model or leave this image out."
+            )
+        if loaded.is_undistorted():
+            return Photo(name, path, _pinhole(loaded, pose).resized(*size))
+        return Photo(name, path, _pinhole(_undistorted(lens, size), pose), functools.partial(sampling, lens, size))
 
 
 def _pinhole(lens: pycolmap.Camera, pose: tuple[np.ndarray, np.ndarray]) -> Camera:
@@ -58,28 +71,28 @@ def _pinhole(lens: pycolmap.Camera, pose: tuple[np.ndarray, np.ndarray]) -> Came
     return Camera(lens.width, lens.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *pose)
 
 
-def _lens(model: str, width: int, height: int, params: tuple[float, ...], size: tuple[int, int]) -> pycolmap.Camera:
-    lens = pycolmap.Camera(model=model, width=width, height=height, params=params)
-    lens.rescale(*size)
-    return lens
+def _rescaled(lens: Lens, size: tuple[int, int]) -> pycolmap.Camera:
+    camera = lens.load()
+    camera.rescale(*size)
+    return camera
 
 
-def _undistorted(lens: pycolmap.Camera) -> pycolmap.Camera:
+def _undistorted(lens: Lens, size: tuple[int, int]) -> pycolmap.Camera:
     """The pinhole that COLMAP's image_undistorter gives ``lens``, without blank pixels."""
+    camera = _rescaled(lens, size)
     try:
-        return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), lens)
+        return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     except Exception as error:
         raise InputError(
-            f"expected a lens that can be undistorted, pycolmap refuses {lens.model_name} {lens.params.tolist()} "
+            f"expected a lens that can be undistorted, pycolmap refuses {lens.model} {camera.params.tolist()} "
             f"({reason_of(error)}); correct the model or leave this image out."
         ) from error
 
 
-def sampling_of(*key: object) -> np.ndarray:
+def sampling_of(lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """Where in the distorted image each pixel of the undistorted one lies, for :func:`images.undistort`."""
-    lens = _lens(*key)
-    pinhole = _undistorted(lens)
+    pinhole = _undistorted(lens, size)
     y, x = np.mgrid[-1 : pinhole.height + 1, -1 : pinhole.width + 1] + 0.5
     rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
-    pixels = lens.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+    pixels = _rescaled(lens, size).img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
     return pixels.astype(np.float32).reshape(*x.shape, 2)

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from warp_splat.errors import InputError
 from warp_splat.formats.ply import GRAY, load_points
 from warp_splat.formats.reading import reading
 from warp_splat.scene import images
 from warp_splat.scene.images import Photo
-from warp_splat.scene.lenses import Sampling, make_photo, make_sampling
+from warp_splat.scene.lenses import Lens, Sampling, make_photo, make_sampling
 from warp_splat.scene.photos import ImageFinder
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
@@ -141,7 +140,7 @@ def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sa
     return Photo(name, path, photo.camera, photo.sampling, mask)
 
 
-def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> pycolmap.Camera:
+def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Lens:
     """The lens that a frame describes in the manner of nerfstudio, or by camera_angle_x as nerf-synthetic does."""
 
     def number(key: str, default: float = 0.0) -> float:
@@ -177,7 +176,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> pycolmap
             f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2 or {FISHEYE} with k1 to k4, got "
             f"{reprlib.repr(model)} with k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs first."
         )
-    return pycolmap.Camera(model=model, width=int(width), height=int(height), params=params)
+    return Lens(model, int(width), int(height), params)
 
 
 def _points(source: Path, name: Any, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
@@ -211,14 +210,16 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
             f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix):.100}; "
             "correct the file."
         )
-    u, scales, vt = np.linalg.svd(world_from_camera[:3, :3])  # u @ vt is the nearest rotation, without the scale
+    given = world_from_camera[:3, :3]
+    u, scales, vt = np.linalg.svd(given)  # u @ vt is the nearest rotation, without the scale
     is_scaled_rotation = np.linalg.det(u @ vt) > 0 and scales[2] > 0 and scales[0] - scales[2] <= TOLERANCE * scales[0]
     if not is_scaled_rotation or not np.allclose(world_from_camera[3], (0, 0, 0, 1)):
         raise InputError(
             f"{where}: expected transform_matrix to be a rotation and a translation (camera to world), but its axes "
             "are sheared, mirrored or scaled unequally, or its last row is not 0 0 0 1; correct the file."
         )
-    rotation = (u @ vt * (1, -1, -1)).T  # OpenGL's y and z axes point the other way
+    exact = np.abs(given @ given.T - np.eye(3)).max() <= 1e-12  # LAPACK's last bits differ by processor
+    rotation = ((given if exact else u @ vt) * (1, -1, -1)).T  # OpenGL's y and z axes point the other way
     return rotation, -rotation @ world_from_camera[:3, 3]
 
 

@@ -15,14 +15,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import OpenImageIO  # noqa: F401 - see warp_splat.sfm.stages
-import pycolmap
 from tqdm import tqdm
 
 from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, reason_of
 from warp_splat.formats.atomic import write_json
 from warp_splat.scene import has_cameras, images
+from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.photos import (
     OTHER_PHOTOS,
     PHOTOS,
@@ -55,6 +54,7 @@ def sfm(config: SfmConfig) -> int:
     started = time.perf_counter()
     source, scene = Path(config.photos), Path(config.scene)
     say = (lambda *_: None) if config.quiet else tqdm.write
+    require_pycolmap("warp-splat sfm")
     _check_numbers(config)
     _check_source(source)
     work = _claim(source, scene, config)

@@ -14,13 +14,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
-import pycolmap
 from tqdm import tqdm
 
 from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.runtime.interrupts import interruptible
+from warp_splat.scene.colmap_library import pycolmap
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
