@@ -45,7 +45,7 @@ def modules() -> dict[str, wp.Module]:
         "shade": sh_colors.make_shade(1).module,
         "adjoint of shade": sh_colors.make_adj_shade(1).module,
         "quarantine": quarantine.module,
-        "adam": make_adam(15, 3).module,
+        "adam": make_adam(1, True).module,
         "pack": tiles.make_pack().module,
         "tiles": tiles.find_spans.module,
     }

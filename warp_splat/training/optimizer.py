@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
+from decimal import Decimal
 
 import numpy as np
 import torch
@@ -12,15 +14,38 @@ from torch.optim.adam import adam
 
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
-from warp_splat.kernels.adam import make_adam
-from warp_splat.kernels.simd import LANES
-from warp_splat.runtime.launch import in_slices, launch, torch_slices, view
+from warp_splat.kernels.adam import make_adam, rows_of
+from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.launch import SMALLEST_SLICE, even_slices, launch, load, view
 from warp_splat.training.options import LearnOptions
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
 MOMENTS = ("exp_avg", "exp_avg_sq")
 SETTINGS = {"fused": True, "amsgrad": False, "weight_decay": 0.0, "maximize": False}
+
+
+def power(base: float, steps: float, of: int = 1) -> float:
+    """``base ** (steps / of)``; the C library's differs by processor."""
+    return float(_root(base, of) ** Decimal(steps))
+
+
+@functools.cache
+def _root(base: float, degree: int) -> Decimal:
+    return Decimal(base) ** (Decimal(1) / degree)
+
+
+def move(tables: list[list[torch.Tensor]], numbers: list, rows: int, radii: torch.Tensor | None, lanes: int) -> None:
+    """Launch the kernel of :mod:`warp_splat.kernels.adam`."""
+    device, at_once = tables[0][0].device, rows_of(lanes)
+    widths = torch.tensor([table[0].numel() // rows for table in tables], dtype=torch.int32, device=device)
+    addresses = torch.tensor([[tensor.data_ptr() for tensor in table] for table in tables], device=device)
+    of_tables = torch.tensor(numbers, dtype=torch.float32, device=device)
+    shown, groups = widths if radii is None else radii, -(-rows // at_once)
+    inputs = [rows, view(widths, wp.int32), view(of_tables, wp.float32), view(shown, wp.int32)]
+    bounds = even_slices(groups, SMALLEST_SLICE // at_once)
+    kernel = make_adam(lanes, radii is not None)
+    launch(kernel, groups, inputs, [view(addresses, wp.uint64)], bounds=bounds, device=device)
 
 
 class Optimizer:
@@ -56,8 +81,8 @@ class Optimizer:
         In the last ``cooldown`` steps all fall to a tenth as well, which settles what constant rates keep in motion.
         """
         options = self.options
-        share = min(iteration / options.position_lr_max_steps, 1.0)
-        rate = math.exp((1 - share) * math.log(options.position_lr_init) + share * math.log(options.position_lr_final))
+        steps, fall = options.position_lr_max_steps, options.position_lr_final / options.position_lr_init
+        rate = options.position_lr_init * power(fall, min(iteration, steps), steps)
         rates = {
             "means": rate * self.extent,
             "sh_dc": options.feature_lr,
@@ -68,9 +93,9 @@ class Optimizer:
             **self._part_rates,
         }
         cooldown = min(options.cooldown, options.iterations)
-        late = max(iteration - options.iterations + cooldown, 0) / max(cooldown, 1)
+        late = power(0.1, max(iteration - options.iterations + cooldown, 0), max(cooldown, 1))
         for name, rate in rates.items():
-            self._groups[name]["lr"] = rate * self.scale * 0.1**late
+            self._groups[name]["lr"] = rate * self.scale * late
 
     def step(self, radii: torch.Tensor | None) -> None:
         """Update from the gradients and clear them.
@@ -78,54 +103,45 @@ class Optimizer:
         Args:
             radii: [N] int32, what the image showed (0: not); None if the set has just changed, and has no gradients.
         """
-        gaussians = [group for group in self.adam.param_groups if group["name"] not in self.parts]
-        if radii is not None and self.options.optimizer_type == "sparse_adam":
-            for group in gaussians:
-                self._sparse_step(group, radii)
-        elif radii is not None:
-            self._dense_step(gaussians)
-        for name in self.parts:
-            self._dense_step([self._groups[name]])
+        sparse, parts = self.options.optimizer_type == "sparse_adam", [self._groups[name] for name in self.parts]
+        if radii is not None:
+            gaussians = [group for group in self.adam.param_groups if group["name"] not in self.parts]
+            self._step(gaussians, len(radii), radii if sparse else None)
+        for group in parts:
+            self._step([group], group["params"][0].numel(), None)
         self.adam.zero_grad(set_to_none=True)
 
-    def _dense_step(self, groups: list[dict]) -> None:
-        """The fused Adam of torch, the rows shared among the threads of the CPU."""
-        jobs, steps, rows = [], [], len(groups[0]["params"][0])
+    def load(self) -> None:
+        """Compile and load the kernel."""
+        device = self.model.device
+        load(make_adam(driver_of(device).lanes, self.options.optimizer_type == "sparse_adam"), device)
+
+    def _step(self, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
+        """Adam on tables of ``rows`` rows.
+
+        With ``radii`` only on rows that are drawn, and without bias correction, as the reference's sparse_adam. Without
+        them, a GPU takes torch's, whose threads read what lies side by side.
+        """
+        tables, numbers, lanes = [], [], driver_of(groups[0]["params"][0].device).lanes
         for group in groups:
-            parameter, (beta1, beta2) = group["params"][0], group["betas"]
-            state = self._state(parameter)
-            steps.append(state["step"])
-            if parameter.grad is not None:  # degree 0: zeros would change nothing but the count of the steps
-                tables = [parameter.detach(), parameter.grad, *(state[name] for name in MOMENTS)]
-                rates = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
-                jobs.append((tables, state["step"], rates))
-
-        def run(low: int, high: int) -> None:
-            for tables, step, rates in jobs:
-                adam(*([table[low:high]] for table in tables), [], [step.clone()], **SETTINGS, **rates)
-
-        in_slices(run, torch_slices(rows, self.model.device))
-        for step in steps:
-            step.add_(1)
-
-    def _sparse_step(self, group: dict, radii: torch.Tensor) -> None:
-        """Adam without bias correction on the rows shown, as the reference's sparse_adam."""
-        parameter = group["params"][0]
-        if parameter.grad is None or parameter.numel() == 0:
-            return
-        state = self._state(parameter)
-        numbers = parameter.numel() // len(radii)
-        pieces = -(-numbers // LANES)
-        columns = numbers // pieces  # of 1, 3, 4, 9, 24 or 45: these divide
-        tables = [tensor.detach().view(-1, columns) for tensor in (parameter, *(state[name] for name in MOMENTS))]
-        grad, row = parameter.grad.reshape(-1, columns), wp.types.vector(length=columns, dtype=float)
-        launch(
-            make_adam(columns, pieces),
-            len(grad),
-            [view(radii, wp.int32), view(grad, row), group["lr"], *group["betas"], group["eps"]],
-            [view(table, row) for table in tables],
-            device=radii.device,
-        )
+            parameter, (beta1, beta2), biases = group["params"][0], group["betas"], (1.0, 1.0)
+            state, grad = self._state(parameter), parameter.grad
+            known = grad is not None and parameter.numel() > 0  # degree 0: zeros would change nothing but the count
+            of_torch = known and lanes == 1 and radii is None
+            if of_torch:
+                lists = ([tensor] for tensor in (parameter.detach(), grad, *(state[name] for name in MOMENTS)))
+                adam(
+                    *lists, [], [state["step"]], lr=group["lr"], beta1=beta1, beta2=beta2, eps=group["eps"], **SETTINGS
+                )
+            elif radii is None:
+                state["step"] += 1
+                biases = [1.0 - power(beta, state["step"].item()) for beta in (beta1, beta2)]
+            if known and not of_torch:
+                tables.append([parameter.detach(), grad.contiguous(), *(state[name] for name in MOMENTS)])
+                rates = [group["lr"] / biases[0], group["eps"], biases[1] ** -0.5]
+                numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])
+        if tables:
+            move(tables, numbers, rows, radii, lanes)
 
     def _state(self, parameter: torch.Tensor) -> dict:
         """Moments and number of steps, as torch's Adam keeps them."""
