@@ -80,9 +80,9 @@ class Blends:
         (self.up, self.adj_final), _, _, self.steps = found
 
     def reverse(self, rows: torch.Tensor, *write: wp.Function) -> None:
-        lists = self.bins.views(self.options)
         states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
-        inputs = [*lists, *states, view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
+        upstream = [view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
+        inputs = [self.bins.view(), self.options.alpha_min, *states, *upstream]
         kernel = make_reverse_block("manual", variant_of(self.options), *write)
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
 

@@ -26,7 +26,8 @@ from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, offset_x, offset_y, reach
 from warp_splat.kernels.falloff import make_exp
 from warp_splat.kernels.simd import LANES, total, vec16, where_less
-from warp_splat.kernels.splat import Splat2D, alpha_of, exponent
+from warp_splat.kernels.splat import alpha_of, exponent
+from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import camera_view, project
@@ -42,10 +43,7 @@ exp2_minus = make_exp(RasterOptions().exp_degree)
 @wp.kernel(module="unique", module_options=dict(IN_LANES))
 def count_pairs(
     first: int,
-    tiles_x: int,
-    ranges: wp.array[wp.vec2i],  # [T]
-    instances: wp.array[int],  # [M]
-    splats: wp.array[Splat2D],  # [V]
+    bins: BinsView,
     alpha_min: float,
     count: wp.array2d[vec16],  # [T, BLOCKS] instances walked before the pixel stopped
     width: float,
@@ -54,16 +52,16 @@ def count_pairs(
     pairs_out: wp.array2d[wp.int64],  # [T, 2] blended, and looked at in blocks
 ):
     tile = first + wp.tid()
-    start = ranges[tile][0]
-    x0 = float((tile % tiles_x) * 16) + 0.5
-    y0 = float((tile // tiles_x) * 16) + 0.5
+    start = bins.ranges[tile][0]
+    x0 = float((tile % bins.tiles_x) * 16) + 0.5
+    y0 = float((tile // bins.tiles_x) * 16) + 0.5
     longest = wp.max(count[tile, 0])
     for block in range(1, BLOCKS):
         longest = wp.max(longest, wp.max(count[tile, block]))
     blended = wp.int64(0)
     looked_at = wp.int64(0)
     for k in range(start, start + int(longest)):
-        splat = splats[instances[k]]
+        splat = bins.splats[bins.instances[k]]
         box = reach(splat.mean, splat.extent, x0, y0)
         hits = vec16(0.0)
         for by in range(box[2], box[3] + 1):
@@ -101,7 +99,7 @@ def count(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> Count
         bins = CPU.bin(project(gaussians, camera, options), camera, options)
         _, (_, stopped, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
         pairs = torch.empty(len(bins.ranges), 2, dtype=torch.int64)
-        inputs = [*bins.views(options), view(stopped, vec16), camera.width, camera.height]
+        inputs = [bins.view(), options.alpha_min, view(stopped, vec16), camera.width, camera.height]
         launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
     blended, looked_at = pairs.sum(0).tolist()
     pixels = camera.width * camera.height

@@ -41,13 +41,13 @@ def test_what_is_differentiated_is_the_blend(mode):
     given = workload("dense_tile")
     bins = CPU.bin(project(given.gaussians, given.camera, PLAIN), given.camera, PLAIN)
     (image, _, _), (final, count, kept) = CPU.blend(bins, given.camera, torch.zeros(3), PLAIN, False)
-    lists, steps = bins.views(PLAIN), count.amax((1, 2)).int()
+    lists, steps = bins.view(), count.amax((1, 2)).int()
     if mode == "generated":
-        lists[3] = wp.array(bins.splats.numpy()[bins.instances.numpy()], dtype=bins.splats.dtype, device="cpu")
+        lists.splats = wp.array(bins.splats.numpy()[bins.instances.numpy()], dtype=bins.splats.dtype, device="cpu")
     color, behind = torch.zeros(len(final), 3 * BLOCKS, LANES), torch.zeros_like(final)
     slots = torch.zeros(len(bins.instances), 9)
     states = [view(state, vec16) for state in (final, count, kept)]
-    inputs = [*lists, *states, view(steps, wp.int32), view(slots, wp.float32)]
+    inputs = [lists, PLAIN.alpha_min, *states, view(steps, wp.int32), view(slots, wp.float32)]
     launch(make_walk(mode, BlendVariant()), len(final), inputs, [view(color, vec16), view(behind, vec16)])
     assert torch.allclose(behind, final, rtol=1e-6, atol=0)
     height, width, _ = image.shape

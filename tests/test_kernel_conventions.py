@@ -10,14 +10,9 @@ MOST_PARAMETERS, MOST_LINES = 12, 100
 
 #: Kernels with more parameters, and why: a struct of arrays would be packed at every launch.
 MANY_PARAMETERS = {
-    "blend": "tile lists, limits, and what the adjoint reads",
-    "upstream": "tile lists, and upstream gradients in another layout",
-    "walk": "as blend, of which it is the differentiated loop",
     "compare": "image and target are given as numbers and as lanes, the target as bytes or floats",
     "adj_compare": "as compare",
 }
-#: Kernels whose inputs are those of `blend` and `upstream`, where their shapes stand.
-INPUTS_OF_THE_BLEND = {"cpu/adjoint:adj_blend", "cpu/taped:walk", "cuda/adjoint:adj_blend", "cuda/taped:walk"}
 
 
 def is_kernel(node):
@@ -87,10 +82,9 @@ def test_order_of_parameters(lines, kernel):
 
 
 @pytest.mark.parametrize(("lines", "kernel"), find_kernels())
-def test_arrays_say_their_shape(lines, kernel, request):
-    repeats = request.node.callspec.id in INPUTS_OF_THE_BLEND
+def test_arrays_say_their_shape(lines, kernel):
     for parameter in kernel.args.args:
-        if "wp.array" in ast.unparse(parameter.annotation) and not (repeats and not parameter.arg.endswith("_out")):
+        if "wp.array" in ast.unparse(parameter.annotation):
             assert comment(lines, parameter).strip().startswith("["), f"{parameter.arg}: no shape"
 
 

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_splat.kernels.splat import Splat2D
+
 mat53 = wp.types.matrix(shape=(5, 3), dtype=float)
 mat73 = wp.types.matrix(shape=(7, 3), dtype=float)
 
@@ -27,3 +29,22 @@ class Splats2DView:
     depths: wp.array[float]  # [N]
     extents: wp.array[wp.vec2]  # [N] px, half sides of the box where alpha >= alpha_min
     radii: wp.array[int]  # [N] px
+
+
+@wp.struct
+class BinsView:
+    """Tile lists."""
+
+    tiles_x: int
+    ranges: wp.array[wp.vec2i]  # [T] first and last instance of a tile
+    instances: wp.array[int]  # [M] splats, by tile, front to back
+    splats: wp.array[Splat2D]  # [V]
+
+
+@wp.struct
+class PixelsView:
+    """An image, or the upstream gradient of one."""
+
+    image: wp.array3d[float]  # [H, W, 3]
+    alpha: wp.array2d[float]  # [H, W]
+    depth: wp.array2d[float]  # [H, W] sum of w z; [0, 0] if not asked for

@@ -19,6 +19,7 @@ from warp_splat.kernels.cpu.blend import BLOCKS, make_blend, make_upstream
 from warp_splat.kernels.cpu.taped import make_walk, rows_of_copies
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import Splat2D
+from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
 from warp_splat.raster.data import Bins, Pixels, limits_of, variant_of
 from warp_splat.runtime.launch import empty, in_slices, launch, view
@@ -47,8 +48,8 @@ def blend(
     launch(
         make_blend(variant_of(options, keep)),
         tile_count,
-        [*bins.views(options), *limits_of(options), view(background, wp.float32)],
-        [*pixels.views(), *_in_lanes(final, count, kept)],
+        [bins.view(), options.alpha_min, *limits_of(options), view(background, wp.float32)],
+        [pixels.view(), *_in_lanes(final, count, kept)],
         bounds=bins.slices,
     )
     return pixels, (final, count, kept)
@@ -88,13 +89,7 @@ def _spread_upstream(bins: Bins, options: RasterOptions, background, final, coun
     launch(
         make_upstream(variant_of(options)),
         tile_count,
-        [
-            bins.tiles_x,
-            view(bins.ranges, wp.vec2i),
-            view(background, wp.float32),
-            *_in_lanes(final, count),
-            *adj_pixels.views(),
-        ],
+        [bins.view(), view(background, wp.float32), *_in_lanes(final, count), adj_pixels.view()],
         [
             *(*_in_lanes(up, adj_final), view(adj_background, wp.float32)),
             *(view(dropped, wp.int32), view(steps, wp.int32), view(slots, slot)),
@@ -106,30 +101,24 @@ def _spread_upstream(bins: Bins, options: RasterOptions, background, final, coun
 
 def differentiate(mode: str, bins: Bins, options: RasterOptions, saved, upstream, steps, slots) -> None:
     """Fill ``slots`` [M, 9 or 10]; ``saved`` and ``upstream`` as the kernels take them, ``steps`` [T]."""
-    lists, tile_count = bins.views(options), len(bins.ranges)
+    tile_count, alpha_min = len(bins.ranges), options.alpha_min
     (final, count, kept), steps, rows = saved, view(steps, wp.int32), view(slots, wp.float32)
     if mode in ("manual", "stepwise"):
-        inputs = [*lists, final, count, steps, *upstream]
+        inputs = [bins.view(), alpha_min, final, count, steps, *upstream]
         launch(make_reverse(mode, variant_of(options)), tile_count, inputs, [rows], bounds=bins.slices)
         return
-    walk, inputs = make_walk(mode, variant_of(options)), [final, count, kept, steps, rows]
+    lists, inputs = bins.view(), [alpha_min, final, count, kept, steps, rows]
+    if mode == "generated":
+        copies, copies.grad = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
+        copies.assign(bins.splats.numpy()[bins.instances.numpy()])
+        copies.grad.zero_()
+        lists.splats = copies
     # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``rows``
-    if mode != "generated":
-        inputs = [*lists, *inputs]
-        adjoint = {"adj_inputs": [None] * len(inputs), "adj_outputs": upstream}
-        launch(walk, tile_count, inputs, upstream, bounds=bins.slices, **adjoint)
-        return
-    tiles_x, ranges, instances, _splats, alpha_min = lists
-    copies, adj_copies = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
-    copies.assign(bins.splats.numpy()[bins.instances.numpy()])
-    adj_copies.zero_()
-    adjoint = {
-        "adj_inputs": [None, None, None, adj_copies, None, *(None for _ in inputs)],
-        "adj_outputs": upstream,
-    }
-    inputs = [tiles_x, ranges, instances, copies, alpha_min, *inputs]
-    launch(walk, tile_count, inputs, upstream, bounds=bins.slices, **adjoint)
-    launch(rows_of_copies, len(bins.instances), [copies, adj_copies], [rows])
+    adjoint = {"adj_inputs": [BinsView(), *[None] * len(inputs)], "adj_outputs": upstream}
+    walk = make_walk(mode, variant_of(options))
+    launch(walk, tile_count, [lists, *inputs], upstream, bounds=bins.slices, **adjoint)
+    if mode == "generated":
+        launch(rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [rows])
 
 
 def gather(bins: Bins, slots: torch.Tensor) -> list[torch.Tensor]:

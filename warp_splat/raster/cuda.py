@@ -11,6 +11,7 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
+from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
 from warp_splat.raster.data import WIDTHS, Bins, Pixels, limits_of, variant_of
 from warp_splat.runtime.launch import launch_blocks, view
@@ -29,8 +30,8 @@ def blend(
     launch_blocks(
         make_blend_block(variant_of(options, keep)),
         tile_count,
-        [*bins.views(options), *limits_of(options), _float(background)],
-        [*pixels.views(), _float(final), view(count, wp.int32), _float(kept)],
+        [bins.view(), options.alpha_min, *limits_of(options), _float(background)],
+        [pixels.view(), _float(final), view(count, wp.int32), _float(kept)],
         background.device,
     )
     return pixels, (final, count, kept)
@@ -45,14 +46,14 @@ def adjoint(
     (up, adj_final), adj_background, dropped, steps = spread_upstream(
         bins, options, background, final, count, adj_pixels, slots
     )
-    inputs = [*bins.views(options), _float(final), view(count, wp.int32)]
+    inputs = [bins.view(), options.alpha_min, _float(final), view(count, wp.int32)]
     upstream, steps, rows = [view(up, wp.vec4), _float(adj_final)], view(steps, wp.int32), _float(slots)
     if mode in ("manual", "stepwise"):
         kernel = make_reverse_block(mode, variant_of(options))
         launch_blocks(kernel, tile_count, [*inputs, steps, *upstream], [rows], device)
     else:
         walk, inputs = make_walk_block(mode, variant_of(options)), [*inputs, _float(kept), steps, rows]
-        adjoint = {"adj_inputs": [None] * len(inputs), "adj_outputs": upstream}
+        adjoint = {"adj_inputs": [BinsView(), *[None] * (len(inputs) - 1)], "adj_outputs": upstream}
         launch_blocks(walk, tile_count, inputs, upstream, device, **adjoint)
     return slots, adj_background.sum(0), dropped
 
@@ -69,14 +70,7 @@ def spread_upstream(bins: Bins, options: RasterOptions, background, final, count
     launch_blocks(
         make_upstream_block(variant_of(options)),
         tile_count,
-        [
-            bins.tiles_x,
-            view(bins.ranges, wp.vec2i),
-            _float(background),
-            _float(final),
-            view(count, wp.int32),
-            *adj_pixels.views(),
-        ],
+        [bins.view(), _float(background), _float(final), view(count, wp.int32), adj_pixels.view()],
         [*outputs, view(dropped, wp.int32), view(steps, wp.int32), _float(slots)],
         background.device,
     )

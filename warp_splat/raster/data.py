@@ -15,8 +15,8 @@ from warp_splat.camera import Camera
 from warp_splat.config import T_LEAST, RasterOptions
 from warp_splat.kernels.falloff import FalloffFunctions, make_falloff
 from warp_splat.kernels.splat import BlendVariant
-from warp_splat.kernels.structs import Splats2DView
-from warp_splat.runtime.launch import pack_struct, view
+from warp_splat.kernels.structs import BinsView, PixelsView, Splats2DView
+from warp_splat.runtime.launch import pack_struct
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
 WIDTHS = (2, 3, 1, 3, 1)  # columns of a slot: mean, conic, opacity, color, and depth where it is asked for
@@ -46,9 +46,7 @@ class Splats2D(NamedTuple):
 
     def view(self) -> Splats2DView:
         """As kernels take them."""
-        types = (wp.vec2, wp.vec3, wp.float32, wp.vec3, wp.float32, wp.vec2, wp.int32)
-        arrays = (view(tensor, dtype) for tensor, dtype in zip(self, types, strict=True))
-        return pack_struct(Splats2DView, **dict(zip(self._fields, arrays, strict=True)))
+        return pack_struct(Splats2DView, **self._asdict())
 
 
 @dataclass
@@ -66,10 +64,11 @@ class Bins:
     tiles_x: int
     invalid: int | torch.Tensor  # Gaussians left out because an input was not finite or a quaternion was zero
 
-    def views(self, options: RasterOptions) -> list:
+    def view(self) -> BinsView:
         """What every blend kernel reads first."""
-        ranges, instances = view(self.ranges, wp.vec2i), view(self.instances, wp.int32)
-        return [self.tiles_x, ranges, instances, self.splats, options.alpha_min]
+        return pack_struct(
+            BinsView, tiles_x=self.tiles_x, ranges=self.ranges, instances=self.instances, splats=self.splats
+        )
 
     def new_slots(self, options: RasterOptions) -> torch.Tensor:
         """Room for a row of gradients per tile instance, [M, 9 or 10]."""
@@ -97,9 +96,9 @@ class Pixels(NamedTuple):
         height, width, new = camera.height, camera.width, like.new_empty
         return cls(new(height, width, 3), new(height, width), new(height, width) if options.depth else new(0, 0))
 
-    def views(self) -> list:
+    def view(self) -> PixelsView:
         """As kernels take them."""
-        return [view(tensor, wp.float32) for tensor in self]
+        return pack_struct(PixelsView, **self._asdict())
 
 
 @dataclass

@@ -19,7 +19,7 @@ from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import UNSEEN, make_project
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES
-from warp_splat.kernels.structs import HarmonicsView, mat53, mat73
+from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import (
@@ -133,12 +133,11 @@ def _project_groups(kernel, cam, lanes, inputs, outputs, adj_inputs, adj_outputs
 
 def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
     """The coefficients as kernels take them; an empty array for each degree that there is not."""
-    degrees = (("degree1", wp.mat33, 0, 3), ("degree2", mat53, 3, 8), ("degree3", mat73, 8, 15))
-    arrays = {
-        name: view(sh_rest[:, low:high] if sh_rest.shape[1] >= high else sh_rest.new_empty(0, high - low, 3), dtype)
-        for name, dtype, low, high in degrees
-    }
-    return pack_struct(HarmonicsView, dc=view(sh_dc[:, 0], wp.vec3), **arrays)
+    degrees = (
+        sh_rest[:, low:high] if sh_rest.shape[1] >= high else sh_rest.new_empty(0, high - low, 3)
+        for low, high in ((0, 3), (3, 8), (8, 15))
+    )
+    return pack_struct(HarmonicsView, **dict(zip(HarmonicsView.vars, (sh_dc[:, 0], *degrees), strict=True)))
 
 
 def _launch_groups(kernel: wp.Kernel, lanes: int, count: int, inputs, outputs, device, **adjoint) -> None:

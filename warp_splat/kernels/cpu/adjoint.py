@@ -14,6 +14,7 @@ from warp_splat.kernels.simd import LANES, times, vec16
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
+from warp_splat.kernels.structs import BinsView
 
 vec5 = wp.types.vector(length=5, dtype=float)
 vec8 = wp.types.vector(length=8, dtype=float)
@@ -158,23 +159,20 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
     def adj_blend(
         first: int,
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],
-        instances: wp.array[int],
-        splats: wp.array[Splat2D],
+        bins: BinsView,
         alpha_min: float,
-        final: wp.array2d[vec16],
-        count: wp.array2d[vec16],
-        steps: wp.array[int],
-        up: wp.array2d[vec16],
-        adj_final: wp.array2d[vec16],
+        final: wp.array2d[vec16],  # [T, BLOCKS]
+        count: wp.array2d[vec16],  # [T, BLOCKS]
+        steps: wp.array[int],  # [T]
+        up: wp.array2d[vec16],  # [T, BLOCKS CHANNELS]
+        adj_final: wp.array2d[vec16],  # [T, BLOCKS]
         # out
         slots_out: wp.array2d[float],  # [M, GRADS]
     ):
         tile = first + wp.tid()
-        start = ranges[tile][0]
-        x0 = float((tile % tiles_x) * TILE) + 0.5
-        y0 = float((tile // tiles_x) * TILE) + 0.5
+        start = bins.ranges[tile][0]
+        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
+        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
         room = mat_room()
         # rows of lanes: T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
@@ -197,7 +195,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
             ahead = back & (AHEAD - 1)
             if ahead == 0:
                 for j in range(wp.min(AHEAD, steps[tile] - back)):
-                    near[j] = splats[instances[k - j]]
+                    near[j] = bins.splats[bins.instances[k - j]]
                 for j in range(wp.min(AHEAD, steps[tile] - back)):
                     boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
             splat = near[ahead]

@@ -37,6 +37,7 @@ from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
+from warp_splat.kernels.structs import BinsView, PixelsView
 
 BLOCKS = TILE * TILE // LANES  # per tile
 AHEAD = 32  # instances that are copied, and their boxes found, together; then, whether the whole tile has stopped
@@ -90,26 +91,21 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
     def blend(
         first: int,  # tile of this slice
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
-        instances: wp.array[int],  # [M] splats, by tile, front to back
-        splats: wp.array[Splat2D],  # [V]
+        bins: BinsView,
         alpha_min: float,
         t_min: float,
         max_steps: int,
         background: wp.array[float],  # [3]
         # out
-        image_out: wp.array3d[float],  # [H, W, 3]
-        alpha_out: wp.array2d[float],  # [H, W]
-        depth_out: wp.array2d[float],  # [H, W] sum of w z
+        pixels_out: PixelsView,
         final_out: wp.array2d[vec16],  # [T, BLOCKS] transmittance behind the last Gaussian
         count_out: wp.array2d[vec16],  # [T, BLOCKS] where the adjoint starts: instances walked before the pixel stopped
         kept_out: wp.array2d[vec16],  # [M, BLOCKS] transmittance in front of each Gaussian
     ):
         tile = first + wp.tid()
-        span = ranges[tile]
-        column = (tile % tiles_x) * TILE
-        line = (tile // tiles_x) * TILE
+        span = bins.ranges[tile]
+        column = (tile % bins.tiles_x) * TILE
+        line = (tile // bins.tiles_x) * TILE
         x0 = float(column) + 0.5
         y0 = float(line) + 0.5
         room = mat_room()
@@ -126,7 +122,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             ahead = (k - span[0]) & (AHEAD - 1)
             if ahead == 0:
                 for j in range(wp.min(AHEAD, end - k)):  # alone, many reads are under way at a time
-                    near[j] = splats[instances[k + j]]
+                    near[j] = bins.splats[bins.instances[k + j]]
                 for j in range(wp.min(AHEAD, end - k)):
                     boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
             splat = near[ahead]
@@ -170,14 +166,14 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             for lane in range(LANES):
                 x = left + lane % 4
                 y = top + lane // 4
-                if y < image_out.shape[0] and x < image_out.shape[1]:
+                if y < pixels_out.image.shape[0] and x < pixels_out.image.shape[1]:
                     final = s[T + block][lane]
                     for channel in range(3):
                         light = s[RGB + channel * BLOCKS + block][lane] + final * background[channel]
-                        image_out[y, x, channel] = light
-                    alpha_out[y, x] = 1.0 - final
+                        pixels_out.image[y, x, channel] = light
+                    pixels_out.alpha[y, x] = 1.0 - final
                     if wp.static(CHANNELS > 3):
-                        depth_out[y, x] = s[DEPTH + block][lane]
+                        pixels_out.depth[y, x] = s[DEPTH + block][lane]
             block += 1
 
     return blend
@@ -194,14 +190,11 @@ def make_upstream(variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def upstream(
         first: int,
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],  # [T]
+        bins: BinsView,
         background: wp.array[float],  # [3]
         final: wp.array2d[vec16],  # [T, BLOCKS]
         count: wp.array2d[vec16],  # [T, BLOCKS]
-        adj_image: wp.array3d[float],  # [H, W, 3]
-        adj_alpha: wp.array2d[float],  # [H, W]
-        adj_depth: wp.array2d[float],  # [H, W]
+        adj_pixels: PixelsView,
         # out
         up_out: wp.array2d[vec16],  # [T, BLOCKS CHANNELS] dL/d(sum of w color, and of w z)
         adj_final_out: wp.array2d[vec16],  # [T, BLOCKS] dL/d(final), through alpha and background
@@ -211,13 +204,13 @@ def make_upstream(variant: BlendVariant) -> wp.Kernel:
         slots_out: wp.array[vec_grads],  # [M] zeros for those that it does not
     ):
         tile = first + wp.tid()
-        column = (tile % tiles_x) * TILE
-        line = (tile // tiles_x) * TILE
+        column = (tile % bins.tiles_x) * TILE
+        line = (tile // bins.tiles_x) * TILE
         zero = vec16(0.0)
         adj_background = mat_background()
         dropped = zero
-        height = adj_image.shape[0]
-        width = adj_image.shape[1]
+        height = adj_pixels.image.shape[0]
+        width = adj_pixels.image.shape[1]
         block = int(0)
         while block < BLOCKS:
             left = column + 4 * (block & 3)
@@ -227,10 +220,10 @@ def make_upstream(variant: BlendVariant) -> wp.Kernel:
                 y = wp.min(top + lane // 4, height - 1)
                 x = wp.min(left + lane % 4, width - 1)
                 for channel in range(3):
-                    u[channel, lane] = adj_image[y, x, channel]
-                u[CHANNELS, lane] = adj_alpha[y, x]
+                    u[channel, lane] = adj_pixels.image[y, x, channel]
+                u[CHANNELS, lane] = adj_pixels.alpha[y, x]
                 if wp.static(CHANNELS > 3):
-                    u[3, lane] = adj_depth[y, x]
+                    u[3, lane] = adj_pixels.depth[y, x]
             inside = where_less(LANE_X, vec16(float(width - left)), vec16(1.0), zero)
             inside = where_less(LANE_Y, vec16(float(height - top)), inside, zero)
             finite = inside
@@ -254,7 +247,7 @@ def make_upstream(variant: BlendVariant) -> wp.Kernel:
             adj_background_out[tile, channel] = total(adj_background[channel])
         dropped_out[tile] = int(total(dropped))
         steps_out[tile] = int(longest)
-        for k in range(ranges[tile][0] + int(longest), ranges[tile][1]):
+        for k in range(bins.ranges[tile][0] + int(longest), bins.ranges[tile][1]):
             slots_out[k] = vec_grads(0.0)
 
     return upstream

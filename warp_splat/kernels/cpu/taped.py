@@ -28,6 +28,7 @@ from warp_splat.kernels.simd import LANE_X, LANE_Y, times, total, vec16, where_l
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
 from warp_splat.kernels.step import conic_from_root, opaque
+from warp_splat.kernels.structs import BinsView
 
 
 @wp.func
@@ -153,24 +154,21 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
     def walk(
         first: int,
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],
-        instances: wp.array[int],
-        splats: wp.array[Splat2D],  # [V]; a copy per instance for ``generated``, [M]
+        bins: BinsView,  # splats: a copy per instance for ``generated``, [M]
         alpha_min: float,
-        final: wp.array2d[vec16],
-        count: wp.array2d[vec16],
-        kept: wp.array2d[vec16],
-        steps: wp.array[int],
+        final: wp.array2d[vec16],  # [T, BLOCKS]
+        count: wp.array2d[vec16],  # [T, BLOCKS]
+        kept: wp.array2d[vec16],  # [M, BLOCKS], or nothing
+        steps: wp.array[int],  # [T]
         slots: wp.array2d[float],  # [M, GRADS], written by the adjoint
         # out
         color_out: wp.array2d[vec16],  # [T, STATE]
         final_out: wp.array2d[vec16],  # [T, BLOCKS]
     ):
         tile = first + wp.tid()
-        start = ranges[tile][0]
-        x0 = float((tile % tiles_x) * TILE) + 0.5
-        y0 = float((tile // tiles_x) * TILE) + 0.5
+        start = bins.ranges[tile][0]
+        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
+        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
         t = wp.zeros(shape=(BLOCKS,), dtype=vec16)
         c = wp.zeros(shape=(STATE,), dtype=vec16)
         m = wp.zeros(shape=(GRADS,), dtype=vec16)
@@ -181,9 +179,9 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
             begin(t, final, tile)
         for k in range(start, start + steps[tile]):
             if wp.static(mode == "generated"):
-                splat = splats[k]
+                splat = bins.splats[k]
             else:
-                splat = splats[instances[k]]
+                splat = bins.splats[bins.instances[k]]
                 collect(m, splat.root, slots, k)
             box = reach(splat.mean, splat.extent, x0, y0)
             here = vec16(float(k - start))

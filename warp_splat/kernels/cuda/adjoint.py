@@ -12,13 +12,14 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
-from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
+from warp_splat.kernels.splat import BlendVariant, exponent
 from warp_splat.kernels.step import (
     conic_from_root,
     geometry_from_moments,
     make_manual,
     make_stepwise,
 )
+from warp_splat.kernels.structs import BinsView, PixelsView
 
 
 @wp.func
@@ -56,14 +57,11 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def upstream(
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],  # [T]
+        bins: BinsView,
         background: wp.array[float],  # [3]
         final: wp.array2d[float],  # [T, THREADS]
         count: wp.array2d[int],  # [T, THREADS]
-        adj_image: wp.array3d[float],  # [H, W, 3]
-        adj_alpha: wp.array2d[float],  # [H, W]
-        adj_depth: wp.array2d[float],  # [H, W]
+        adj_pixels: PixelsView,
         # out
         up_out: wp.array2d[wp.vec4],  # [T, THREADS] dL/d(sum of w color, and of w z)
         adj_final_out: wp.array2d[float],  # [T, THREADS] dL/d(final), through alpha and background
@@ -73,20 +71,22 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
         slots_out: wp.array2d[float],  # [M, GRADS] zeros for those that it does not
     ):
         tile, thread = wp.tid()
-        column = (tile % tiles_x) * TILE + thread % TILE
-        line = (tile // tiles_x) * TILE + thread // TILE
+        column = (tile % bins.tiles_x) * TILE + thread % TILE
+        line = (tile // bins.tiles_x) * TILE + thread // TILE
         up = wp.vec4(0.0)
         adj_t = float(0.0)
         lit = wp.vec3(0.0)  # of the background
         dropped = int(0)
-        if line < adj_image.shape[0] and column < adj_image.shape[1]:
-            u = wp.vec4(adj_image[line, column, 0], adj_image[line, column, 1], adj_image[line, column, 2], 0.0)
+        image = adj_pixels.image
+        if line < image.shape[0] and column < image.shape[1]:
+            u = wp.vec4(image[line, column, 0], image[line, column, 1], image[line, column, 2], 0.0)
+            adj_alpha = adj_pixels.alpha[line, column]
             if wp.static(CHANNELS > 3):
-                u[3] = adj_depth[line, column]
-            if wp.isfinite(u) and wp.isfinite(adj_alpha[line, column]):
+                u[3] = adj_pixels.depth[line, column]
+            if wp.isfinite(u) and wp.isfinite(adj_alpha):
                 up = u
                 color = wp.vec3(u[0], u[1], u[2])
-                adj_t = wp.dot(color, wp.vec3(background[0], background[1], background[2])) - adj_alpha[line, column]
+                adj_t = wp.dot(color, wp.vec3(background[0], background[1], background[2])) - adj_alpha
                 lit = color * final[tile, thread]
             else:
                 dropped = 1
@@ -101,10 +101,10 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
                 adj_background_out[tile, channel] = sums[channel]
             dropped_out[tile] = bad
             steps_out[tile] = steps
-        first = ranges[tile][0] + steps
-        for batch in range((ranges[tile][1] - first + THREADS - 1) // THREADS):
+        first = bins.ranges[tile][0] + steps
+        for batch in range((bins.ranges[tile][1] - first + THREADS - 1) // THREADS):
             k = first + batch * THREADS + thread
-            if k < ranges[tile][1]:
+            if k < bins.ranges[tile][1]:
                 for grad in range(slots_out.shape[1]):
                     slots_out[k, grad] = 0.0
 
@@ -126,23 +126,20 @@ def make_reverse_block(mode: str, variant: BlendVariant, write: wp.Function = pu
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def adj_blend(
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],
-        instances: wp.array[int],
-        splats: wp.array[Splat2D],
+        bins: BinsView,
         alpha_min: float,
-        final: wp.array2d[float],
-        count: wp.array2d[int],
-        steps: wp.array[int],
-        up: wp.array2d[wp.vec4],
-        adj_final: wp.array2d[float],
+        final: wp.array2d[float],  # [T, THREADS]
+        count: wp.array2d[int],  # [T, THREADS]
+        steps: wp.array[int],  # [T]
+        up: wp.array2d[wp.vec4],  # [T, THREADS]
+        adj_final: wp.array2d[float],  # [T, THREADS]
         # out
         slots_out: wp.array2d[float],  # [M, GRADS]
     ):
         tile, thread = wp.tid()
-        x = float((tile % tiles_x) * TILE + thread % TILE) + 0.5
-        y = float((tile // tiles_x) * TILE + thread // TILE) + 0.5
-        start = ranges[tile][0]
+        x = float((tile % bins.tiles_x) * TILE + thread % TILE) + 0.5
+        y = float((tile // bins.tiles_x) * TILE + thread // TILE) + 0.5
+        start = bins.ranges[tile][0]
         u = up[tile, thread]
         t = final[tile, thread]
         walked = float(count[tile, thread])
@@ -153,7 +150,7 @@ def make_reverse_block(mode: str, variant: BlendVariant, write: wp.Function = pu
             last = steps[tile] - 1 - batch * THREADS
             mine = vec10(0.0)
             if last - thread >= 0:
-                mine = staged_of(splats[instances[start + last - thread]])
+                mine = staged_of(bins.splats[bins.instances[start + last - thread]])
             staged = wp.tile(mine, preserve_type=True)
             for j in range(wp.min(THREADS, last + 1)):
                 g = staged[j]
@@ -195,6 +192,6 @@ def make_reverse_block(mode: str, variant: BlendVariant, write: wp.Function = pu
                         row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
                     k = start + last - j
                     for grad in range(GRADS):
-                        write(slots_out, k, instances[k], grad, row[grad])
+                        write(slots_out, k, bins.instances[k], grad, row[grad])
 
     return adj_blend

@@ -12,6 +12,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
+from warp_splat.kernels.structs import BinsView, PixelsView
 
 THREADS = wp.constant(TILE * TILE)  # per block
 vec10 = wp.types.vector(length=10, dtype=float)
@@ -36,30 +37,25 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def blend(
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],  # [T] first and last instance of a tile
-        instances: wp.array[int],  # [M] splats, by tile, front to back
-        splats: wp.array[Splat2D],  # [V]
+        bins: BinsView,
         alpha_min: float,
         t_min: float,
         max_steps: int,
         background: wp.array[float],  # [3]
         # out
-        image_out: wp.array3d[float],  # [H, W, 3]
-        alpha_out: wp.array2d[float],  # [H, W]
-        depth_out: wp.array2d[float],  # [H, W] sum of w z
+        pixels_out: PixelsView,
         final_out: wp.array2d[float],  # [T, THREADS] transmittance behind the last Gaussian
         count_out: wp.array2d[int],  # [T, THREADS] where the adjoint starts: instances walked before the pixel stopped
         kept_out: wp.array2d[float],  # [M, THREADS] transmittance in front of each Gaussian
     ):
         tile, thread = wp.tid()
-        column = (tile % tiles_x) * TILE + thread % TILE
-        line = (tile // tiles_x) * TILE + thread // TILE
+        column = (tile % bins.tiles_x) * TILE + thread % TILE
+        line = (tile // bins.tiles_x) * TILE + thread // TILE
         x = float(column) + 0.5
         y = float(line) + 0.5
-        start = ranges[tile][0]
-        length = wp.min(ranges[tile][1] - start, max_steps)
-        inside = line < image_out.shape[0] and column < image_out.shape[1]
+        start = bins.ranges[tile][0]
+        length = wp.min(bins.ranges[tile][1] - start, max_steps)
+        inside = line < pixels_out.image.shape[0] and column < pixels_out.image.shape[1]
         t = float(1.0)
         if not inside:
             t = -1.0  # stopped from the beginning
@@ -70,7 +66,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             first = batch * THREADS
             mine = vec10(0.0)
             if first + thread < length:
-                mine = staged_of(splats[instances[start + first + thread]])
+                mine = staged_of(bins.splats[bins.instances[start + first + thread]])
             staged = wp.tile(mine, preserve_type=True)
             for j in range(wp.min(THREADS, length - first)):
                 g = staged[j]
@@ -93,9 +89,9 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         count_out[tile, thread] = count
         if inside:
             for channel in range(3):
-                image_out[line, column, channel] = color[channel] + t * background[channel]
-            alpha_out[line, column] = 1.0 - t
+                pixels_out.image[line, column, channel] = color[channel] + t * background[channel]
+            pixels_out.alpha[line, column] = 1.0 - t
             if wp.static(CHANNELS > 3):
-                depth_out[line, column] = far
+                pixels_out.depth[line, column] = far
 
     return blend

@@ -16,6 +16,7 @@ from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent, odds_of
 from warp_splat.kernels.step import opaque
+from warp_splat.kernels.structs import BinsView
 
 
 @wp.func
@@ -112,29 +113,26 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
 
     @wp.kernel(module="unique", module_options={**BLOCK_OPTIONS, "enable_backward": True})
     def walk(
-        tiles_x: int,
-        ranges: wp.array[wp.vec2i],
-        instances: wp.array[int],
-        splats: wp.array[Splat2D],
+        bins: BinsView,
         alpha_min: float,
-        final: wp.array2d[float],
-        count: wp.array2d[int],
-        kept: wp.array2d[float],
-        steps: wp.array[int],
+        final: wp.array2d[float],  # [T, THREADS]
+        count: wp.array2d[int],  # [T, THREADS]
+        kept: wp.array2d[float],  # [M, THREADS], or nothing
+        steps: wp.array[int],  # [T]
         slots: wp.array2d[float],  # [M, GRADS], written by the adjoint
         # out
         color_out: wp.array2d[wp.vec4],  # [T, THREADS]
         final_out: wp.array2d[float],  # [T, THREADS]
     ):
         tile, thread = wp.tid()
-        start = ranges[tile][0]
-        x = float((tile % tiles_x) * TILE + thread % TILE) + 0.5
-        y = float((tile // tiles_x) * TILE + thread // TILE) + 0.5
+        start = bins.ranges[tile][0]
+        x = float((tile % bins.tiles_x) * TILE + thread % TILE) + 0.5
+        y = float((tile // bins.tiles_x) * TILE + thread // TILE) + 0.5
         walked = float(count[tile, thread])
         t = begin(final[tile, thread])
         color = wp.vec4(0.0)
         for k in range(start, start + steps[tile]):
-            g = read(splats[instances[k]], slots, k, thread)
+            g = read(bins.splats[bins.instances[k]], slots, k, thread)
             z = exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY])
             raw = fall_known(z, fall_value(z)) * g[OPACITY]
             alpha = opaque(raw, alpha_min, float(k - start), walked)
