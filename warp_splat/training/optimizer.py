@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from decimal import Decimal
 
@@ -48,8 +49,26 @@ def move(tables: list[list[torch.Tensor]], numbers: list, rows: int, radii: torc
     launch(kernel, groups, inputs, [view(addresses, wp.uint64)], bounds=bounds, device=device)
 
 
+class Tables:
+    """Groups of parameters and their moments, by the names of torch's Adam, which loads torch's compiler: 5 s.
+
+    Args:
+        groups: each with ``name`` and ``params``, a list of one leaf.
+        settings: of all groups: ``lr``, ``betas``, ``eps``.
+    """
+
+    def __init__(self, groups: Sequence[dict], **settings):
+        self.param_groups = [settings | group for group in groups]
+        self.state: defaultdict[torch.Tensor, dict] = defaultdict(dict)
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for group in self.param_groups:
+            group["params"][0].grad = None
+
+
 class Optimizer:
-    """Adam with one group per parameter, or its sparse variant, whose moments torch's optimizer keeps.
+    """Adam with one group per parameter, or its sparse variant.
 
     Args:
         model: whose parameters are updated in place.
@@ -71,7 +90,7 @@ class Optimizer:
         self._part_rates = {group["name"]: group["lr"] for group in parts}
         groups = [{"name": name, "params": [leaf]} for name, leaf in model.parameters.items()]
         betas = (BETAS[0] ** batch, BETAS[1] ** batch)
-        self.adam = torch.optim.Adam([*groups, *parts], lr=0.0, betas=betas, eps=EPS / self.scale)
+        self.adam = Tables([*groups, *parts], lr=0.0, betas=betas, eps=EPS / self.scale)
         self._groups = {group["name"]: group for group in self.adam.param_groups}
         self.set_iteration(0)
 
@@ -109,7 +128,7 @@ class Optimizer:
             self._step(gaussians, len(radii), radii if sparse else None)
         for group in parts:
             self._step([group], group["params"][0].numel(), None)
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
 
     def load(self) -> None:
         """Compile and load the kernel."""

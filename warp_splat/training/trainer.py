@@ -167,7 +167,7 @@ class Trainer:
         view = self.scene.train[0]
         out = self._render(view.camera.resized(TILE, TILE), self.background, self._asked(Step(0, view)))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
-        self.optimizer.adam.zero_grad(set_to_none=True)
+        self.optimizer.adam.zero_grad()
         self.optimizer.load()
         load(quarantine, self.device)  # launched only where a gradient is not finite
 
