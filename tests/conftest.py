@@ -1,6 +1,7 @@
 """Fixtures that several test modules share."""
 
 import functools
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -11,9 +12,21 @@ import warp as wp
 from fake_viser import FakeServer
 from filelock import FileLock
 
+from warp_splat.config import RasterOptions
+from warp_splat.kernels import ssim
+from warp_splat.kernels.cpu.adjoint import make_reverse
+from warp_splat.kernels.cpu.blend import make_blend
+from warp_splat.kernels.project.shared import make_project
+from warp_splat.kernels.sh_colors import make_adj_shade
+from warp_splat.kernels.simd import LANES
+from warp_splat.raster.data import falloff_of, variant_of
+from warp_splat.raster.project import projection_of
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
+# Tests start dozens of processes: what one has compiled of torch serves the next.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 torch.set_num_threads(1)  # idle threads of torch would spin beside the kernels'
 
 
@@ -29,6 +42,21 @@ def compiled_by_one(compile_module):
 
 
 wp.Module._compile = compiled_by_one(wp.Module._compile)
+
+
+def pytest_sessionstart():
+    """Two workers begin at either end of what takes long to compile, instead of one that waits for the other."""
+    if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+        options, variant = RasterOptions(), variant_of(RasterOptions())
+        projections = [
+            make_project(projection_of(RasterOptions(projection=name)), falloff_of(options).reach_of, LANES)
+            for name in ("affine", "ellipsoid")
+        ]
+        blends = [make_blend(variant), make_adj_shade(LANES), make_reverse("manual", variant)]
+        modules = [kernel.module for kernel in (projections[0], *blends)] + [wp.get_module(ssim.__name__)]
+        modules += [projections[1].module]
+        for module in modules if worker == "gw0" else modules[::-1]:
+            module.load(wp.get_device("cpu"), 1)  # as every launch of theirs
 
 
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])

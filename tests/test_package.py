@@ -71,6 +71,7 @@ def image(count=3000):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_child_renders_too():
+    image()  # other workers wait for kernels that this process compiles, and would compile those of another again
     code = (
         "import os, sys; sys.path.insert(0, 'tests'); import warp_splat; warp_splat.set_threads(2)\n"
         "from test_package import image\n"
