@@ -1,5 +1,7 @@
 """A command of ours that serves a viewer, and how it ends."""
 
+import io
+import os
 import re
 import signal
 import subprocess
@@ -8,6 +10,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 PATIENCE = 300.0  # seconds; a machine may be busy
+
+
+class CtrlC(io.StringIO):
+    """The standard output of a command in this process, which presses Ctrl-C where a text begins with ``line``."""
+
+    def __init__(self, line):
+        super().__init__()
+        self.line, self.heeded = line, []
+
+    def write(self, text):
+        if text.startswith(self.line):
+            self.heeded.append(signal.getsignal(signal.SIGINT) is not signal.SIG_IGN)
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().write(text)
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """A training that is watched, by browsers whose place is taken by a fake."""
 
-import io
-import os
 import signal
 import sys
 import time
@@ -9,6 +7,7 @@ import time
 import pytest
 from fake_viser import PHOTO, FakeClient, FakeServer, at_rest, some_scene
 from scene_files import write_colmap
+from serving import CtrlC
 
 from warp_splat.cli import main
 from warp_splat.training.live import TrainingViewer
@@ -185,19 +184,11 @@ def test_a_training_is_watched_to_its_end(fake_viser, monkeypatch, tmp_path, cap
 @pytest.mark.parametrize(("line", "code"), [("Viewer at", 130), ("The viewer stays at", 0)])
 def test_who_reads_the_line_may_press_ctrl_c(line, code, fake_viser, monkeypatch, tmp_path, capsys):
     """While it is printed, Ctrl-C is heeded already, even if the shell has the process ignore it."""
-    heeded = []
-
-    class Output(io.StringIO):
-        def write(self, text):
-            if text.startswith(line):
-                heeded.append(signal.getsignal(signal.SIGINT) is not signal.SIG_IGN)
-                os.kill(os.getpid(), signal.SIGINT)
-            return super().write(text)
-
-    monkeypatch.setattr(sys, "stdout", Output())
+    output = CtrlC(line)
+    monkeypatch.setattr(sys, "stdout", output)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         assert main(visited(monkeypatch, tmp_path)) == code
     finally:
         signal.signal(signal.SIGINT, before)
-    assert heeded == [True] and Visited.last.waits < 2
+    assert output.heeded == [True] and Visited.last.waits < 2
