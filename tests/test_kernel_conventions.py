@@ -8,12 +8,6 @@ import pytest
 KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
 MOST_PARAMETERS, MOST_LINES = 12, 100
 
-#: Kernels with more parameters, and why: a struct of arrays would be packed at every launch.
-MANY_PARAMETERS = {
-    "compare": "image and target are given as numbers and as lanes, the target as bytes or floats",
-    "adj_compare": "as compare",
-}
-
 
 def is_kernel(node):
     """Whether a function is decorated as one: by ``wp.kernel`` or by what assembles kernels."""
@@ -100,10 +94,5 @@ def test_arrays_of_structs_say_their_shape():
 
 @pytest.mark.parametrize(("lines", "kernel"), find_kernels())
 def test_size(lines, kernel):
-    assert len(kernel.args.args) <= MOST_PARAMETERS or kernel.name in MANY_PARAMETERS
+    assert len(kernel.args.args) <= MOST_PARAMETERS, "put what belongs together into a struct (kernels/structs.py)"
     assert kernel.end_lineno - kernel.lineno < MOST_LINES
-
-
-def test_exceptions_are_needed():
-    kernels = [param.values[1] for param in find_kernels()]
-    assert set(MANY_PARAMETERS) == {kernel.name for kernel in kernels if len(kernel.args.args) > MOST_PARAMETERS}

@@ -89,6 +89,20 @@ def neighbors(rows: wp.array2d[wp.uint8], taps: wp.array2d[vec16b], row: int, st
     return over(values, vec16(255.0))
 
 
+@wp.struct
+class Pictures:
+    """What is compared, each as numbers and as taps: element p holds numbers p .. p + 15 of a row."""
+
+    image: wp.array2d[float]  # [H, L]
+    image_taps: wp.array2d[vec16]  # [H, L - 15]
+    limits: wp.vec2
+    target: wp.array2d[float]  # [H, L], or nothing
+    target_taps: wp.array2d[vec16]  # [H, L - 15], or nothing
+    levels: wp.array2d[wp.uint8]  # [H, L] the target times 255, or nothing
+    level_taps: wp.array2d[vec16b]  # [H, L - 15], or nothing
+    centers: wp.vec2  # p, q
+
+
 @wp.func
 def photograph(
     target: wp.array2d[float],
@@ -252,14 +266,7 @@ def compare_row(
 def compare(
     first: int,  # band of this slice
     bounds: wp.array[int],  # [B + 1] rows where bands begin
-    image: wp.array2d[float],  # [H, L]
-    image_taps: wp.array2d[vec16],  # [H, L - 15] the same: element p holds floats p .. p + 15 of a row
-    limits: wp.vec2,
-    target: wp.array2d[float],  # [H, L], or nothing
-    target_taps: wp.array2d[vec16],  # [H, L - 15], or nothing
-    levels: wp.array2d[wp.uint8],  # [H, L], to be divided by 255, or nothing
-    level_taps: wp.array2d[vec16b],  # [H, L - 15], or nothing
-    centers: wp.vec2,  # p, q
+    pictures: Pictures,
     missing: wp.array[vec16],  # [G] share of the window beyond the ends of a row
     # out
     padded_out: wp.array3d[vec16],  # [B, 2, G + 2] a row of the image within the limits minus p, and of the target
@@ -269,9 +276,18 @@ def compare(
     slopes_out: wp.array3d[vec16],  # [H, SLOPES, G + 2] 0 outside the image
 ):
     band = first + wp.tid()
+    # in front of the loop: read in it, the loss takes a third longer
+    image = pictures.image
+    image_taps = pictures.image_taps
+    limits = pictures.limits
+    target = pictures.target
+    target_taps = pictures.target_taps
+    levels = pictures.levels
+    level_taps = pictures.level_taps
     height = image.shape[0]
     length = image.shape[1]
     groups = missing.shape[0]
+    centers = pictures.centers
     p = centers[0]
     q = centers[1]
     zero = vec16(0.0)
@@ -311,14 +327,7 @@ def compare(
 def adj_compare(
     first: int,
     bounds: wp.array[int],  # [B + 1]
-    image: wp.array2d[float],  # [H, L]
-    image_taps: wp.array2d[vec16],  # [H, L - 15]
-    limits: wp.vec2,
-    target: wp.array2d[float],  # [H, L], or nothing
-    target_taps: wp.array2d[vec16],  # [H, L - 15], or nothing
-    levels: wp.array2d[wp.uint8],  # [H, L], or nothing
-    level_taps: wp.array2d[vec16b],  # [H, L - 15], or nothing
-    centers: wp.vec2,
+    pictures: Pictures,
     slopes: wp.array3d[vec16],  # [H, SLOPES, G + 2]
     adj_l1: float,  # dL / d(sum of |x - y|)
     adj_ssim: float,  # dL / d(sum of SSIM)
@@ -329,9 +338,19 @@ def adj_compare(
     adj_taps_out: wp.array2d[vec16],  # [H, L - 15]
 ):
     band = first + wp.tid()
+    # in front of the loop: read in it, the loss takes a third longer
+    image = pictures.image
+    image_taps = pictures.image_taps
+    limits = pictures.limits
+    target = pictures.target
+    target_taps = pictures.target_taps
+    levels = pictures.levels
+    level_taps = pictures.level_taps
     height = image.shape[0]
     length = image.shape[1]
     groups = slopes.shape[2] - 2
+    p = pictures.centers[0]
+    q = pictures.centers[1]
     zero = vec16(0.0)
     ring = ring_out[band]
     blurred = blurred_out[band]
@@ -350,9 +369,9 @@ def adj_compare(
             for group in range(groups):
                 start = LANES * group
                 given = neighbors(image, image_taps, row, start)
-                a = between(given, limits) - vec16(centers[0])
-                b = photograph(target, target_taps, levels, level_taps, row, start) - vec16(centers[1])
-                delta = a - b + vec16(centers[0] - centers[1])
+                a = between(given, limits) - vec16(p)
+                b = photograph(target, target_taps, levels, level_taps, row, start) - vec16(q)
+                delta = a - b + vec16(p - q)
                 sign = where_less(zero, delta, vec16(1.0), where_less(delta, zero, vec16(-1.0), zero))
                 adj = blurred[which, group, 0] + times(a, blurred[which, group, 1]) * 2.0
                 adj = sign * adj_l1 + (adj + times(b, blurred[which, group, 2])) * adj_ssim

@@ -16,7 +16,7 @@ from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.raster.drivers import DRIVERS, driver_of
-from warp_splat.runtime.launch import even_slices, launch, stage, view
+from warp_splat.runtime.launch import even_slices, launch, pack_struct, stage, view
 
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
 FAR_APART = 10.0  # in units of an image's usual range
@@ -164,8 +164,7 @@ class ImageLoss(torch.autograd.Function):
                 bands,
                 [
                     view(bounds, wp.int32),
-                    *_pictures(image, limits, target),
-                    wp.vec2(*centers),
+                    _pictures(image, limits, target, centers),
                     view(_missing(groups, length), vec16),
                 ],
                 [
@@ -194,8 +193,10 @@ class ImageLoss(torch.autograd.Function):
                 ssim.adj_compare,
                 bands,
                 [
-                    *(view(bounds, wp.int32), *_pictures(image, ctx.limits, target)),
-                    *(wp.vec2(*ctx.centers), view(slopes, vec16), *weights),
+                    view(bounds, wp.int32),
+                    _pictures(image, ctx.limits, target, ctx.centers),
+                    view(slopes, vec16),
+                    *weights,
                 ],
                 [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)],
                 bounds=list(range(bands + 1)),
@@ -217,14 +218,14 @@ def _bands(height: int) -> tuple[torch.Tensor, int]:
     return torch.tensor(bounds, dtype=torch.int32, device="cpu"), len(bounds) - 1
 
 
-def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor) -> list:
-    """What both kernels read of [H, L]: the image and its limits; the target as floats, and as bytes: one of them."""
+def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor, centers) -> ssim.Pictures:
+    """What both kernels read of [H, L]: the target as floats or as bytes, the other is empty."""
     types = (torch.float32, torch.uint8)
     floats, levels = (target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype) for dtype in types)
-    return [
-        *(view(image, wp.float32), _taps(image), wp.vec2(*limits)),
-        *(view(floats, wp.float32), _taps(floats), view(levels, wp.uint8), _taps(levels, ssim.vec16b)),
-    ]
+    return pack_struct(
+        ssim.Pictures, image=image, image_taps=_taps(image), limits=wp.vec2(*limits), centers=wp.vec2(*centers),
+        target=floats, target_taps=_taps(floats), levels=levels, level_taps=_taps(levels, ssim.vec16b),
+    )  # fmt: skip
 
 
 def _centers(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
