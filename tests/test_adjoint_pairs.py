@@ -31,8 +31,8 @@ CONSTANT = {
 #: Derivatives that are right only together, in the loop that Warp replays, and adjoints of whole steps: against
 #: differences of the image in test_gradcheck, in every mode.
 OF_A_LOOP = {"front_of", "front_of_kept", "behind_of", "spread", "collect", "read", "step", "geometry"}
-#: In tests of their own, below.
-ALONE = {"alpha_of", "alpha_blend"}
+#: In tests of their own, below; the activations' in test_threads.
+ALONE = {"alpha_of", "alpha_blend", "exp", "logistic"}
 LOW, HIGH = 0.3, 2.0  # of the numbers that pieces are tried with
 
 

@@ -68,7 +68,7 @@ class Camera:
     @property
     def center(self) -> np.ndarray:
         """Camera center in world coordinates, [3]."""
-        return -self.rotation.T @ self.translation
+        return -(self.rotation * self.translation[:, None]).sum(0)  # in one order, which a product of matrices has not
 
     @property
     def forward(self) -> np.ndarray:

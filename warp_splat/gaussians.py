@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,16 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.kernels.activation import make_activate, make_adj_activate
+from warp_splat.kernels.falloff import LN_2
 from warp_splat.kernels.harmonics import C0
+from warp_splat.kernels.simd import Types
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import in_slices, torch_slices
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
-LARGEST = 88.0  # logarithm of a scale; float32 ends soon after
 CELLS = 2**20  # of the Morton curve, along an axis
 #: Shifts and masks that put two zeros between the bits of a number below 2^21.
 MORTON = (
@@ -31,40 +33,37 @@ MORTON = (
 )
 
 
+def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scales [N, 3] from their logarithms, opacities [N] from logits. What is too large ends at 1.7e38."""
+    inputs, outputs = (logarithms, logits), (torch.empty_like(logarithms), torch.empty_like(logits))
+    _launch_activation(make_activate, inputs, outputs)
+    return outputs
+
+
+def _launch_activation(make, inputs: Sequence[torch.Tensor], outputs: Sequence[torch.Tensor]) -> None:
+    def arguments(types: Types, rows: slice) -> tuple[list, list]:
+        given, found = ([tensor[rows] for tensor in tensors] for tensors in (inputs, outputs))
+        return lanes_of(types.number, *given), lanes_of(types.number, *found)
+
+    device = outputs[1].device
+    launch_in_lanes(make, driver_of(device).lanes, len(outputs[1]), arguments, device)
+
+
 class Activate(torch.autograd.Function):
-    """Scales from their logarithms, opacities from logits; the rows shared among the threads of the CPU."""
+    """:func:`activate` for autograd."""
 
     @staticmethod
     def forward(ctx, logarithms, logits):
-        scales, opacities = torch.empty_like(logarithms), torch.empty_like(logits)
-
-        def run(low: int, high: int) -> None:
-            # finite: the renderer leaves out what is too large
-            torch.exp(logarithms[low:high].clamp_max(LARGEST), out=scales[low:high])
-            torch.sigmoid(logits[low:high], out=opacities[low:high])
-
-        in_slices(run, torch_slices(len(logits), logits.device))
-        ctx.save_for_backward(scales, opacities)
-        ctx.peeks = driver_of(scales.device).peeks
-        return scales, opacities
+        found = activate(logarithms, logits)
+        ctx.save_for_backward(*found)
+        return found
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, adj_scales, adj_opacities):
-        scales, opacities = ctx.saved_tensors
-        adj_logarithms, adj_logits = torch.empty_like(scales), torch.empty_like(opacities)
-        end = math.exp(LARGEST)
-
-        def run(low: int, high: int) -> None:
-            part = scales[low:high]
-            torch.mul(adj_scales[low:high], part, out=adj_logarithms[low:high])
-            if not (ctx.peeks and part.max() < end):  # the clamp's share, rarely: zero beyond it, and of no number
-                adj_logarithms[low:high].masked_fill_(~(part < end), 0.0)
-            torch.mul(adj_opacities[low:high], 1.0 - opacities[low:high], out=adj_logits[low:high])
-            adj_logits[low:high].mul_(opacities[low:high])
-
-        in_slices(run, torch_slices(len(opacities), opacities.device))
-        return adj_logarithms, adj_logits
+    def backward(ctx, *adj_outputs):
+        outputs = [torch.empty_like(tensor) for tensor in ctx.saved_tensors]
+        _launch_activation(make_adj_activate, [*ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs)], outputs)
+        return tuple(outputs)
 
 
 class GaussianModel:
@@ -108,10 +107,11 @@ class GaussianModel:
         """
         count = len(points)
         neighbors = min(4, count)  # the point itself and three others
-        distances = KDTree(points).query(points, k=neighbors)[0].reshape(count, neighbors)[:, 1:]
+        nearest = KDTree(points).query(points, k=neighbors)[1].reshape(count, neighbors)[:, 1:]
+        offsets = points[nearest].astype(np.float64) - points[:, None]
         # fewer than four points: no or few neighbors; one unit then
-        squared = np.mean(distances**2, axis=1) if neighbors > 1 else np.ones(count)
-        scales = 0.5 * np.log(np.maximum(squared, SMALLEST_DISTANCE2))
+        squared = np.mean((offsets * offsets).sum(2), axis=1) if neighbors > 1 else np.ones(count)
+        scales = 0.5 * _log(np.maximum(squared, SMALLEST_DISTANCE2))
         tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
         return cls(
             {
@@ -167,6 +167,13 @@ class GaussianModel:
         means, sh, opacities, scales, quats = (torch.from_numpy(np.ascontiguousarray(array)) for array in splats)
         parameters = {"means": means, "sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
         return cls({**parameters, "opacities": opacities, "scales": scales, "quats": quats})
+
+
+def _log(x: np.ndarray) -> np.ndarray:
+    """The natural logarithm to 1e-9; NumPy's differs by processor. As 2 artanh((m - 1) / (m + 1)) of a mantissa m."""
+    m, exponent = np.frexp(x)
+    s = (m - 1.0) / (m + 1.0)
+    return exponent * LN_2 + 2.0 * s * np.polyval(1.0 / np.arange(19, 0, -2), s * s)
 
 
 def along_curve(means: torch.Tensor) -> torch.Tensor:

@@ -30,6 +30,7 @@ import warp as wp
 
 from warp_splat.config import CORES
 from warp_splat.errors import InputError
+from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
 
 BLOCK = 256  # threads of a block: one per pixel of a tile
@@ -257,6 +258,31 @@ def launch(
     if len(bounds) > 2:
         wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
     in_slices(run, bounds, beside)
+
+
+def launch_in_lanes(
+    make: Callable[[int], wp.Kernel],
+    lanes: int,
+    count: int,
+    arguments: Callable[[Types, slice], tuple[list, list]],
+    device: torch.device | str = "cpu",
+) -> None:
+    """Launch ``make(lanes)``, a kernel for so many rows at once, on ``count`` rows, ``make(1)`` on those left over.
+
+    ``arguments`` gives inputs and outputs for a slice of the rows, as arrays of those types (:func:`lanes_of`).
+    """
+    whole = count - count % lanes
+    for size, rows in ((lanes, slice(0, whole)), (1, slice(whole, count))):
+        groups = (rows.stop - rows.start) // size
+        if groups:
+            bounds = even_slices(groups, SMALLEST_SLICE // size)
+            launch(make(size), groups, *arguments(TYPES[size], rows), bounds=bounds, device=device)
+
+
+def lanes_of(dtype: type, *tensors: torch.Tensor) -> list:
+    """Dense tensors as arrays of ``dtype``, as many numbers in each element as that has."""
+    size = wp.types.type_size_in_bytes(dtype) // 4
+    return [view(tensor.view(-1, size) if size > 1 else tensor.view(-1), dtype) for tensor in tensors]
 
 
 def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callable[[], None] | None = None) -> None:

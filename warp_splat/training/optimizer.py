@@ -7,6 +7,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from decimal import Decimal
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,9 +16,10 @@ from torch.optim.adam import adam
 
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
-from warp_splat.kernels.adam import make_adam, rows_of
+from warp_splat.kernels.adam import make_adam
+from warp_splat.kernels.simd import Types
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import SMALLEST_SLICE, even_slices, launch, load, view
+from warp_splat.runtime.launch import launch_in_lanes, load, view
 from warp_splat.training.options import LearnOptions
 
 BETAS = (0.9, 0.999)
@@ -36,17 +38,23 @@ def _root(base: float, degree: int) -> Decimal:
     return Decimal(base) ** (Decimal(1) / degree)
 
 
-def move(tables: list[list[torch.Tensor]], numbers: list, rows: int, radii: torch.Tensor | None, lanes: int) -> None:
-    """Launch the kernel of :mod:`warp_splat.kernels.adam`."""
-    device, at_once = tables[0][0].device, rows_of(lanes)
-    widths = torch.tensor([table[0].numel() // rows for table in tables], dtype=torch.int32, device=device)
-    addresses = torch.tensor([[tensor.data_ptr() for tensor in table] for table in tables], device=device)
+def move(tables: list[list[torch.Tensor]], numbers: list, count: int, radii: torch.Tensor | None) -> None:
+    """Launch the kernel of :mod:`warp_splat.kernels.adam` on tables of ``count`` rows."""
+    device = tables[0][0].device
+    sizes = [table[0].numel() // count for table in tables]
+    widths = torch.tensor(sizes, dtype=torch.int32, device=device)
     of_tables = torch.tensor(numbers, dtype=torch.float32, device=device)
-    shown, groups = widths if radii is None else radii, -(-rows // at_once)
-    inputs = [rows, view(widths, wp.int32), view(of_tables, wp.float32), view(shown, wp.int32)]
-    bounds = even_slices(groups, SMALLEST_SLICE // at_once)
-    kernel = make_adam(lanes, radii is not None)
-    launch(kernel, groups, inputs, [view(addresses, wp.uint64)], bounds=bounds, device=device)
+
+    def arguments(_types: Types, rows: slice) -> tuple[list, list]:
+        places = [
+            [t.data_ptr() + 4 * size * rows.start for t in table] for table, size in zip(tables, sizes, strict=True)
+        ]
+        addresses = torch.tensor(places, device=device)
+        shown = widths if radii is None else radii[rows]
+        inputs = [view(widths, wp.int32), view(of_tables, wp.float32), view(shown, wp.int32)]
+        return inputs, [view(addresses, wp.uint64)]
+
+    launch_in_lanes(partial(make_adam, sparse=radii is not None), driver_of(device).lanes, count, arguments, device)
 
 
 class Tables:
@@ -79,7 +87,7 @@ class Optimizer:
             Training"): if gradients of different images are independent, a step then moves the parameters as far,
             and forgets as much, as ``batch`` steps of one image.
         parts: groups of what parts learn, each with ``name``, ``params`` (one leaf of at least one axis) and ``lr``;
-            they learn in every step, by torch's fused Adam.
+            they learn in every step. On a CPU, leaves are dense float32.
     """
 
     def __init__(
@@ -89,7 +97,7 @@ class Optimizer:
         self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
         self._part_rates = {group["name"]: group["lr"] for group in parts}
         groups = [{"name": name, "params": [leaf]} for name, leaf in model.parameters.items()]
-        betas = (BETAS[0] ** batch, BETAS[1] ** batch)
+        betas = tuple(power(beta, batch) for beta in BETAS)
         self.adam = Tables([*groups, *parts], lr=0.0, betas=betas, eps=EPS / self.scale)
         self._groups = {group["name"]: group for group in self.adam.param_groups}
         self.set_iteration(0)
@@ -133,7 +141,8 @@ class Optimizer:
     def load(self) -> None:
         """Compile and load the kernel."""
         device = self.model.device
-        load(make_adam(driver_of(device).lanes, self.options.optimizer_type == "sparse_adam"), device)
+        for lanes in {driver_of(device).lanes, 1}:
+            load(make_adam(lanes, sparse=self.options.optimizer_type == "sparse_adam"), device)
 
     def _step(self, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
         """Adam on tables of ``rows`` rows.
@@ -157,10 +166,10 @@ class Optimizer:
                 biases = [1.0 - power(beta, state["step"].item()) for beta in (beta1, beta2)]
             if known and not of_torch:
                 tables.append([parameter.detach(), grad.contiguous(), *(state[name] for name in MOMENTS)])
-                rates = [group["lr"] / biases[0], group["eps"], biases[1] ** -0.5]
+                rates = [group["lr"] / biases[0], group["eps"], 1.0 / math.sqrt(biases[1])]
                 numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])
         if tables:
-            move(tables, numbers, rows, radii, lanes)
+            move(tables, numbers, rows, radii)
 
     def _state(self, parameter: torch.Tensor) -> dict:
         """Moments and number of steps, as torch's Adam keeps them."""

@@ -111,12 +111,15 @@ def leaves_of(problem: Problem, dtype: torch.dtype) -> dict[str, torch.Tensor]:
 
 
 def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> Gaussians:
-    """As the renderer takes them, through the trainer's activations if ``raw``."""
-    if not problem.raw:
-        return Gaussians(**{name: leaves[name] for name in Gaussians._fields})
-    model = GaussianModel({name: leaves[name] for name in GaussianModel.NAMES})
-    model.parameters = leaves
-    return model.activated()
+    """As the renderer takes them, through the trainer's activations if ``raw``; in float64, through torch's."""
+    if problem.raw and leaves["means"].dtype == torch.float64:
+        scales, opacities = leaves["scales"].clamp_max(88.0).exp(), leaves["opacities"].sigmoid()
+        leaves = leaves | {"scales": scales, "opacities": opacities}
+    elif problem.raw:
+        model = GaussianModel({name: leaves[name] for name in GaussianModel.NAMES})
+        model.parameters = leaves
+        return model.activated()
+    return Gaussians(**{name: leaves[name] for name in Gaussians._fields})
 
 
 def draw_case(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> api.RenderOutput:

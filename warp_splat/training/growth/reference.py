@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from statistics import NormalDist
+
 import numpy as np
 import torch
+import warp as wp
 
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.gaussians import along_curve
+from warp_splat.gaussians import activate, along_curve
+from warp_splat.kernels.simd import Types
+from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput
-from warp_splat.runtime.launch import in_slices, torch_slices
+from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes
 from warp_splat.training.growth import ReferenceOptions
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting, Step
@@ -16,6 +24,7 @@ from warp_splat.training.seams import Change, Setting, Step
 PRUNE_OPACITY = 0.005
 RESET_OPACITY = 0.01
 PRUNE_EXTENT = 0.1  # share of the scene's extent above which a Gaussian is pruned, once opacities have been reset
+LEVELS = 2**14  # of the normal distribution from which children are drawn
 SPLIT_SHRINK = 1.6  # the children's scales are the parent's divided by this
 
 
@@ -41,13 +50,13 @@ class Reference:
         if grad is None or step.iteration >= self.options.densify_until_iter:
             return
 
-        def run(low: int, high: int) -> None:
-            rows = slice(low, high)
-            x, y = (0.5 * size * grad[rows, axis] for axis, size in enumerate((width, height)))
-            self.gradient[rows] += torch.nan_to_num(torch.hypot(x, y), 0.0, 0.0, 0.0)
-            self.views[rows] += out.radii[rows] > 0
+        def arguments(types: Types, rows: slice) -> tuple[list, list]:
+            given = [*lanes_of(types.row2, grad[rows]), *lanes_of(types.integer, out.radii[rows])]
+            return [wp.vec2(0.5 * width, 0.5 * height), *given], lanes_of(
+                types.number, self.gradient[rows], self.views[rows]
+            )
 
-        in_slices(run, torch_slices(len(grad), grad.device))
+        launch_in_lanes(make_observe, driver_of(grad.device).lanes, len(grad), arguments, grad.device)
         if self.options.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
 
@@ -94,8 +103,7 @@ class Reference:
         self.processes.maximum(self.radius)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         chosen = self._choose()
-        widest = torch.exp(raw["scales"]).amax(1)
-        splits = widest > self.options.percent_dense * self.extent
+        splits = raw["scales"].amax(1) > _log(self.options.percent_dense * self.extent)
         clone, split = chosen[~splits[chosen]], chosen[splits[chosen]]
         added = self._children(raw, split)
         added = {name: torch.cat([raw[name][clone], added[name]]) for name in raw}
@@ -126,24 +134,39 @@ class Reference:
         """Two samples of each Gaussian in ``split``, smaller than it."""
         twice = split.repeat(2)
         rows = {name: tensor[twice] for name, tensor in raw.items()}
-        sample = torch.randn(len(twice), 3, generator=self.random)  # on the host: one seed, one result on any device
-        offsets = torch.exp(rows["scales"]) * sample.to(rows["scales"].device)
+        drawn = torch.randint(LEVELS, (len(twice), 3), generator=self.random)  # on the host: the same on any device
+        offsets = activate(rows["scales"], rows["opacities"])[0] * _normals()[drawn].to(twice.device)
         rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
-        rows["scales"] = rows["scales"] - float(torch.tensor(SPLIT_SHRINK).log())
+        rows["scales"] = rows["scales"] - math.log(SPLIT_SHRINK)
         return rows
 
     def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
-        keep = torch.sigmoid(raw["opacities"]) >= PRUNE_OPACITY
+        keep = raw["opacities"] >= math.log(PRUNE_OPACITY / (1.0 - PRUNE_OPACITY))
         for tensor in raw.values():  # one that is not finite is left out of every image, so nothing else would prune it
             keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
         if prune_large:
-            keep &= torch.exp(raw["scales"]).amax(1) <= PRUNE_EXTENT * self.extent
+            keep &= raw["scales"].amax(1) <= _log(PRUNE_EXTENT * self.extent)
         return keep
+
+
+@functools.cache
+def _normals() -> torch.Tensor:
+    """Standard normal numbers, each as likely as the others [LEVELS]; torch's own differ by processor."""
+    return torch.tensor([NormalDist().inv_cdf((level + 0.5) / LEVELS) for level in range(LEVELS)])
+
+
+def _log(x: float) -> float:
+    return math.log(x) if x > 0.0 else -math.inf
 
 
 def rotate(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any norm but 0."""
-    unit = torch.nn.functional.normalize(quats, dim=1)
+    w, x, y, z = (quats * quats).unbind(1)  # one operation after another: torch's functions of rows differ by processor
+    unit = quats / (w + x + y + z).sqrt()[:, None].clamp_min(1e-12)
     w, axis = unit[:, :1], unit[:, 1:]
-    twist = 2.0 * torch.linalg.cross(axis, vectors)
-    return vectors + w * twist + torch.linalg.cross(axis, twist)
+    twist = 2.0 * _cross(axis, vectors)
+    return vectors + w * twist + _cross(axis, twist)
+
+
+def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    return a.roll(-1, 1) * b.roll(1, 1) - a.roll(1, 1) * b.roll(-1, 1)
