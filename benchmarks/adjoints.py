@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from blend import Lanes
 from common import interleaved_medians, machine, write_table
-from scenes import blend_scene
+from made_up import blend_scene
 
 from warp_splat.compare.adjoints import peak_of
 from warp_splat.config import ADJOINTS

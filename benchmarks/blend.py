@@ -12,8 +12,8 @@ import numpy as np
 import torch
 import warp as wp
 from common import interleaved_medians, machine, write_table
+from made_up import BlendScene, blend_scene
 from scalar_blend import adj_blend, blend, vec9
-from scenes import BlendScene, blend_scene
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions

@@ -1,10 +1,12 @@
-"""What the benchmarks share: interleaved timing, the machine's name, and tables."""
+"""What the benchmarks share: timing, the machine's name, and tables."""
 
 import json
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+
+import torch
 
 from warp_splat.evaluation.report import machine
 from warp_splat.text import format_table
@@ -33,3 +35,28 @@ def write_table(
         out.mkdir(parents=True, exist_ok=True)
         (out / f"{name}.md").write_text(f"{table}\n\n{note} Measured by `benchmarks/{name}.py` on {machine()}.\n")
         (out / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
+
+
+def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:
+    """Median after a warm-up, by CUDA events (by the clock on a CPU)."""
+    times = []
+    for repeat in range(-2, repeats):
+        if device == "cuda":
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            start.record()
+            run()
+            end.record()
+            torch.cuda.synchronize()
+            elapsed = start.elapsed_time(end)
+        else:
+            begun = time.perf_counter()
+            run()
+            elapsed = 1e3 * (time.perf_counter() - begun)
+        if repeat >= 0:
+            times.append(elapsed)
+    return statistics.median(times)
+
+
+def synchronize(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 import warp as wp
 from gpu_blends import ATOMIC_HEADERS, SHARE_HEADERS, measure_blends
-from gpu_scene import cameras, make_gaussians
 from gpu_steps import STEP_HEADERS, measure_errors, measure_modes, measure_orbit, measure_step
+from made_up import cameras, make_gaussians
 
 from warp_splat import rasterize
 from warp_splat.config import ADJOINTS

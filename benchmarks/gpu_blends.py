@@ -6,7 +6,8 @@ kernel adds into the Gaussian's row at once; no rows per instance, no second ker
 
 import torch
 import warp as wp
-from gpu_scene import cameras, make_gaussians, milliseconds
+from common import milliseconds
+from made_up import cameras, make_gaussians
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions

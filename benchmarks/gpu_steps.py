@@ -4,7 +4,8 @@ import statistics
 import time
 
 import torch
-from gpu_scene import cameras, make_gaussians, make_trainer, milliseconds, steps_of, synchronize
+from common import milliseconds, synchronize
+from made_up import cameras, make_gaussians, make_trainer, steps_of
 
 from warp_splat.compare import adjoints
 from warp_splat.compare.workloads import layered

@@ -21,7 +21,7 @@ import numpy as np
 import OpenImageIO as oiio
 import torch
 from common import machine, write_table
-from gpu_scene import NEVER, steps_of
+from made_up import NEVER, steps_of
 from step import add_arguments, synthetic, trained
 
 from warp_splat.raster import cpu

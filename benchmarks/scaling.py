@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from common import machine, write_table
-from gpu_scene import make_trainer
+from made_up import make_trainer
 
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, new_figure, plain_axes, save_figure

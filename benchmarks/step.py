@@ -20,9 +20,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from common import machine, write_table
-from gpu_scene import VIEWS, make_gaussians, make_scene, steps_of, trainer_on
 from gpu_steps import STAGES
 from limits import Limits, measure_limits
+from made_up import VIEWS, make_gaussians, make_scene, steps_of, trainer_on
 from work import Counts, count, mean, work_of
 
 from warp_splat.config import RasterOptions

@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import gpu  # noqa: E402
 import gpu_blends  # noqa: E402
-import gpu_scene  # noqa: E402
+import made_up  # noqa: E402
 
 
 @pytest.fixture
@@ -32,8 +32,8 @@ def fibers(monkeypatch):
 
 def test_atomics_and_slots_give_the_gradients_of_the_product(fibers):
     """Against autograd through the CPU's driver, which shares no kernel with them."""
-    gaussians = Gaussians(*(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated()))
-    camera = gpu_scene.cameras(60, 40, 1)[0]
+    gaussians = Gaussians(*(tensor.detach() for tensor in made_up.make_gaussians(3000, "cpu").activated()))
+    camera = made_up.cameras(60, 40, 1)[0]
     blends = gpu_blends.Blends(gaussians, camera)
     blends.into_slots()
     found = {"slots": blends.gather(), "atomics": blends.by_gaussian(blends.by_atomics()).split([2, 3, 1, 3], 1)}
@@ -56,7 +56,7 @@ def test_operations_of_the_card_are_counted_as_they_are_done():
 
 
 def test_trainer_of_the_benchmark_trains():
-    trainer = gpu_scene.make_trainer(500, 64, 48, "cpu")
+    trainer = made_up.make_trainer(500, 64, 48, "cpu")
     before = {name: tensor.detach().clone() for name, tensor in trainer.model.parameters.items()}
     for iteration in range(10, 13):
         trainer.differentiate(iteration)

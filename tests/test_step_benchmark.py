@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import derivatives  # noqa: E402
-import gpu_scene  # noqa: E402
 import limits  # noqa: E402
+import made_up  # noqa: E402
 import savings  # noqa: E402
 import step  # noqa: E402
 import work  # noqa: E402
@@ -35,10 +35,10 @@ def two_threads():
 
 
 def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
-    gaussians = Gaussians(*(tensor.detach() for tensor in gpu_scene.make_gaussians(3000, "cpu").activated()))
+    gaussians = Gaussians(*(tensor.detach() for tensor in made_up.make_gaussians(3000, "cpu").activated()))
     # pixels stop
     gaussians = gaussians._replace(scales=3.0 * gaussians.scales, opacities=gaussians.opacities.clamp_min(0.5))
-    camera = gpu_scene.cameras(40, 30, 1)[0]
+    camera = made_up.cameras(40, 30, 1)[0]
     found = work.count(gaussians, camera, RasterOptions())
     means, conics, opacities, _, depths, _, radii = project(gaussians, camera, RasterOptions())
     drawn = np.flatnonzero(radii.numpy() > 0)
@@ -113,8 +113,8 @@ def test_what_is_left_out_changes_nothing(two_threads):
 
 def test_inactive_degrees_get_no_gradient_and_the_same_bytes():
     """Steps at degree 0 and then 3, against Adam fed with gradients of zero."""
-    scene, gaussians = gpu_scene.make_scene(48, 32), gpu_scene.make_gaussians(300, "cpu")
-    trainers = [gpu_scene.trainer_on(scene, gaussians, "cpu", sh_interval=4) for _ in range(2)]
+    scene, gaussians = made_up.make_scene(48, 32), made_up.make_gaussians(300, "cpu")
+    trainers = [made_up.trainer_on(scene, gaussians, "cpu", sh_interval=4) for _ in range(2)]
     for iteration in range(1, 14):
         for trainer, fills in zip(trainers, (False, True), strict=True):
             trainer.differentiate(iteration)
@@ -132,8 +132,8 @@ def test_inactive_degrees_get_no_gradient_and_the_same_bytes():
 def test_degree_rises_without_a_compilation(monkeypatch, capsys):
     """``warm_up`` has compiled and loaded all that a higher degree needs: Warp says so when it loads a module."""
     monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
-    scene, gaussians = gpu_scene.make_scene(48, 32), gpu_scene.make_gaussians(300, "cpu")
-    trainer = gpu_scene.trainer_on(scene, gaussians, "cpu", sh_interval=2)
+    scene, gaussians = made_up.make_scene(48, 32), made_up.make_gaussians(300, "cpu")
+    trainer = made_up.trainer_on(scene, gaussians, "cpu", sh_interval=2)
     trainer.warm_up()
     work.count_pairs.module.unload()
     wp.load_module(work.count_pairs.module, device="cpu")

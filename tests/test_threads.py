@@ -23,7 +23,7 @@ from warp_splat.training.seams import Setting, Step
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from gpu_scene import make_trainer
+from made_up import make_trainer
 
 COUNT = 5003  # no multiple of what any processor computes at once
 

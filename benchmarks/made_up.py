@@ -1,15 +1,16 @@
-"""A scene without files, of any number of Gaussians, trainers on it or another, and a clock for either device."""
+"""Scenes made up: Gaussians in a ball, photographs of noise, trainers on these or others; splats for blends alone."""
 
 import math
-import statistics
-import time
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from warp_splat.camera import Camera
+from warp_splat.config import ALPHA_MIN, TILE
 from warp_splat.gaussians import GaussianModel
+from warp_splat.kernels.splat import Splat2D
 from warp_splat.rendering.camera_paths import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.options import TrainConfig
@@ -18,6 +19,7 @@ from warp_splat.training.trainer import Trainer
 RADIUS = 4.0  # world units, of the ball that the Gaussians fill; the orbit lies outside
 VIEWS = 8
 NEVER = 10**9
+LN_2 = np.log(2.0)
 
 
 def make_gaussians(count: int, device: str) -> GaussianModel:
@@ -91,26 +93,52 @@ def steps_of(trainer: Trainer) -> Callable[[], None]:
     return step
 
 
-def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:
-    """Median after a warm-up, by CUDA events (by the clock on a CPU)."""
-    times = []
-    for repeat in range(-2, repeats):
-        if device == "cuda":
-            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            start.record()
-            run()
-            end.record()
-            torch.cuda.synchronize()
-            elapsed = start.elapsed_time(end)
-        else:
-            begun = time.perf_counter()
-            run()
-            elapsed = 1e3 * (time.perf_counter() - begun)
-        if repeat >= 0:
-            times.append(elapsed)
-    return statistics.median(times)
+class BlendScene(NamedTuple):
+    """Random screen-space Gaussians, binned by their 3-sigma square, front to back: V of them, M instances, T tiles."""
+
+    width: int
+    height: int
+    tiles_x: int
+    splats: np.ndarray  # [V] Splat2D
+    ranges: np.ndarray  # [T, 2] int32, first and last instance
+    instances: np.ndarray  # [M] int32, splats
+    places: np.ndarray  # [M] int32, where in ``instances``, splat by splat
+    place_begins: np.ndarray  # [V] int32
 
 
-def synchronize(device: str) -> None:
-    if device == "cuda":
-        torch.cuda.synchronize()
+def blend_scene(count: int = 100_000, width: int = 980, height: int = 545, seed: int = 0) -> BlendScene:
+    """Log-normal sizes around 2 px, any orientation, logistic-normal opacities: 1.14M instances at the default size."""
+    rng = np.random.default_rng(seed)
+    mean = np.stack([rng.uniform(0, width, count), rng.uniform(0, height, count)], 1)
+    sigma = [np.exp(rng.normal(0.7, 1.0, count)).clip(0.55, 60) for _ in range(2)]
+    angle = rng.uniform(0, np.pi, count)
+    c, s = np.cos(angle), np.sin(angle)
+    xx, yy = ((a * sigma[0]) ** 2 + (b * sigma[1]) ** 2 for a, b in ((c, s), (s, c)))
+    xy = c * s * (sigma[0] ** 2 - sigma[1] ** 2)
+    det = xx * yy - xy * xy
+    opacity = 1 / (1 + np.exp(-rng.normal(0, 2, count)))
+    color = rng.uniform(0, 1, (count, 3))
+    order = np.argsort(rng.uniform(1, 10, count))  # by depth
+    reach = 2 * np.log(np.maximum(opacity / ALPHA_MIN, 1.0001))
+    splats = np.zeros(count, dtype=Splat2D.numpy_dtype())
+    splats["mean"], splats["opacity"], splats["color"], splats["depth"] = mean, opacity, color, 1.0
+    splats["extent"] = np.sqrt(reach[:, None] * np.stack([xx, yy], 1))
+    splats["root"] = np.stack([yy, -xy, np.sqrt(det)], 1) / np.sqrt(2 * LN_2 * det * yy)[:, None]
+    return _bin(splats[order], np.ceil(3 * np.maximum(*sigma))[order], width, height)
+
+
+def _bin(splats: np.ndarray, radius: np.ndarray, width: int, height: int) -> BlendScene:
+    tiles = np.array([-(-width // TILE), -(-height // TILE)])
+    low = np.clip((splats["mean"] - radius[:, None]) // TILE, 0, tiles).astype(np.int64)
+    high = np.clip((splats["mean"] + radius[:, None] + TILE - 1) // TILE, 0, tiles).astype(np.int64)
+    counts = np.prod(high - low, axis=1)
+    splat = np.repeat(np.arange(len(splats)), counts)
+    local = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    across = np.repeat(high[:, 0] - low[:, 0], counts)
+    tile = (low[splat, 1] + local // across) * tiles[0] + low[splat, 0] + local % across
+    order = np.argsort(tile, kind="stable")  # splats are in depth order already
+    ends = np.searchsorted(tile[order], np.arange(tiles.prod()), "right")
+    ranges = np.stack([np.concatenate([[0], ends[:-1]]), ends], 1)
+    places = np.argsort(order)
+    lists = (table.astype(np.int32) for table in (ranges, splat[order], places, np.cumsum(counts) - counts))
+    return BlendScene(width, height, int(tiles[0]), splats, *lists)
