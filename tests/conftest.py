@@ -56,7 +56,7 @@ def pytest_sessionstart():
         modules = [kernel.module for kernel in (projections[0], *blends)] + [wp.get_module(ssim.__name__)]
         modules += [projections[1].module]
         for module in modules if worker == "gw0" else modules[::-1]:
-            module.load(wp.get_device("cpu"), 1)  # as every launch of theirs
+            wp.load_module(module, device="cpu")
 
 
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
