@@ -180,11 +180,11 @@ def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
     assert main(["train", "--resume", str(whole), "--iterations", "90", "--quiet"]) == 0
     assert ply_path(tmp_path / "longer", 90).read_bytes() == ply_path(whole, 90).read_bytes()
     options = (
-        "--iterations 120 -r 2 --adjoint stepwise --densify_until_iter 110 --max_gaussians 40000 --white_background"
+        "--iterations 120 -r 8 --adjoint stepwise --densify_until_iter 110 --max_gaussians 40000 --white_background"
     )
     assert main(["train", "--resume", str(whole), *options.split()]) == 0
     config = parse(["train", "--resume", str(whole)])
-    assert (config.data.resolution, config.model.adjoint, config.grow.max_gaussians) == (2, "stepwise", 40000)
+    assert (config.data.resolution, config.model.adjoint, config.grow.max_gaussians) == (8, "stepwise", 40000)
     assert config.learn.sh_interval == 15
     assert len(load_ply(ply_path(whole, 120)).means) <= 40000
 
@@ -315,7 +315,7 @@ def run_main(arguments):
 
 @pytest.mark.parametrize(
     ("most", "iterations"),
-    [pytest.param(4, 100, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)],
+    [pytest.param(4, 60, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)],
 )
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes that have loaded torch are forked")
 def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, iterations, tmp_path):

@@ -200,7 +200,7 @@ def test_ctrl_c_stops_all_after_the_same_step(tmp_path):
 def test_a_whole_run_of_two_processes(tmp_path):
     """The options of test_train.py's short run; identical models are checked after every densification."""
     options = (
-        "--eval -r 4 --iterations 119 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 110 "
+        "--eval -r 8 --iterations 119 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 110 "
     )
     options += "--opacity_reset_interval 60 --sh_interval 30 --densify_grad_threshold 0.00005 --profile 20"
     out = torchrun(ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *options.split())

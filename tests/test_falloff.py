@@ -34,7 +34,7 @@ def dense(out):
     return leaves, image, torch.einsum("nyx,n->yx", weights, depths) / (1 - front[-1]).clamp_min(1e-10)
 
 
-@pytest.mark.parametrize("driver", ["CPU", "CUDA"])
+@pytest.mark.parametrize("driver", [pytest.param("CPU", marks=pytest.mark.slow), "CUDA"])  # half a minute to compile
 @pytest.mark.parametrize("adjoint", ["stepwise", "reversible", "stored"])
 def test_against_a_dense_formula(adjoint, driver):
     scene = SCENES["degree1"]()
@@ -52,12 +52,14 @@ def test_against_a_dense_formula(adjoint, driver):
         assert (gradient - truth).norm() < 1e-4 * truth.norm()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", ["stepwise", "reversible", "stored"])
 def test_gradients_agree_with_differences(adjoint):
     scene = SCENES["degree1"]()
     assert check_gradients(*scene.parameters(), scene.camera, adjoint=adjoint, options=OPTIONS, directions=3).ok
 
 
+@pytest.mark.slow
 def test_manual_refuses_another_falloff_where_a_gradient_is_asked_for():
     scene = SCENES["degree1"]()
     leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]

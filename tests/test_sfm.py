@@ -231,6 +231,7 @@ def test_the_sharpest_frame_of_each_span_is_taken(tmp_path):
     assert written == 6 and taken == sharp and shares == sorted(shares)
 
 
+@pytest.mark.slow
 def test_a_video_becomes_a_scene(tmp_path, capsys):
     textures = room.walls()
     save_video(tmp_path / "clip.mp4", [room.photo(index / 11, textures) for index in range(12)], 25)
@@ -248,6 +249,7 @@ def test_a_video_that_cannot_be_decoded_gets_one_sentence(tmp_path, keep, words)
     cannot(lambda: sfm(config), *words)
 
 
+@pytest.mark.slow
 def test_png_files_can_be_written_after_pycolmap_was_loaded(tmp_path):
     """The libraries in pycolmap's wheel clash with those in OpenImageIO's if they are loaded first."""
     code = (
