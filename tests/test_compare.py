@@ -127,6 +127,7 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     assert len(list(tmp_path.glob("*.png"))) == 4
 
 
+@pytest.mark.slow
 def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
     """Its kernels run in fibers, its memory is told by a stub; all else is what a card would see."""
     monkeypatch.setattr(workloads, "LAYERED_SIZE", 16)

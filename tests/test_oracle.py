@@ -137,7 +137,12 @@ def differentiable(scene, **options):
 
 @pytest.mark.parametrize(
     ("seed", "degree", "options"),
-    [(0, 0, {}), (1, 1, {"antialiasing": True}), (2, 2, {"sh_degree": 1}), (3, 3, {})],
+    [
+        (0, 0, {}),
+        pytest.param(1, 1, {"antialiasing": True}, marks=pytest.mark.slow),
+        pytest.param(2, 2, {"sh_degree": 1}, marks=pytest.mark.slow),
+        (3, 3, {}),
+    ],
 )
 def test_gradients_match_central_differences(seed, degree, options):
     """Of every input number, on few Gaussians: some clamped at 0.99, some beyond the frame, some colors below 0."""

@@ -161,8 +161,8 @@ VARIANTS = [
     ("saturated", RasterOptions(t_min=0.0)),
     ("saturated", RasterOptions(alpha_min=1e-4, t_min=1e-2)),
     ("layers_4000", RasterOptions(alpha_min=0.0, t_min=0.0)),
-    ("degree2", RasterOptions(exp_degree=None)),
     ("degree2", RasterOptions(exp_degree=6)),
+    pytest.param("degree2", RasterOptions(exp_degree=None), marks=pytest.mark.slow),
 ]
 
 

@@ -128,6 +128,7 @@ def test_one_seed_one_result_for_any_number_of_threads(trained, tmp_path):
     assert ply_path(tmp_path, 60).read_bytes() == ply_path(trained, 60).read_bytes()
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_result(trained, tmp_path):
     assert train(tmp_path, "--seed", "1") == 0
     assert ply_path(tmp_path, 60).read_bytes() != ply_path(trained, 60).read_bytes()

@@ -44,6 +44,7 @@ def test_video(told, capsys, video, opposite):
     assert psnr(film[0], film[opposite]) < 25
 
 
+@pytest.mark.slow
 def test_frames_of_a_video(told, tmp_path, capsys):
     """A folder gets the frames that the film shows, as H.264 keeps them; the first is the first photograph's."""
     for output in (tmp_path / "frames", tmp_path / "film.mp4"):
@@ -58,6 +59,7 @@ def test_frames_of_a_video(told, tmp_path, capsys):
         assert frame.shape == (61, 65, 3) and psnr(np.ascontiguousarray(decoded[:61, :65]), frame) > 30
 
 
+@pytest.mark.slow
 def test_render_says_that_the_scene_is_another(told, tmp_path, capsys):
     shutil.copytree(SCENE, tmp_path / "other")
     options = ["-m", str(told), "--video", "orbit", "--frames", "2", "--video_output", str(tmp_path / "a.mp4")]
