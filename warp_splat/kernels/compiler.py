@@ -6,13 +6,13 @@ width is an upper bound, which AVX2 or NEON cut down. No flag lets the compiler 
 
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its
 #: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie.
-_FLAGS = "-march=native -ffp-contract=fast -fno-signed-zeros -mstackrealign"
+_FLAGS = "-march=native -ffp-contract=off -fno-signed-zeros -mstackrealign"
 
 #: Of most modules. Sums over lanes may be regrouped, or they would not vectorize.
 FORWARD_ONLY = {
     "enable_backward": False,
     "optimization_level": 3,
-    "cpu_compiler_flags": f"{_FLAGS} -mreassociate -mprefer-vector-width=512",
+    "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512",
 }
 
 #: Of those whose sums keep their order: (mean - center) - center_low is nothing but that.

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_splat.errors import InputError
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.simd import exp2_exact, fill, fraction, halved, times, vec16, whole
+from warp_splat.kernels.simd import exp2_exact, fill, fma, fraction, halved, times, vec16, whole
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -115,7 +115,7 @@ def make_exp(degree: int | None) -> wp.Function:
         f = fraction(bounded, n)
         p = fill(coefficients[degree], z)
         for power in range(degree):
-            p = fill(coefficients[degree - 1 - power], z) + times(f, p)
+            p = fma(f, p, fill(coefficients[degree - 1 - power], z))
         return halved(p, n)
 
     return exp2_minus

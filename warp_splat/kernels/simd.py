@@ -87,6 +87,32 @@ def times(a: vec16, b: float):
     return a * b
 
 
+_ADJ_FMA = "adj_a = fmaf(b, adj_ret, adj_a); adj_b = fmaf(a, adj_ret, adj_b); adj_c += adj_ret;"
+_LANES = "for (int i = 0; i < 16; ++i)"
+
+
+@wp.func_native("return fmaf(a, b, c);", _ADJ_FMA)
+def fma(a: float, b: float, c: float) -> float:
+    """a b + c, rounded once."""
+    ...
+
+
+@wp.func_native(
+    f"auto r = c; {_LANES} r.c[i] = fmaf(a.c[i], b.c[i], c.c[i]); return r;",
+    f"""{_LANES} {{
+        adj_a.c[i] = fmaf(b.c[i], adj_ret.c[i], adj_a.c[i]);
+        adj_b.c[i] = fmaf(a.c[i], adj_ret.c[i], adj_b.c[i]);
+        adj_c.c[i] += adj_ret.c[i];
+    }}""",
+)
+def fma(a: vec16, b: vec16, c: vec16) -> vec16: ...
+
+
+@wp.func
+def fma(a: vec16, b: float, c: vec16):
+    return fma(a, vec16(b), c)
+
+
 @wp.func
 def over(a: float, b: float):
     return a / b

@@ -28,7 +28,7 @@ import warp as wp
 from warp_splat.config import ALPHA_MAX
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
-from warp_splat.kernels.simd import fill, over, times, where_less
+from warp_splat.kernels.simd import fill, fma, over, times, where_less
 from warp_splat.kernels.slots import CHANNEL
 
 wp.set_module_options(FORWARD_ONLY)
@@ -62,9 +62,9 @@ class Splat2D:
 @wp.func
 def exponent(dx: Any, dy: Any, xx: Any, xy: Any, yy: Any):
     """The exponent z at offset (dx, dy) [px] from pixel center to mean, from the entries of the root."""
-    u = times(dx, xx) + times(dy, xy)
+    u = fma(dx, xx, times(dy, xy))
     v = times(dy, yy)
-    return times(u, u) + times(v, v)
+    return fma(u, u, times(v, v))
 
 
 @wp.func
@@ -85,7 +85,7 @@ def advance(t: Any, alpha: Any, t_min: float):
 
     A pixel stops at the Gaussian that would take T below ``t_min``: it keeps its T with the sign flipped, from then on.
     """
-    after = t - times(alpha, t)
+    after = fma(-alpha, t, t)
     return where_less(after, fill(t_min, t), wp.min(t, -t), after)
 
 
@@ -98,7 +98,7 @@ def weight(t: Any, alpha: Any, behind: Any):
 @wp.func
 def adj_alpha_blend(t: Any, odds: Any, behind: Any, here: Any):
     """dL/dalpha_k from T_k, alpha_k / (1 - alpha_k), behind_k and color_k . u (module docstring)."""
-    return times(t, here) - (behind + times(behind, odds))
+    return fma(t, here, -fma(behind, odds, behind))
 
 
 @wp.func

@@ -32,7 +32,7 @@ import math
 import warp as wp
 
 from warp_splat.kernels.compiler import LANES_IN_ORDER
-from warp_splat.kernels.simd import LANES, fill, over, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANES, fill, fma, over, times, total, vec16, where_less
 
 wp.set_module_options(LANES_IN_ORDER)
 
@@ -156,9 +156,9 @@ def blur_moments(x: wp.array[vec16], y: wp.array[vec16], moments_out: wp.array2d
             wb = b * WEIGHTS[tap]
             mx = mx + wa
             my = my + wb
-            xx = xx + times(wa, a)
-            yy = yy + times(wb, b)
-            xy = xy + times(wa, b)
+            xx = fma(wa, a, xx)
+            yy = fma(wb, b, yy)
+            xy = fma(wa, b, xy)
         moments_out[group, 0] = mx
         moments_out[group, 1] = my
         moments_out[group, 2] = xx
@@ -175,9 +175,9 @@ def blur_slopes(dmu: wp.array[vec16], dxx: wp.array[vec16], dxy: wp.array[vec16]
         xx = vec16(0.0)
         xy = vec16(0.0)
         for tap in range(WINDOW):
-            mu = mu + seen_by(tap, dmu)[place] * WEIGHTS[tap]
-            xx = xx + seen_by(tap, dxx)[place] * WEIGHTS[tap]
-            xy = xy + seen_by(tap, dxy)[place] * WEIGHTS[tap]
+            mu = fma(seen_by(tap, dmu)[place], WEIGHTS[tap], mu)
+            xx = fma(seen_by(tap, dxx)[place], WEIGHTS[tap], xx)
+            xy = fma(seen_by(tap, dxy)[place], WEIGHTS[tap], xy)
         slopes_out[group, 0] = mu
         slopes_out[group, 1] = xx
         slopes_out[group, 2] = xy
@@ -197,7 +197,7 @@ def make_blur_columns(planes: int):
                     value = ring[other & (RING - 1), group, plane]
                     for which in range(ROWS):
                         weight = WEIGHTS_OF_ROWS[(other - row + RADIUS + ROWS - 1 - which) & (LANES - 1)]
-                        sums[which * planes + plane] = sums[which * planes + plane] + value * weight
+                        sums[which * planes + plane] = fma(value, weight, sums[which * planes + plane])
             for which in range(ROWS):
                 for plane in range(planes):
                     blurred_out[which, group, plane] = sums[which * planes + plane]

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import LN_2, LOG2_E, make_falloff
-from warp_splat.kernels.simd import fill, inner, times, vec16, where_less
+from warp_splat.kernels.simd import fill, fma, inner, times, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, adj_alpha_blend, adj_alpha_of, alpha_of, exponent, odds_of
 
 wp.set_module_options(FORWARD_ONLY)
@@ -80,9 +80,9 @@ def make_manual(falloff: int | None, number: type) -> wp.Function:
         raw = where_less(here, walked, fall * opacity, fill(-1.0, z))
         odds = odds_of(alpha_of(raw, alpha_min))
         w = times(t, odds)
-        front = t + w
+        front = fma(t, odds, t)
         adj_raw = adj_alpha_of(raw, alpha_min, adj_alpha_blend(front, odds, behind, lit))
-        return front, behind + times(w, lit), w, times(adj_raw, fall)
+        return front, fma(w, lit, behind), w, times(adj_raw, fall)
 
     return adj_step
 
@@ -123,7 +123,7 @@ def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
         """The falloff and the transmittance in front, from that behind."""
         fall = fall_at(exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy))
         odds = odds_of(opaque(times(fall, parcel.opacity), alpha_min, here, walked))
-        return fall, t + times(t, odds)
+        return fall, fma(t, odds, t)
 
     @wp.func
     def step(
@@ -143,9 +143,9 @@ def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
         z = exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy)
         alpha = opaque(times(fall_known(z, fall), parcel.opacity), alpha_min, here, walked)
         w = times(alpha, t)
-        lit = times(parcel.red, red) + times(parcel.green, green) + times(parcel.blue, blue)
+        lit = fma(parcel.red, red, fma(parcel.green, green, times(parcel.blue, blue)))
         if wp.static(CHANNELS > 3):
-            lit = lit + times(parcel.depth, far)
+            lit = fma(parcel.depth, far, lit)
         return inner(w, lit) + inner(adj_behind, t - w)
 
     return Stepwise(Parcel, undo, step)

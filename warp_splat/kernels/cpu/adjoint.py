@@ -10,7 +10,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
-from warp_splat.kernels.simd import LANES, times, vec16
+from warp_splat.kernels.simd import LANES, fma, times, vec16
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise
@@ -55,9 +55,9 @@ def _make_manual_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
         far: vec16,
     ):
         """Both in front, and what to sum over pixels: d, d d', 1 times dL/dopacity, and the channels' gradients."""
-        lit = red * splat.color[0] + green * splat.color[1] + blue * splat.color[2]
+        lit = fma(red, splat.color[0], fma(green, splat.color[1], blue * splat.color[2]))
         if wp.static(CHANNELS > 3):
-            lit = lit + far * splat.depth
+            lit = fma(far, splat.depth, lit)
         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
         front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
         part = mat_grads()

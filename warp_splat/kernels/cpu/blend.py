@@ -35,7 +35,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.falloff import make_falloff
-from warp_splat.kernels.simd import LANE_X, LANE_Y, LANES, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANE_X, LANE_Y, LANES, fma, times, total, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
 
@@ -142,9 +142,10 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
                     if wp.static(variant.keep):
                         kept_out[k, block] = s[T + block]
                     for channel in range(3):
-                        s[RGB + channel * BLOCKS + block] = s[RGB + channel * BLOCKS + block] + w * splat.color[channel]
+                        row = RGB + channel * BLOCKS + block
+                        s[row] = fma(w, splat.color[channel], s[row])
                     if wp.static(CHANNELS > 3):
-                        s[DEPTH + block] = s[DEPTH + block] + w * splat.depth
+                        s[DEPTH + block] = fma(w, splat.depth, s[DEPTH + block])
                     s[T + block] = behind
                     s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
                     bx += 1

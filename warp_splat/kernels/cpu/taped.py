@@ -24,7 +24,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, reach
 from warp_splat.kernels.falloff import make_falloff
-from warp_splat.kernels.simd import LANE_X, LANE_Y, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANE_X, LANE_Y, fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
 from warp_splat.kernels.step import conic_from_root, opaque
@@ -56,7 +56,7 @@ def front_of(t: wp.array[vec16], block: int, alpha: vec16):
 
 @wp.func_replay(front_of)
 def replay_front_of(t: wp.array[vec16], block: int, alpha: vec16):
-    t[block] = t[block] + times(t[block], odds_of(alpha))
+    t[block] = fma(t[block], odds_of(alpha), t[block])
     return t[block]
 
 
