@@ -24,11 +24,5 @@ LANES_IN_ORDER = {**IN_ORDER, "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-w
 #: Of the loops over blocks in lanes: they are short, and vectorized across blocks they take three times as long.
 IN_LANES = {**FORWARD_ONLY, "cpu_compiler_flags": f"{FORWARD_ONLY['cpu_compiler_flags']} -fno-vectorize"}
 
-#: Of lanes that Warp differentiates; their sums keep their order, too. Loops over lanes must reach LLVM as loops.
-#: Unrolled by LLVM, they are so many scalars that it takes minutes to find the vectors again; by Warp, functions too
-#: long to be inlined: twice the time. (The blends become 25 to 65 times slower without LLVM's unrolling.)
-DIFFERENTIABLE_LANES = {
-    "max_unroll": 0,
-    "optimization_level": 3,
-    "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512 -fno-unroll-loops",
-}
+#: Of lanes that Warp differentiates.
+DIFFERENTIABLE_LANES = {"optimization_level": 3, "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512"}

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_splat.kernels import simd
-from warp_splat.kernels.simd import TYPES, fill, inner, inverse, root
+from warp_splat.kernels.simd import TYPES, fill, fma, inner, inverse, root
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -37,7 +37,7 @@ def make_harmonics(lanes: int) -> Harmonics:
 
     @wp.func
     def basis(x: number, y: number, z: number):
-        per_norm = inverse(root(times(x, x) + times(y, y) + times(z, z)))
+        per_norm = inverse(root(fma(x, x, fma(y, y, times(z, z)))))
         x = times(x, per_norm)
         y = times(y, per_norm)
         z = times(z, per_norm)
@@ -87,21 +87,11 @@ def make_harmonics(lanes: int) -> Harmonics:
     @wp.func
     def weigh(x: number, y: number, z: number, weights: table):
         b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14 = basis(x, y, z)
-        s = times(b0, weight_of(weights, 0)) + times(b1, weight_of(weights, 1)) + times(b2, weight_of(weights, 2))
-        s = s + times(b3, weight_of(weights, 3)) + times(b4, weight_of(weights, 4)) + times(b5, weight_of(weights, 5))
-        s = s + times(b6, weight_of(weights, 6)) + times(b7, weight_of(weights, 7)) + times(b8, weight_of(weights, 8))
-        s = (
-            s
-            + times(b9, weight_of(weights, 9))
-            + times(b10, weight_of(weights, 10))
-            + times(b11, weight_of(weights, 11))
-        )
-        s = (
-            s
-            + times(b12, weight_of(weights, 12))
-            + times(b13, weight_of(weights, 13))
-            + times(b14, weight_of(weights, 14))
-        )
+        s = fma(b0, weight_of(weights, 0), fma(b1, weight_of(weights, 1), times(b2, weight_of(weights, 2))))
+        s = fma(b3, weight_of(weights, 3), fma(b4, weight_of(weights, 4), fma(b5, weight_of(weights, 5), s)))
+        s = fma(b6, weight_of(weights, 6), fma(b7, weight_of(weights, 7), fma(b8, weight_of(weights, 8), s)))
+        s = fma(b9, weight_of(weights, 9), fma(b10, weight_of(weights, 10), fma(b11, weight_of(weights, 11), s)))
+        s = fma(b12, weight_of(weights, 12), fma(b13, weight_of(weights, 13), fma(b14, weight_of(weights, 14), s)))
         return inner(s, fill(1.0, s))
 
     return Harmonics(table, evaluate, weigh)

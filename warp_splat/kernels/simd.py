@@ -17,6 +17,7 @@ Kernels that Warp differentiates need operations that know their derivative. The
 Masks are 1 or 0. Masks, constants, whole and rounded numbers have no derivative.
 """
 
+import re
 from typing import NamedTuple
 
 import warp as wp
@@ -51,15 +52,33 @@ LANE_X = wp.constant(vec16(*[float(lane % 4) for lane in range(LANES)]))
 LANE_Y = wp.constant(vec16(*[float(lane // 4) for lane in range(LANES)]))
 
 
+def _vectors(result: str, adjoint: str = ";", kind: str = "float") -> tuple[str, str]:
+    """A function in C++, which sees its arguments as vectors of sixteen, and what its adjoint does.
+
+    LLVM then need not find the vectors among scalars; it splits them where registers are shorter. Arguments named a, b,
+    c, x, y and mask are of type V, n is of type I.
+    """
+    types = "".join(
+        f"typedef {scalar} {name} __attribute__((vector_size({4 * LANES}), aligned(4), may_alias)); "
+        for name, scalar in (("V", "float"), ("I", "int"))
+    )
+    forward, reverse = (
+        re.sub(r"\b(adj_)?(a|b|c|x|y|n|mask|ret)\b", lambda m: f"({'I' if m[0] == 'n' else 'V'}&){m[0]}", code)
+        for code in (result, adjoint)
+    )
+    forward, reverse = (
+        re.sub(r"\b_(fma|sqrt|ceil|floor)\(", r"__builtin_elementwise_\1(", code) for code in (forward, reverse)
+    )
+    if kind == "bool":
+        return f"{types} return {forward};", types + reverse
+    name = {"float": "V", "int": "I"}[kind]
+    return f"{types} wp::vec_t<{LANES}, {kind}> r; ({name}&)r = {forward}; return r;", types + reverse
+
+
 @wp.func
 def fill(value: float, like: float):
     """``value`` in every lane of a variable shaped as ``like``; a constant, without a gradient."""
     return value
-
-
-@wp.func
-def fill(value: float, like: vec16):
-    return vec16(value)
 
 
 @wp.func_grad(fill)
@@ -67,9 +86,8 @@ def adj_fill(value: float, like: float, adj_ret: float):
     pass
 
 
-@wp.func_grad(fill)
-def adj_fill(value: float, like: vec16, adj_ret: vec16):
-    pass
+@wp.func_native(*_vectors("V{} + value"))
+def fill(value: float, like: vec16) -> vec16: ...
 
 
 @wp.func
@@ -77,9 +95,8 @@ def times(a: float, b: float):
     return a * b
 
 
-@wp.func
-def times(a: vec16, b: vec16):
-    return wp.cw_mul(a, b)
+@wp.func_native(*_vectors("a * b", "adj_a = _fma(b, adj_ret, adj_a); adj_b = _fma(a, adj_ret, adj_b);"))
+def times(a: vec16, b: vec16) -> vec16: ...
 
 
 @wp.func
@@ -87,30 +104,24 @@ def times(a: vec16, b: float):
     return a * b
 
 
-_ADJ_FMA = "adj_a = fmaf(b, adj_ret, adj_a); adj_b = fmaf(a, adj_ret, adj_b); adj_c += adj_ret;"
-_LANES = "for (int i = 0; i < 16; ++i)"
-
-
-@wp.func_native("return fmaf(a, b, c);", _ADJ_FMA)
+@wp.func_native(
+    "return fmaf(a, b, c);",
+    "adj_a = fmaf(b, adj_ret, adj_a); adj_b = fmaf(a, adj_ret, adj_b); adj_c += adj_ret;",
+)
 def fma(a: float, b: float, c: float) -> float:
-    """a b + c, rounded once."""
-    ...
+    """The product of ``a`` and ``b`` plus ``c``, rounded once."""
+    return a * b + c  # what Python sees
 
 
 @wp.func_native(
-    f"auto r = c; {_LANES} r.c[i] = fmaf(a.c[i], b.c[i], c.c[i]); return r;",
-    f"""{_LANES} {{
-        adj_a.c[i] = fmaf(b.c[i], adj_ret.c[i], adj_a.c[i]);
-        adj_b.c[i] = fmaf(a.c[i], adj_ret.c[i], adj_b.c[i]);
-        adj_c.c[i] += adj_ret.c[i];
-    }}""",
+    *_vectors("_fma(a, b, c)", "adj_a = _fma(b, adj_ret, adj_a); adj_b = _fma(a, adj_ret, adj_b);adj_c += adj_ret;")
 )
 def fma(a: vec16, b: vec16, c: vec16) -> vec16: ...
 
 
 @wp.func
 def fma(a: vec16, b: float, c: vec16):
-    return fma(a, vec16(b), c)
+    return fma(a, fill(b, a), c)
 
 
 @wp.func
@@ -118,9 +129,8 @@ def over(a: float, b: float):
     return a / b
 
 
-@wp.func
-def over(a: vec16, b: vec16):
-    return wp.cw_div(a, b)
+@wp.func_native(*_vectors("a / b", "V q = adj_ret / b; adj_a += q; adj_b = _fma(-(a / b), q, adj_b);"))
+def over(a: vec16, b: vec16) -> vec16: ...
 
 
 @wp.func
@@ -129,21 +139,14 @@ def inverse(x: float):
     return 1.0 / x
 
 
-@wp.func
-def inverse(x: vec16):
-    return wp.cw_div(vec16(1.0), x)
-
-
 @wp.func_grad(inverse)
 def adj_inverse(x: float, adj_ret: float):
     r = inverse(x)
     wp.adjoint[x] -= adj_ret * r * r
 
 
-@wp.func_grad(inverse)
-def adj_inverse(x: vec16, adj_ret: vec16):
-    r = inverse(x)
-    wp.adjoint[x] -= wp.cw_mul(wp.cw_mul(adj_ret, r), r)
+@wp.func_native(*_vectors("1.0f / x", "V r = 1.0f / x; adj_x -= adj_ret * r * r;"))
+def inverse(x: vec16) -> vec16: ...
 
 
 @wp.func
@@ -152,22 +155,13 @@ def root(x: float):
     return wp.sqrt(x)
 
 
-@wp.func
-def root(x: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.sqrt(x[lane])
-    return r
-
-
 @wp.func_grad(root)
 def adj_root(x: float, adj_ret: float):
     wp.adjoint[x] += adj_ret / (root(x) * 2.0)
 
 
-@wp.func_grad(root)
-def adj_root(x: vec16, adj_ret: vec16):
-    wp.adjoint[x] += wp.cw_div(adj_ret, root(x) * 2.0)
+@wp.func_native(*_vectors("_sqrt(x)", "adj_x += adj_ret / (_sqrt(x) * 2.0f);"))
+def root(x: vec16) -> vec16: ...
 
 
 @wp.func
@@ -176,17 +170,8 @@ def less(a: float, b: float):
     return wp.where(a < b, 1.0, 0.0)
 
 
-@wp.func
-def less(a: vec16, b: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.where(a[lane] < b[lane], 1.0, 0.0)
-    return r
-
-
-@wp.func_grad(less)
-def adj_less(a: vec16, b: vec16, adj_ret: vec16):
-    pass
+@wp.func_native(*_vectors("a < b ? V{} + 1.0f : V{}"))
+def less(a: vec16, b: vec16) -> vec16: ...
 
 
 @wp.func
@@ -195,17 +180,8 @@ def equal(a: float, b: float):
     return wp.where(a == b, 1.0, 0.0)
 
 
-@wp.func
-def equal(a: vec16, b: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.where(a[lane] == b[lane], 1.0, 0.0)
-    return r
-
-
-@wp.func_grad(equal)
-def adj_equal(a: vec16, b: vec16, adj_ret: vec16):
-    pass
+@wp.func_native(*_vectors("a == b ? V{} + 1.0f : V{}"))
+def equal(a: vec16, b: vec16) -> vec16: ...
 
 
 @wp.func
@@ -214,12 +190,8 @@ def some(mask: float):
     return mask > 0.0
 
 
-@wp.func
-def some(mask: vec16):
-    s = int(0)  # a sum of floats would be taken in order
-    for lane in range(LANES):
-        s += int(mask[lane])
-    return s > 0
+@wp.func_native(*_vectors("__builtin_reduce_or((I)(mask > 0.0f)) != 0", kind="bool"))
+def some(mask: vec16) -> bool: ...
 
 
 @wp.func
@@ -228,19 +200,10 @@ def pick(mask: float, a: float, b: float):
     return wp.where(mask > 0.0, a, b)
 
 
-@wp.func
-def pick(mask: vec16, a: vec16, b: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.where(mask[lane] > 0.0, a[lane], b[lane])
-    return r
-
-
-@wp.func_grad(pick)
-def adj_pick(mask: vec16, a: vec16, b: vec16, adj_ret: vec16):
-    zero = vec16(0.0)
-    wp.adjoint[a] += pick(mask, adj_ret, zero)
-    wp.adjoint[b] += pick(mask, zero, adj_ret)
+@wp.func_native(
+    *_vectors("mask > 0.0f ? a : b", "adj_a += mask > 0.0f ? adj_ret : V{}; adj_b += mask > 0.0f ? V{} : adj_ret;")
+)
+def pick(mask: vec16, a: vec16, b: vec16) -> vec16: ...
 
 
 @wp.func
@@ -251,12 +214,8 @@ def where_less(a: float, b: float, x: float, y: float):
     return y
 
 
-@wp.func
-def where_less(a: vec16, b: vec16, x: vec16, y: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.where(a[lane] < b[lane], x[lane], y[lane])
-    return r
+@wp.func_native(*_vectors("a < b ? x : y", "adj_x += a < b ? adj_ret : V{}; adj_y += a < b ? V{} : adj_ret;"))
+def where_less(a: vec16, b: vec16, x: vec16, y: vec16) -> vec16: ...
 
 
 @wp.func
@@ -265,26 +224,18 @@ def whole(x: float):
     return int(x)
 
 
-@wp.func
-def whole(x: vec16):
-    r = vec16i()
-    for lane in range(LANES):
-        r[lane] = int(x[lane])
-    return r
+@wp.func_native(*_vectors("__builtin_convertvector(x, I)", kind="int"))
+def whole(x: vec16) -> vec16i: ...
 
 
 @wp.func
-def real(x: int):
+def real(n: int):
     """From an integer."""
-    return float(x)
+    return float(n)
 
 
-@wp.func
-def real(x: vec16i):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = float(x[lane])
-    return r
+@wp.func_native(*_vectors("__builtin_convertvector(n, V)"))
+def real(n: vec16i) -> vec16: ...
 
 
 @wp.func
@@ -292,12 +243,8 @@ def rounded_up(x: float):
     return wp.ceil(x)
 
 
-@wp.func
-def rounded_up(x: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.ceil(x[lane])
-    return r
+@wp.func_native(*_vectors("_ceil(x)"))
+def rounded_up(x: vec16) -> vec16: ...
 
 
 @wp.func
@@ -305,12 +252,8 @@ def rounded_down(x: float):
     return wp.floor(x)
 
 
-@wp.func
-def rounded_down(x: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.floor(x[lane])
-    return r
+@wp.func_native(*_vectors("_floor(x)"))
+def rounded_down(x: vec16) -> vec16: ...
 
 
 @wp.func
@@ -319,12 +262,8 @@ def fraction(x: float, n: int):
     return x - float(n)
 
 
-@wp.func
-def fraction(x: vec16, n: vec16i):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = x[lane] - float(n[lane])
-    return r
+@wp.func_native(*_vectors("x - __builtin_convertvector(n, V)", "adj_x += adj_ret;"))
+def fraction(x: vec16, n: vec16i) -> vec16: ...
 
 
 @wp.func
@@ -333,22 +272,13 @@ def halved(x: float, n: int):
     return wp.cast(wp.cast(x, int) - (n << 23), float)
 
 
-@wp.func
-def halved(x: vec16, n: vec16i):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.cast(wp.cast(x[lane], int) - (n[lane] << 23), float)
-    return r
-
-
 @wp.func_grad(halved)
 def adj_halved(x: float, n: int, adj_ret: float):
     wp.adjoint[x] += adj_ret * halved(1.0, n)
 
 
-@wp.func_grad(halved)
-def adj_halved(x: vec16, n: vec16i, adj_ret: vec16):  # bits have no derivative that Warp could find
-    wp.adjoint[x] += times(adj_ret, halved(vec16(1.0), n))
+@wp.func_native(*_vectors("(V)((I)x - (n << 23))", "adj_x += adj_ret * (V)((127 - n) << 23);"))
+def halved(x: vec16, n: vec16i) -> vec16: ...
 
 
 @wp.func

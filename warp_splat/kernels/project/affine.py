@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
-from warp_splat.kernels.simd import TYPES, fill, inverse, less, over, pick, times
+from warp_splat.kernels.simd import TYPES, fill, fma, inverse, less, over, pick, times
 
 
 @functools.cache
@@ -20,8 +20,8 @@ def make_pinhole(lanes: int, limited: bool = True) -> wp.Function:
         fy = fill(camera.focal[1], z)
         u = over(x, z)
         v = over(y, z)
-        px = times(fx, u) + fill(camera.principal[0], z)
-        py = times(fy, v) + fill(camera.principal[1], z)
+        px = fma(fx, u, fill(camera.principal[0], z))
+        py = fma(fy, v, fill(camera.principal[1], z))
         if wp.static(limited):  # there the linearization is worthless
             u_min = fill(camera.slope_min[0], z)
             u_max = fill(camera.slope_max[0], z)

@@ -19,7 +19,7 @@ from warp_splat.config import OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.affine import make_pinhole
 from warp_splat.kernels.project.camera_view import CameraView
-from warp_splat.kernels.simd import TYPES, fill, less, over, pick, root, times
+from warp_splat.kernels.simd import TYPES, fill, fma, less, over, pick, root, times
 
 LEAST_REST = wp.constant(1.0 - (OUTLINE / OUTLINE_REACH) ** 2)
 
@@ -60,11 +60,11 @@ def make_outline(lanes: int) -> wp.Function:
         a30 = times(times(k_per_z, sx), t0)
         a31 = times(times(k_per_z, sy), t1)
         a32 = times(times(k_per_z, sz), t2)
-        rest = one - (times(a30, a30) + times(a31, a31) + times(a32, a32))
+        rest = one - (fma(a30, a30, fma(a31, a31, times(a32, a32))))
         has_outline = times(drawn, less(fill(LEAST_REST, z), rest))
         rest = pick(has_outline, rest, one)
-        shift1 = times(a10, a30) + times(a11, a31) + times(a12, a32)
-        shift2 = times(a20, a30) + times(a21, a31) + times(a22, a32)
+        shift1 = fma(a10, a30, fma(a11, a31, times(a12, a32)))
+        shift2 = fma(a20, a30, fma(a21, a31, times(a22, a32)))
         along_x = times(over(k, rest), shift1)
         along_y = times(over(k, rest), shift2)
         shrink = root(rest)
@@ -73,12 +73,12 @@ def make_outline(lanes: int) -> wp.Function:
         return (
             px - along_x,
             py - along_y,
-            over(a10 + times(shift1, a30), shrink),
-            over(a11 + times(shift1, a31), shrink),
-            over(a12 + times(shift1, a32), shrink),
-            over(a20 + times(shift2, a30), shrink),
-            over(a21 + times(shift2, a31), shrink),
-            over(a22 + times(shift2, a32), shrink),
+            over(fma(shift1, a30, a10), shrink),
+            over(fma(shift1, a31, a11), shrink),
+            over(fma(shift1, a32, a12), shrink),
+            over(fma(shift2, a30, a20), shrink),
+            over(fma(shift2, a31, a21), shrink),
+            over(fma(shift2, a32, a22), shrink),
             has_outline,
         )
 

@@ -32,6 +32,7 @@ from warp_splat.kernels.simd import (
     columns,
     equal,
     fill,
+    fma,
     inverse,
     less,
     over,
@@ -85,21 +86,21 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         x = times(qx, scale)
         y = times(qy, scale)
         z = times(qz, scale)
-        per_norm = inverse(root(times(w, w) + times(x, x) + times(y, y) + times(z, z)))
+        per_norm = inverse(root(fma(w, w, fma(x, x, fma(y, y, times(z, z))))))
         w = times(w, per_norm)
         x = times(x, per_norm)
         y = times(y, per_norm)
         z = times(z, per_norm)
         return (
-            one - times(two, times(y, y) + times(z, z)),
+            one - times(two, fma(y, y, times(z, z))),
             times(two, times(x, y) - times(w, z)),
-            times(two, times(x, z) + times(w, y)),
-            times(two, times(x, y) + times(w, z)),
-            one - times(two, times(x, x) + times(z, z)),
+            times(two, fma(x, z, times(w, y))),
+            times(two, fma(x, y, times(w, z))),
+            one - times(two, fma(x, x, times(z, z))),
             times(two, times(y, z) - times(w, x)),
             times(two, times(x, z) - times(w, y)),
-            times(two, times(y, z) + times(w, x)),
-            one - times(two, times(x, x) + times(y, y)),
+            times(two, fma(y, z, times(w, x))),
+            one - times(two, fma(x, x, times(y, y))),
         )
 
     @wp.func
@@ -109,10 +110,10 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         c1 = times(a12, a20) - times(a10, a22)
         c2 = times(a10, a21) - times(a11, a20)
         return (
-            times(a10, a10) + times(a11, a11) + times(a12, a12),
-            times(a10, a20) + times(a11, a21) + times(a12, a22),
-            times(a20, a20) + times(a21, a21) + times(a22, a22),
-            times(c0, c0) + times(c1, c1) + times(c2, c2),
+            fma(a10, a10, fma(a11, a11, times(a12, a12))),
+            fma(a10, a20, fma(a11, a21, times(a12, a22))),
+            fma(a20, a20, fma(a21, a21, times(a22, a22))),
+            fma(c0, c0, fma(c1, c1, times(c2, c2))),
         )
 
     @wp.func
@@ -129,7 +130,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
         """Half sides of the box where alpha >= alpha_min, its farthest point's distance, rounded up [px]."""
         reach = reaches(opacity, alpha_min)
-        widest = (xx + yy + root(times(xx - yy, xx - yy) + times(xy, xy) * 4.0)) * 0.5  # variance of the long axis
+        widest = (xx + yy + root(fma(xx - yy, xx - yy, times(xy, xy) * 4.0))) * 0.5  # variance of the long axis
         return (
             root(times(reach, xx)),
             root(times(reach, yy)),
@@ -179,9 +180,9 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         zero = fill(0.0, opacity)
         one = fill(1.0, opacity)
         # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
-        nought = times(mx, zero) + times(my, zero) + times(mz, zero) + times(opacity, zero)
-        nought = nought + times(qw, zero) + times(qx, zero) + times(qy, zero) + times(qz, zero)
-        finite = equal(nought + times(sx, zero) + times(sy, zero) + times(sz, zero), zero)
+        nought = fma(mx, zero, fma(my, zero, fma(mz, zero, times(opacity, zero))))
+        nought = fma(qw, zero, fma(qx, zero, fma(qy, zero, fma(qz, zero, nought))))
+        finite = equal(fma(sx, zero, fma(sy, zero, fma(sz, zero, nought))), zero)
         size = largest(qw, qx, qy, qz)
         valid = times(finite, less(zero, size))
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
@@ -193,7 +194,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         r20 = turn(camera, 2, 0, one)
         r21 = turn(camera, 2, 1, one)
         r22 = turn(camera, 2, 2, one)
-        depth = times(r20, ox) + times(r21, oy) + times(r22, oz)
+        depth = fma(r20, ox, fma(r21, oy, times(r22, oz)))
         here = times(here, less(fill(NEAR, one), depth))
         if not some(here):
             return
@@ -208,26 +209,26 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         sx = pick(here, sx, one)
         sy = pick(here, sy, one)
         sz = pick(here, sz, one)
-        x = times(turn(camera, 0, 0, one), ox) + times(turn(camera, 0, 1, one), oy) + times(turn(camera, 0, 2, one), oz)
-        y = times(turn(camera, 1, 0, one), ox) + times(turn(camera, 1, 1, one), oy) + times(turn(camera, 1, 2, one), oz)
+        x = fma(turn(camera, 0, 0, one), ox, fma(turn(camera, 0, 1, one), oy, times(turn(camera, 0, 2, one), oz)))
+        y = fma(turn(camera, 1, 0, one), ox, fma(turn(camera, 1, 1, one), oy, times(turn(camera, 1, 2, one), oz)))
         px, py, j00, j01, j02, j10, j11, j12 = lens(camera, x, y, z)
         # a1, a2; scaled last, or needles would lose digits of the scales' gradients
-        a10 = times(sx, times(j00, m00) + times(j01, m10) + times(j02, m20))
-        a11 = times(sy, times(j00, m01) + times(j01, m11) + times(j02, m21))
-        a12 = times(sz, times(j00, m02) + times(j01, m12) + times(j02, m22))
-        a20 = times(sx, times(j10, m00) + times(j11, m10) + times(j12, m20))
-        a21 = times(sy, times(j10, m01) + times(j11, m11) + times(j12, m21))
-        a22 = times(sz, times(j10, m02) + times(j11, m12) + times(j12, m22))
+        a10 = times(sx, fma(j00, m00, fma(j01, m10, times(j02, m20))))
+        a11 = times(sy, fma(j00, m01, fma(j01, m11, times(j02, m21))))
+        a12 = times(sz, fma(j00, m02, fma(j01, m12, times(j02, m22))))
+        a20 = times(sx, fma(j10, m00, fma(j11, m10, times(j12, m20))))
+        a21 = times(sy, fma(j10, m01, fma(j11, m11, times(j12, m21))))
+        a22 = times(sz, fma(j10, m02, fma(j11, m12, times(j12, m22))))
         if wp.static(projection.outline is not None):
-            t0 = times(r20, m00) + times(r21, m10) + times(r22, m20)
-            t1 = times(r20, m01) + times(r21, m11) + times(r22, m21)
-            t2 = times(r20, m02) + times(r21, m12) + times(r22, m22)
+            t0 = fma(r20, m00, fma(r21, m10, times(r22, m20)))
+            t1 = fma(r20, m01, fma(r21, m11, times(r22, m21)))
+            t2 = fma(r20, m02, fma(r21, m12, times(r22, m22)))
             px, py, a10, a11, a12, a20, a21, a22, here = outline(
                 camera, z, px, py, a10, a11, a12, a20, a21, a22, t0, t1, t2, sx, sy, sz, here
             )
         xx, xy, yy, sharp = covariance(a10, a11, a12, a20, a21, a22)
         blur = fill(BLUR, one)
-        det = sharp + times(blur, xx + yy) + times(blur, blur)
+        det = fma(blur, xx + yy, fma(blur, blur, sharp))
         xx = xx + blur
         yy = yy + blur
         opacity = pick(here, opacity, one)
