@@ -157,6 +157,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
     try:
         config = parse(sys.argv[1:] if arguments is None else arguments)
+        if isinstance(config, TrainConfig) and config.machine.portable:
+            os.environ["WARP_SPLAT_PORTABLE"] = "1"  # read when kernels are loaded
         # idle OpenMP threads of torch must not spin beside busy kernels; read when torch is loaded
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
         os.environ.setdefault("GOMP_SPINCOUNT", "0")

@@ -9,11 +9,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_splat.kernels.compiler import LANES_IN_ORDER
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import LOG2_E
 from warp_splat.kernels.simd import TYPES, equal, fill, halved, less, over, pick, times, whole
 
-wp.set_module_options(LANES_IN_ORDER)
+wp.set_module_options(FORWARD_ONLY)
 
 LARGEST = wp.constant(88.0)  # logarithm of a scale; float32 ends soon after
 LEAST = wp.constant(-87.0)
@@ -59,7 +59,7 @@ def make_activate(lanes: int) -> wp.Kernel:
     """The activations of ``lanes`` Gaussians at once."""
     number = TYPES[lanes].number
 
-    @wp.kernel(module="unique", module_options=dict(LANES_IN_ORDER))
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def activate(
         first: int,  # group of Gaussians of this slice
         logarithms: wp.array[number],  # [3 N / lanes]
@@ -81,7 +81,7 @@ def make_adj_activate(lanes: int) -> wp.Kernel:
     """The adjoint of :func:`make_activate`'s kernel, from its results."""
     number = TYPES[lanes].number
 
-    @wp.kernel(module="unique", module_options=dict(LANES_IN_ORDER))
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adj_activate(
         first: int,  # group of Gaussians of this slice
         scales: wp.array[number],  # [3 N / lanes]

@@ -9,10 +9,10 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.compiler import LANES_IN_ORDER
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import TYPES, fill, over, pick, root, times
 
-wp.set_module_options(LANES_IN_ORDER)  # regrouped, v would overflow for gradients above 1e19
+wp.set_module_options(FORWARD_ONLY)  # regrouped, v would overflow for gradients above 1e19
 
 #: Columns of the numbers of a table: rate over bias, eps, root of 1 / bias of v, and each beta with 1 - beta.
 RATE, EPS, PER_ROOT, BETA1, REST1, BETA2, REST2 = (wp.constant(column) for column in range(7))
@@ -40,7 +40,7 @@ def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
                 mask[lane] = wp.where(radii[row] > 0, 1.0, 0.0)
             return mask
 
-    @wp.kernel(module="unique", module_options=dict(LANES_IN_ORDER))
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adam(
         first: int,  # group of rows of this slice
         widths: wp.array[int],  # [T] numbers in a row

@@ -1,28 +1,26 @@
-"""How Warp builds the kernels for the CPU.
+"""How Warp builds the kernels for the CPU, so that every processor computes the same bytes.
 
-The flags name what the compiler may do, not a processor. ``-march=native`` is Warp's way to say "this machine". The
-width is an upper bound, which AVX2 or NEON cut down. No flag lets the compiler assume that NaN or infinity never occur.
+The compiler fuses no multiplication with an addition and regroups no sum: where it would, depends on the processor's
+instructions and width. What pays is fused by hand (:func:`.simd.fma`), and lanes are vectors. No flag lets it assume
+that NaN or infinity never occur. The width is an upper bound, which AVX2 or NEON cut down.
 """
+
+import os
+
+#: Warp's way to say "this machine", or another processor for tests: "-target-cpu x86-64-v3".
+TARGET = os.environ.get("WARP_SPLAT_TARGET", "-march=native")
+
+#: Multiplications and additions apart, where :func:`.simd.fma` fuses them: x86-64 without AVX2 has no such instruction.
+PORTABLE = os.environ.get("WARP_SPLAT_PORTABLE", "") == "1"
 
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its
 #: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie.
-_FLAGS = "-march=native -ffp-contract=off -fno-signed-zeros -mstackrealign"
-
-#: Of most modules. Sums over lanes may be regrouped, or they would not vectorize.
-FORWARD_ONLY = {
-    "enable_backward": False,
+DIFFERENTIABLE = {
     "optimization_level": 3,
-    "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512",
+    "cpu_compiler_flags": f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512",
 }
 
-#: Of those whose sums keep their order: (mean - center) - center_low is nothing but that.
-IN_ORDER = {"enable_backward": False, "optimization_level": 3, "cpu_compiler_flags": _FLAGS}
-
-#: Of those in lanes: the loss, whose bits then do not depend on how a compiler regroups.
-LANES_IN_ORDER = {**IN_ORDER, "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512"}
+FORWARD_ONLY = {**DIFFERENTIABLE, "enable_backward": False}
 
 #: Of the loops over blocks in lanes: they are short, and vectorized across blocks they take three times as long.
 IN_LANES = {**FORWARD_ONLY, "cpu_compiler_flags": f"{FORWARD_ONLY['cpu_compiler_flags']} -fno-vectorize"}
-
-#: Of lanes that Warp differentiates.
-DIFFERENTIABLE_LANES = {"optimization_level": 3, "cpu_compiler_flags": f"{_FLAGS} -mprefer-vector-width=512"}

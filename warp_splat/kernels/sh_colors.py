@@ -15,14 +15,14 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.compiler import LANES_IN_ORDER
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.harmonics import C0, make_harmonics
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.shared import INVALID
 from warp_splat.kernels.simd import TYPES, pick
 from warp_splat.kernels.structs import HarmonicsView, Splats2DView, mat53, mat73
 
-OPTIONS = {**LANES_IN_ORDER, "max_unroll": 15}  # unrolls all loops but those over lanes
+OPTIONS = {**FORWARD_ONLY, "max_unroll": 15}  # unrolls all loops but those over lanes
 
 
 @functools.cache

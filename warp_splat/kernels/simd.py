@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, PORTABLE
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -52,27 +52,32 @@ LANE_X = wp.constant(vec16(*[float(lane % 4) for lane in range(LANES)]))
 LANE_Y = wp.constant(vec16(*[float(lane // 4) for lane in range(LANES)]))
 
 
+def _fused(number: str, builtin: str) -> str:
+    """In C++: the function ``fused`` of three numbers, a b + c."""
+    result = "a * b + c" if PORTABLE else f"{builtin}(a, b, c)"
+    return f"auto fused = []({number} a, {number} b, {number} c) {{ return {result}; }}; "
+
+
+_VECTORS = "".join(
+    f"typedef {scalar} {name} __attribute__((vector_size({4 * LANES}), aligned(4), may_alias)); "
+    for name, scalar in (("V", "float"), ("I", "int"))
+) + _fused("V", "__builtin_elementwise_fma")
+
+
 def _vectors(result: str, adjoint: str = ";", kind: str = "float") -> tuple[str, str]:
     """A function in C++, which sees its arguments as vectors of sixteen, and what its adjoint does.
 
     LLVM then need not find the vectors among scalars; it splits them where registers are shorter. Arguments named a, b,
     c, x, y and mask are of type V, n is of type I.
     """
-    types = "".join(
-        f"typedef {scalar} {name} __attribute__((vector_size({4 * LANES}), aligned(4), may_alias)); "
-        for name, scalar in (("V", "float"), ("I", "int"))
-    )
     forward, reverse = (
         re.sub(r"\b(adj_)?(a|b|c|x|y|n|mask|ret)\b", lambda m: f"({'I' if m[0] == 'n' else 'V'}&){m[0]}", code)
         for code in (result, adjoint)
     )
-    forward, reverse = (
-        re.sub(r"\b_(fma|sqrt|ceil|floor)\(", r"__builtin_elementwise_\1(", code) for code in (forward, reverse)
-    )
     if kind == "bool":
-        return f"{types} return {forward};", types + reverse
+        return f"{_VECTORS} return {forward};", _VECTORS + reverse
     name = {"float": "V", "int": "I"}[kind]
-    return f"{types} wp::vec_t<{LANES}, {kind}> r; ({name}&)r = {forward}; return r;", types + reverse
+    return f"{_VECTORS} wp::vec_t<{LANES}, {kind}> r; ({name}&)r = {forward}; return r;", _VECTORS + reverse
 
 
 @wp.func
@@ -95,7 +100,7 @@ def times(a: float, b: float):
     return a * b
 
 
-@wp.func_native(*_vectors("a * b", "adj_a = _fma(b, adj_ret, adj_a); adj_b = _fma(a, adj_ret, adj_b);"))
+@wp.func_native(*_vectors("a * b", "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b);"))
 def times(a: vec16, b: vec16) -> vec16: ...
 
 
@@ -105,8 +110,8 @@ def times(a: vec16, b: float):
 
 
 @wp.func_native(
-    "return fmaf(a, b, c);",
-    "adj_a = fmaf(b, adj_ret, adj_a); adj_b = fmaf(a, adj_ret, adj_b); adj_c += adj_ret;",
+    _fused("float", "fmaf") + "return fused(a, b, c);",
+    _fused("float", "fmaf") + "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b); adj_c += adj_ret;",
 )
 def fma(a: float, b: float, c: float) -> float:
     """The product of ``a`` and ``b`` plus ``c``, rounded once."""
@@ -114,7 +119,7 @@ def fma(a: float, b: float, c: float) -> float:
 
 
 @wp.func_native(
-    *_vectors("_fma(a, b, c)", "adj_a = _fma(b, adj_ret, adj_a); adj_b = _fma(a, adj_ret, adj_b);adj_c += adj_ret;")
+    *_vectors("fused(a, b, c)", "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b);adj_c += adj_ret;")
 )
 def fma(a: vec16, b: vec16, c: vec16) -> vec16: ...
 
@@ -129,7 +134,7 @@ def over(a: float, b: float):
     return a / b
 
 
-@wp.func_native(*_vectors("a / b", "V q = adj_ret / b; adj_a += q; adj_b = _fma(-(a / b), q, adj_b);"))
+@wp.func_native(*_vectors("a / b", "V q = adj_ret / b; adj_a += q; adj_b = fused(-(a / b), q, adj_b);"))
 def over(a: vec16, b: vec16) -> vec16: ...
 
 
@@ -160,7 +165,9 @@ def adj_root(x: float, adj_ret: float):
     wp.adjoint[x] += adj_ret / (root(x) * 2.0)
 
 
-@wp.func_native(*_vectors("_sqrt(x)", "adj_x += adj_ret / (_sqrt(x) * 2.0f);"))
+@wp.func_native(
+    *_vectors("__builtin_elementwise_sqrt(x)", "adj_x += adj_ret / (__builtin_elementwise_sqrt(x) * 2.0f);")
+)
 def root(x: vec16) -> vec16: ...
 
 
@@ -243,7 +250,7 @@ def rounded_up(x: float):
     return wp.ceil(x)
 
 
-@wp.func_native(*_vectors("_ceil(x)"))
+@wp.func_native(*_vectors("__builtin_elementwise_ceil(x)"))
 def rounded_up(x: vec16) -> vec16: ...
 
 
@@ -252,7 +259,7 @@ def rounded_down(x: float):
     return wp.floor(x)
 
 
-@wp.func_native(*_vectors("_floor(x)"))
+@wp.func_native(*_vectors("__builtin_elementwise_floor(x)"))
 def rounded_down(x: vec16) -> vec16: ...
 
 

@@ -31,10 +31,10 @@ import math
 
 import warp as wp
 
-from warp_splat.kernels.compiler import LANES_IN_ORDER
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import LANES, fill, fma, over, times, total, vec16, where_less
 
-wp.set_module_options(LANES_IN_ORDER)
+wp.set_module_options(FORWARD_ONLY)
 
 WINDOW = 11
 RADIUS = WINDOW // 2

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.compiler import LANES_IN_ORDER
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import TYPES, columns, equal, fill, less, pick, real, root, times
 
 
@@ -13,7 +13,7 @@ def make_observe(lanes: int) -> wp.Kernel:
     """Of ``lanes`` Gaussians at once."""
     number, integer, row2, _row3, _row4 = TYPES[lanes]
 
-    @wp.kernel(module="unique", module_options=dict(LANES_IN_ORDER))
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def observe(
         first: int,  # group of Gaussians of this slice
         half_size: wp.vec2,  # px, of the image

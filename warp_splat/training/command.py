@@ -23,7 +23,17 @@ from warp_splat.runtime.interrupts import interruptible
 from warp_splat.training import memory
 from warp_splat.training.opening import Say, open_scene, refuse_other_training, resolve, speaker, write_inputs
 from warp_splat.training.options import ReportOptions, TrainConfig, check_train
-from warp_splat.training.record import Run, finish, how_to_continue, keep, restore, save_model, save_or_warn, warn
+from warp_splat.training.record import (
+    Run,
+    finish,
+    how_to_continue,
+    keep,
+    restore,
+    save_model,
+    save_or_warn,
+    sha256_of,
+    warn,
+)
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
 
@@ -133,7 +143,15 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say)
         elsewhere = f"The model is not in {run.folder}, but in {run.saved}; see the warning, and move it."
         tqdm.write(elsewhere, file=sys.stderr)
         return 1
-    return 130 if run.iteration < end else 0
+    if run.iteration < end:
+        return 130
+    verify = trainer.config.report.verify
+    if trainer.processes.rank == 0 and not (found := sha256_of(run)).startswith(verify):
+        raise InputError(
+            f"--verify: expected a model whose sha256 begins with {verify}, got {found}; another scene, version, "
+            "option or kind of device makes another model, see docs/performance.md."
+        )
+    return 0
 
 
 def _watched(trainer: Trainer, run: Run) -> AbstractContextManager[TrainingViewer | None]:

@@ -14,6 +14,7 @@ from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
 from warp_splat.formats.ply import save_points
+from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch
 from warp_splat.runtime.distributed import Processes
@@ -44,6 +45,8 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
     if config.report.tensorboard:
         writer_class()
+    if machine.portable and not PORTABLE:
+        raise InputError("portable: expected to be set before kernels are loaded; set WARP_SPLAT_PORTABLE=1 instead.")
     begun = _verified(data.start_checkpoint) if data.start_checkpoint else None
     done = begun.count("iteration") if begun else 0
     if begun and done > iterations:  # at the end, what is written there is written again

@@ -108,6 +108,7 @@ class ReportOptions:
     tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
     viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
     port: int = reporting(PORT, PORT_HELP)
+    verify: str = reporting("", "the sha256 that the model must have, or how it begins; exit code 1 if it has another")
     profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot")
 
 
@@ -119,6 +120,9 @@ class MachineOptions:
     data_device: str = machinery("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
     threads: int = machinery(
         0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)", least=0
+    )
+    portable: bool = machinery(
+        False, "multiply and add apart, as processors without fused multiply-adds do: slower, the same bytes there, too"
     )
 
 
@@ -202,6 +206,8 @@ def check_train(config: TrainConfig) -> str | None:
             return f"{name}: expected a finite number, at least 0, got {value}."
         if type(value) is int and value < (least := item.metadata.get("least", 0)):
             return f"{name}: expected at least {least}, got {value}."
+    if (verify := config.report.verify) and (len(verify) < 8 or set(verify) - set("0123456789abcdef")):
+        return f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
     if learn.lambda_dssim > 1:
         return f"--lambda_dssim: expected 0 to 1, got {learn.lambda_dssim}."
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:

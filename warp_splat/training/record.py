@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 import sys
 import tempfile
@@ -134,6 +135,12 @@ def how_to_continue(folder: Path, processes: Processes) -> str:
     return shlex.join([*program, "--resume", str(folder)])
 
 
+def sha256_of(run: Run) -> str:
+    """The hash of the saved model, a .ply file: equal where the bytes are (docs/performance.md says where)."""
+    assert run.saved
+    return hashlib.sha256(run.saved.read_bytes()).hexdigest()
+
+
 def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     """Pictures, curves and numbers of the saved model, and where they lie."""
     wall = time.perf_counter() - run.start
@@ -142,6 +149,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         "split": split,
         "iterations": run.iteration,
         "gaussians": len(trainer.model),
+        "sha256": sha256_of(run),
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
         "processes": trainer.processes.count,

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from warp_splat.kernels.compiler import IN_ORDER
+from warp_splat.kernels.compiler import FORWARD_ONLY
 
-wp.set_module_options(IN_ORDER)
+wp.set_module_options(FORWARD_ONLY)
 
 
 @wp.kernel

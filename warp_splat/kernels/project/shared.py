@@ -22,7 +22,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR
-from warp_splat.kernels.compiler import DIFFERENTIABLE_LANES
+from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
@@ -156,7 +156,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
 
     parts = {"lens": lens, "rotation": rotation, "covariance": covariance} | ({"outline": outline} if outline else {})
 
-    @kernel_of_parts(DIFFERENTIABLE_LANES, **parts)
+    @kernel_of_parts(DIFFERENTIABLE, **parts)
     def project(
         first: int,  # group of Gaussians of this slice
         camera: CameraView,
