@@ -126,7 +126,7 @@ def fma(a: vec16, b: vec16, c: vec16) -> vec16: ...
 
 @wp.func
 def fma(a: vec16, b: float, c: vec16):
-    return fma(a, fill(b, a), c)
+    return fma(a, vec16(b), c)  # not fill: it is no constant
 
 
 @wp.func
