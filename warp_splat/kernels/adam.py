@@ -12,7 +12,7 @@ import warp as wp
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import TYPES, fill, over, pick, root, times
 
-wp.set_module_options(FORWARD_ONLY)  # regrouped, v would overflow for gradients above 1e19
+wp.set_module_options(FORWARD_ONLY)
 
 #: Columns of the numbers of a table: rate over bias, eps, root of 1 / bias of v, and each beta with 1 - beta.
 RATE, EPS, PER_ROOT, BETA1, REST1, BETA2, REST2 = (wp.constant(column) for column in range(7))
