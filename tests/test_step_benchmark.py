@@ -19,9 +19,11 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import derivatives  # noqa: E402
+import gpu_steps  # noqa: E402
 import limits  # noqa: E402
 import made_up  # noqa: E402
 import savings  # noqa: E402
+import serial  # noqa: E402
 import step  # noqa: E402
 import work  # noqa: E402
 
@@ -144,3 +146,16 @@ def test_degree_rises_without_a_compilation(monkeypatch, capsys):
         trainer.update(iteration)
         degrees.add(trainer.degree)
     assert degrees == {0, 1, 2, 3} and "Module" not in capsys.readouterr().out
+
+
+def test_serial_time_is_what_slices_do_not_share(two_threads):
+    """Spans by hand; and a step, of which no stage is longer in serial than it is."""
+    assert serial.shared([(0.0, 2.0), (1.0, 4.0), (1.5, 1.75), (6.0, 7.0)], 0.5, 6.5) == pytest.approx(1.0)
+    assert (
+        serial.shared([(0.0, 2.0), (1.0, 4.0)], 1.5, 3.0) == pytest.approx(0.5) and serial.shared([], 0.0, 1.0) == 0.0
+    )
+    job = launch._Job
+    seconds, alone = serial.measure(made_up.steps_of(made_up.make_trainer(3000, 64, 48, "cpu")), 2)
+    assert launch._Job is job and all(
+        0.0 <= alone[stage] <= seconds[stage] for stage in (*gpu_steps.STAGES, "whole step")
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -47,16 +48,24 @@ def random_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
 
 def _along_rays(cameras: list[Camera], extent: float, random: np.random.Generator) -> np.ndarray:
     """COUNT points [COUNT, 3], as many in front of each camera up to one."""
-    depths = extent * np.exp(random.uniform(*np.log(DEPTHS), COUNT))
+    depths = extent * DEPTHS[0] * _power(DEPTHS[1] / DEPTHS[0], random.uniform(size=COUNT))
     pixels, points = random.uniform(size=(COUNT, 2)), np.empty((COUNT, 3))
     for index, camera in enumerate(cameras):
         mine = slice(index, None, len(cameras))
         x = (pixels[mine, 0] * camera.width - camera.cx) / camera.fx
         y = (pixels[mine, 1] * camera.height - camera.cy) / camera.fy
-        points[mine] = (
-            np.stack([x, y, np.ones_like(x)], 1) * depths[mine, None] - camera.translation
-        ) @ camera.rotation
+        seen = np.stack([x, y, np.ones_like(x)], 1) * depths[mine, None] - camera.translation
+        points[mine] = (seen[:, :, None] * camera.rotation).sum(1)
     return points
+
+
+def _power(base: float, shares: np.ndarray) -> np.ndarray:
+    """``base`` to powers of 0 to 1, multiples of 2^-16, by square roots: NumPy's exponential differs by processor."""
+    values, bits = np.ones(len(shares)), (shares * 2**16).astype(np.int64)
+    for place in reversed(range(16)):
+        base = math.sqrt(base)
+        values = np.where(bits >> place & 1, values * base, values)
+    return values
 
 
 def load_start(path: str, report: Callable[[str], None]) -> tuple[SplatFile, np.ndarray, np.ndarray]:

@@ -211,16 +211,24 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
             "correct the file."
         )
     given = world_from_camera[:3, :3]
-    u, scales, vt = np.linalg.svd(given)  # u @ vt is the nearest rotation, without the scale
+    u, scales, vt = np.linalg.svd(given)  # u @ vt is the nearest rotation
     is_scaled_rotation = np.linalg.det(u @ vt) > 0 and scales[2] > 0 and scales[0] - scales[2] <= TOLERANCE * scales[0]
     if not is_scaled_rotation or not np.allclose(world_from_camera[3], (0, 0, 0, 1)):
         raise InputError(
             f"{where}: expected transform_matrix to be a rotation and a translation (camera to world), but its axes "
             "are sheared, mirrored or scaled unequally, or its last row is not 0 0 0 1; correct the file."
         )
-    exact = np.abs(given @ given.T - np.eye(3)).max() <= 1e-12  # LAPACK's last bits differ by processor
-    rotation = ((given if exact else u @ vt) * (1, -1, -1)).T  # OpenGL's y and z axes point the other way
-    return rotation, -rotation @ world_from_camera[:3, 3]
+    rotation = (_nearest_rotation(given) * (1, -1, -1)).T  # OpenGL's y and z axes point the other way
+    return rotation, -(rotation * world_from_camera[:3, 3]).sum(1)
+
+
+def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Of a matrix that is almost a rotation times a factor (Higham 1986): LAPACK's last bits differ by processor."""
+    matrix = matrix / np.sqrt((matrix * matrix).sum() / 3.0)
+    for _ in range(4):  # each doubles the digits, of which TOLERANCE leaves three
+        cofactors = np.cross(matrix[[1, 2, 0]], matrix[[2, 0, 1]])
+        matrix = 0.5 * (matrix + cofactors / (cofactors[0] * matrix[0]).sum())
+    return matrix
 
 
 def _value(content: Any, key: str, where: str | Path) -> Any:

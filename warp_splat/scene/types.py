@@ -12,7 +12,7 @@ from warp_splat.formats.splats import SplatFile
 
 def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Which of ``points`` [P, 3] lie in front of the camera and inside its image, [P] bool."""
-    x, y, z = camera.rotation @ points.T + camera.translation[:, None]
+    x, y, z = (camera.rotation[:, :, None] * points.T).sum(1) + camera.translation[:, None]
     in_width = (x * camera.fx + z * camera.cx >= 0) & (x * camera.fx + z * camera.cx <= z * camera.width)
     in_height = (y * camera.fy + z * camera.cy >= 0) & (y * camera.fy + z * camera.cy <= z * camera.height)
     return (z > 0) & in_width & in_height

@@ -251,7 +251,7 @@ def _missing(groups: int, length: int) -> torch.Tensor:
     """The share of the window beyond the ends of a row, by place in the row, [G, LANES]."""
     columns = length // ssim.CHANNELS
     tap = np.arange(columns)[:, None] + np.arange(ssim.WINDOW) - ssim.RADIUS
-    share = ((tap < 0) | (tap >= columns)) @ np.array(list(ssim.WEIGHTS))
+    share = (((tap < 0) | (tap >= columns)) * np.array(list(ssim.WEIGHTS))).sum(1)  # in one order, unlike a product
     missing = torch.zeros(groups * LANES, dtype=torch.float32, device="cpu")
     missing[:length] = torch.from_numpy(np.repeat(share, ssim.CHANNELS))
     return missing.view(groups, LANES)

@@ -1,0 +1,158 @@
+"""What keeps a training step from being faster on more cores: work of one thread only, and bytes that must move.
+
+Serial is the time in which fewer than two threads are at work on slices of a launch. On P cores, a stage is predicted
+to take
+
+    serial + max((time on one thread - serial) / P, bytes / bandwidth)
+
+with the bytes of ``work.py`` and half of one thread's bandwidth per core: 16 cores have 8 times as much. With more
+threads than cores, serial time must not grow: that checks the bookkeeping. Sizes are those of ``step.py``; times are
+the least of several rounds.
+
+    python benchmarks/serial.py [-s path/to/fox --models output/fox] [--out docs/benchmarks]
+"""
+
+import argparse
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable
+
+from common import machine, write_table
+from gpu_steps import STAGES
+from limits import measure_limits
+from made_up import VIEWS, steps_of
+from step import add_arguments, trainers
+from work import Counts, count, mean, work_of
+
+from warp_splat.config import CORES, RasterOptions
+from warp_splat.raster.data import Gaussians
+from warp_splat.runtime import launch
+from warp_splat.training.trainer import Trainer
+
+CORES_PREDICTED = (4, 8, 16, 32)
+SHARED, MORE = max(CORES, 2), 4 * max(CORES, 2)  # threads that share the work
+HOST, WHOLE = "host", "whole step"
+
+Spans = list[tuple[float, float]]
+
+
+class Clock(defaultdict):
+    """Seconds of each stage, as ``launch.stage`` adds them, and of those the seconds in which threads shared work."""
+
+    def __init__(self):
+        super().__init__(float)
+        self.spans: Spans = []  # of slices, in any order
+        self.busy: dict[str, float] = defaultdict(float)
+        self.lock = threading.Lock()
+
+    def __setitem__(self, stage: str, total: float) -> None:
+        end = time.perf_counter()
+        self.busy[stage] += shared(self.spans, end - (total - self.get(stage, 0.0)), end)
+        super().__setitem__(stage, total)
+
+
+def shared(spans: Spans, start: float, end: float) -> float:
+    """Seconds between ``start`` and ``end`` in which at least two of ``spans`` overlap."""
+    within = [(max(begin, start), min(stop, end)) for begin, stop in spans if begin < end and stop > start]
+    events = sorted([(begin, 1) for begin, _ in within] + [(stop, -1) for _, stop in within])
+    found, running, before = 0.0, 0, start
+    for moment, change in events:
+        found += moment - before if running > 1 else 0.0
+        running, before = running + change, moment
+    return found
+
+
+def timed(clock: Clock, run: Callable[[], None]) -> Callable[[], None]:
+    """A slice that notes when it ran."""
+
+    def call() -> None:
+        begin = time.perf_counter()
+        try:
+            run()
+        finally:
+            with clock.lock:
+                clock.spans.append((begin, time.perf_counter()))
+
+    return call
+
+
+def measure(step: Callable[[], None], threads: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Seconds of each stage and of the whole step, and of those in which no work was shared; means over VIEWS steps."""
+    clock, job = Clock(), launch._Job
+    launch.set_threads(threads)
+    launch._seconds, launch._Job = clock, lambda slices: job([timed(clock, run) for run in slices])
+    whole = busy = 0.0
+    try:
+        for _ in range(VIEWS):
+            clock.spans.clear()
+            start = time.perf_counter()
+            step()
+            end = time.perf_counter()
+            whole, busy = whole + end - start, busy + shared(clock.spans, start, end)
+    finally:
+        launch._seconds, launch._Job = None, job
+    seconds = {stage: clock.get(stage, 0.0) / VIEWS for stage in STAGES}
+    serial = {stage: seconds[stage] - clock.busy[stage] / VIEWS for stage in STAGES}
+    for table, total in ((seconds, whole / VIEWS), (serial, (whole - busy) / VIEWS)):
+        table |= {HOST: total - sum(table.values()), WHOLE: total}
+    return seconds, serial
+
+
+def least(records: list[dict[str, float]]) -> dict[str, float]:
+    return {stage: min(record[stage] for record in records) for stage in records[0]}
+
+
+def measure_trainer(trainer: Trainer, rounds: int) -> tuple[dict, dict, dict]:
+    """By stage: seconds on one thread, and serial ones with SHARED and with MORE threads. They take turns."""
+    step, found = steps_of(trainer), defaultdict(list)
+    for number in range(-1, rounds):
+        for threads in (1, SHARED, MORE):
+            measured = measure(step, threads)
+            if number >= 0:
+                found[threads].append(measured)
+    (alone, _), (_, serial), (_, check) = (
+        (least([seconds for seconds, _ in found[threads]]), least([serial for _, serial in found[threads]]))
+        for threads in (1, SHARED, MORE)
+    )
+    return alone, serial, check
+
+
+def predict(alone: dict, serial: dict, counts: Counts, bandwidth: float, cores: int) -> dict[str, float]:
+    """Seconds of each stage on so many cores."""
+    work, found = work_of(counts), {}
+    for stage in [*STAGES, HOST]:
+        least = work[stage][0] / (0.5 * cores * bandwidth)
+        found[stage] = serial[stage] + max((alone[stage] - serial[stage]) / cores, least)
+    return {**found, WHOLE: sum(found.values())}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add_arguments(parser)
+    arguments = parser.parse_args()
+    launch.prepare("cpu", 0)
+    bandwidth = measure_limits(1).bandwidth
+    rows, notes, data = [], [], {"machine": machine(), "bandwidth": bandwidth}
+    for name, trainer, rounds in trainers(arguments):
+        gaussians = Gaussians(*(tensor.detach() for tensor in trainer.model.activated()))
+        counts = mean([count(gaussians, view.camera, RasterOptions()) for view in trainer.scene.train])
+        alone, serial, check = measure_trainer(trainer, rounds)
+        predicted = {cores: predict(alone, serial, counts, bandwidth, cores) for cores in CORES_PREDICTED}
+        work = work_of(counts)
+        for stage in alone:
+            moved = sum(size for size, _ in work.values()) if stage == WHOLE else work[stage][0]
+            times = [alone[stage], serial[stage], check[stage], *(predicted[cores][stage] for cores in CORES_PREDICTED)]
+            milliseconds = [f"{1e3 * seconds:.2f}" for seconds in times]
+            rows.append([name, stage, *milliseconds[:3], f"{1e-6 * moved:.1f}", *milliseconds[3:]])
+        gains = ", ".join(f"{alone[WHOLE] / predicted[cores][WHOLE]:.1f} on {cores}" for cores in CORES_PREDICTED)
+        notes.append(f"{name}: {100 * serial[WHOLE] / alone[WHOLE]:.1f} % of a step is serial; predicted gain {gains}.")
+        print(notes[-1])
+        data[name] = {"seconds": alone, "serial": serial, f"serial, {MORE} threads": check, "predicted": predicted}
+    headers = ("size", "stage", "1 thread: ms", f"serial, {SHARED} threads: ms", f"serial, {MORE} threads: ms", "MB")
+    headers += tuple(f"{cores} cores: ms" for cores in CORES_PREDICTED)
+    write_table("serial", arguments.out, headers, rows, f"{' '.join(notes)} {1e-9 * bandwidth:.1f} GB/s.", data)
+
+
+if __name__ == "__main__":
+    main()
