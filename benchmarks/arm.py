@@ -1,25 +1,25 @@
-"""Linux on ARM, emulated: whether the same bytes come out as here, and whether the hot loops are vectors.
+"""Linux on ARM, emulated: whether the same bytes come out as here.
 
-    python benchmarks/arm.py [--root FOLDER] [--flags "-target-cpu x86-64-v3"] [--steps 50] [--out docs/benchmarks]
+    python benchmarks/arm.py [--root FOLDER] [--steps 50] [--adjoints manual] [--out docs/benchmarks]
 
 Makes a folder with Debian's arm64 Python, PyPI's aarch64 wheels and qemu, once: 2 GB. Nothing is installed on this
-machine. It needs Debian's or Ubuntu's apt-get, uv, and llvm-objdump. Runs ``benchmarks/processor_hashes.py`` there and
-here, compares array by array, and counts instructions in the objects that Warp compiled.
+machine. It needs Debian's or Ubuntu's apt-get, and uv. Runs ``benchmarks/processor_hashes.py`` there and here, and
+compares array by array. ``benchmarks/vectors.py`` reads the objects that Warp compiled for both.
 """
 
 import argparse
 import hashlib
 import os
-import re
 import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from common import write_table
+
+from warp_splat.config import ADJOINTS
 
 REPOSITORY = Path(__file__).parents[1]
 DEBIAN = ("python3-minimal", "libpython3-stdlib", "libgomp1", "libstdc++6")
@@ -30,12 +30,6 @@ DEFAULT_ROOT = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / 
 APT = """APT::Architecture "arm64"; APT::Architectures {{ "arm64"; "{host}"; }};
 Dir::State "{root}/apt"; Dir::State::status "{root}/apt/status"; Dir::Cache "{root}/apt"; APT::Sandbox::User "";
 """
-
-#: Kernels whose loops take the time of a step.
-HOT = ("project", "shade", "adj_shade", "blend", "upstream", "adj_blend", "walk", "ssim", "adam")
-#: Floating-point arithmetic; on x86-64 the name says whether it is packed, on ARM the operands do.
-X86 = re.compile(r"v?(?:add|sub|mul|div|sqrt|min|max|fn?m(?:add|sub)\d+)([ps])[sd]")
-ARM = re.compile(r"f(?:add|sub|mul|div|sqrt|min|max|minnm|maxnm|mla|mls|madd|msub|nmadd|nmsub|nmul|neg|abs)")
 
 
 def make_root(root: Path) -> None:
@@ -80,18 +74,23 @@ def run_emulated(root: Path, kernels: Path, *arguments: object) -> str:
     return _output(*emulator, python(root), *arguments, **paths, OPENBLAS_NUM_THREADS="1")
 
 
-def run_both(root: Path, flags: str, steps: int) -> tuple[dict[str, Path], dict[str, Path]]:
-    """Compute the arrays on both processors; returns files of them and folders of the kernels, by processor."""
+def kernel_folders(root: Path) -> dict[str, Path]:
+    """Where Warp keeps its objects for the two processors, anew for other sources."""
     sources = sorted((REPOSITORY / "warp_splat" / "kernels").rglob("*.py"))
-    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources) + flags.encode()).hexdigest()[:8]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
+    return {name: root / f"kernels-{name}-{digest}" for name in ("ARM", "here")}
+
+
+def run_both(root: Path, *options: object) -> dict[str, Path]:
+    """Compute the arrays on both processors; returns the files of them, by processor."""
     arrays = {name: root / f"{name}.npz" for name in ("ARM", "here")}
-    kernels = {name: root / f"kernels-{name}-{digest}" for name in arrays}
-    program = [REPOSITORY / "benchmarks" / "processor_hashes.py", "--steps", steps, "--out"]
-    here = _output(sys.executable, *program, arrays["here"], "--flags", flags, WARP_CACHE_PATH=str(kernels["here"]))
+    kernels = kernel_folders(root)
+    program = [REPOSITORY / "benchmarks" / "processor_hashes.py", *options, "--out"]
+    here = _output(sys.executable, *program, arrays["here"], WARP_CACHE_PATH=str(kernels["here"]))
     there = run_emulated(root, kernels["ARM"], *program, arrays["ARM"])
     for name, text in (("here", here), ("ARM", there)):
         (root / f"{name}.txt").write_text(text)
-    return arrays, kernels
+    return arrays
 
 
 def compare(ours: Path, theirs: Path) -> list[tuple[str, str]]:
@@ -110,63 +109,24 @@ def compare(ours: Path, theirs: Path) -> list[tuple[str, str]]:
     return rows
 
 
-def vectors(objects: Path) -> Iterator[tuple[str, int, int, int, int]]:
-    """Kernel; packed and scalar arithmetic instructions of it, and of its inner loop with the most packed ones."""
-    for path in sorted(objects.rglob("*.o")):
-        kernel = re.sub(
-            r"^wp_(?:warp_splat\.kernels\.)?(?:make_\w+__locals__)?|(_[0-9a-f]{7,8})+$", "", path.parent.name
-        )
-        text = _output("llvm-objdump", "-d", "--no-show-raw-insn", path)
-        code = re.findall(r"^ *([0-9a-f]+):\s+(\S+)[ \t]*(.*)$", text, re.MULTILINE)
-        kinds = [(int(address, 16), _kind(name, operands)) for address, name, operands in code]
-        jumps = [(int(a, 16), int(to[1], 16)) for a, name, rest in code if (to := _target(name, rest))]
-        loops = [(to, at) for at, to in jumps if to <= at]
-        inner = [(lo, hi) for lo, hi in loops if not any(lo <= a and b <= hi and (a, b) != (lo, hi) for a, b in loops)]
-        counts = [_count(kind for at, kind in kinds if lo <= at <= hi) for lo, hi in inner]
-        yield kernel, *_count(kind for _, kind in kinds), *max(counts, default=(0, 0))
-
-
-def _kind(name: str, operands: str) -> str:
-    """The letter p of packed, s of scalar arithmetic, else nothing."""
-    if match := X86.fullmatch(name):
-        return match[1]
-    return ("p" if re.search(r"v\d+\.\d", operands) else "s") if ARM.fullmatch(name) else ""
-
-
-def _target(name: str, operands: str) -> re.Match | None:
-    """Where a jump goes, unless it is a call."""
-    return None if name == "bl" or name.startswith("call") else re.search(r"0x([0-9a-f]+) <", operands)
-
-
-def _count(kinds: Iterator[str]) -> tuple[int, int]:
-    found = "".join(kinds)
-    return found.count("p"), found.count("s")
-
-
 def _output(*command: object, **environment: str) -> str:
     words, variables = [str(word) for word in command], {**os.environ, **environment}
     return subprocess.run(words, env=variables, cwd=REPOSITORY, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 def main() -> None:
-    """Print which arrays are equal, and the table of instructions; exit code 1 if an array is not equal."""
+    """Print which arrays are equal; exit code 1 if one is not."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, default=DEFAULT_ROOT, help="folder of the emulated machine")
-    parser.add_argument("--flags", default="-march=native", help="of the compiler here, to choose a processor")
     parser.add_argument("--steps", type=int, default=50, help="of training")
-    parser.add_argument("--out", type=Path, help="folder for the tables")
+    parser.add_argument("--adjoints", nargs="+", default=list(ADJOINTS), help="of the blend")
+    parser.add_argument("--out", type=Path, help="folder for the table")
     arguments = parser.parse_args()
     make_root(arguments.root)
-    arrays, kernels = run_both(arguments.root, arguments.flags, arguments.steps)
+    arrays = run_both(arguments.root, "--steps", arguments.steps, "--adjoints", *arguments.adjoints)
     rows = compare(arrays["here"], arrays["ARM"])
-    note = f"Emulated {PROCESSOR} (qemu-user) against `{arguments.flags}` here."
+    note = f"Emulated {PROCESSOR} (qemu-user) against this processor."
     write_table("arm", arguments.out, ["array", "on both"], rows, note, dict(rows))
-    counts = [(kernel, name, *found) for name, folder in kernels.items() for kernel, *found in vectors(folder)]
-    headers = ["kernel", "processor", "packed", "scalar", "packed, inner loop", "scalar, inner loop"]
-    note = (
-        "Floating-point arithmetic instructions of all of the kernel, and of its inner loop with the most packed ones."
-    )
-    write_table("arm_vectors", arguments.out, headers, sorted(counts), note, {"rows": sorted(counts)})
     sys.exit(any(agreement != "equal" for _, agreement in rows))
 
 

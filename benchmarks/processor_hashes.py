@@ -1,6 +1,6 @@
 """A hash of each array that rendering and a short training compute: the same wherever results are the same.
 
-    python benchmarks/processor_hashes.py [--flags "-target-cpu x86-64-v3"] [--steps 50] [--out arrays.npz]
+    [WARP_SPLAT_TARGET="-target-cpu x86-64-v3"] python benchmarks/processor_hashes.py [--steps 50] [--out arrays.npz]
 
 The Gaussians come from additions and multiplications alone, so that they are the same everywhere. ``benchmarks/arm.py``
 runs this file on an emulated processor and compares.
@@ -19,7 +19,6 @@ from warp_splat import Camera, RasterOptions, rasterize
 from warp_splat.cli import main as command
 from warp_splat.config import ADJOINTS
 from warp_splat.formats.ply import load_ply
-from warp_splat.kernels import compiler
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import project
@@ -33,13 +32,6 @@ CAMERA = Camera(WIDTH, HEIGHT, 60.0, 58.0, 40.0, 22.0, np.eye(3), np.array((0.0,
 SMALL = 8  # -r of the training
 #: Two rounds of growth and a reset of the opacities within 50 steps.
 GROWTH = {"densify_from_iter": 9, "densification_interval": 10, "densify_until_iter": 29, "opacity_reset_interval": 20}
-
-
-def choose_processor(flags: str) -> None:
-    """Let ``flags`` take the place of -march=native in all modules that are not built yet."""
-    for options in vars(compiler).values():
-        if isinstance(options, dict) and "cpu_compiler_flags" in options:
-            options["cpu_compiler_flags"] = options["cpu_compiler_flags"].replace("-march=native", flags)
 
 
 def gaussians() -> list[torch.Tensor]:
@@ -89,12 +81,10 @@ def trained(steps: int) -> dict[str, np.ndarray]:
 def main() -> None:
     """Print a line for each array: its hash, its name, its shape."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--flags", default="-march=native", help="of the compiler, to choose a processor")
     parser.add_argument("--steps", type=int, default=50, help="of training; 0: none")
     parser.add_argument("--adjoints", nargs="+", default=list(ADJOINTS), help="of the blend")
     parser.add_argument("--out", type=Path, help="also write the arrays there, as .npz")
     arguments = parser.parse_args()
-    choose_processor(arguments.flags)
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(1)
     arrays = rendered(arguments.adjoints) | (trained(arguments.steps) if arguments.steps else {})
