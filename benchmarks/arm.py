@@ -119,7 +119,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, default=DEFAULT_ROOT, help="folder of the emulated machine")
     parser.add_argument("--steps", type=int, default=50, help="of training")
-    parser.add_argument("--adjoints", nargs="+", default=list(ADJOINTS), help="of the blend")
+    parser.add_argument("--adjoints", nargs="*", default=list(ADJOINTS), help="of the blend")
     parser.add_argument("--out", type=Path, help="folder for the table")
     arguments = parser.parse_args()
     make_root(arguments.root)

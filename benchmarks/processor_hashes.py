@@ -82,7 +82,7 @@ def main() -> None:
     """Print a line for each array: its hash, its name, its shape."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=50, help="of training; 0: none")
-    parser.add_argument("--adjoints", nargs="+", default=list(ADJOINTS), help="of the blend")
+    parser.add_argument("--adjoints", nargs="*", default=list(ADJOINTS), help="of the blend")
     parser.add_argument("--out", type=Path, help="also write the arrays there, as .npz")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
