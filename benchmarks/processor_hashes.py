@@ -67,7 +67,9 @@ def rendered(adjoints: list[str]) -> dict[str, np.ndarray]:
 
 
 def trained(steps: int) -> dict[str, np.ndarray]:
-    """The photographs of the embedded scene, small, and the parameters that ``steps`` steps make of it."""
+    """The photographs of the embedded scene, small, and the parameters that ``steps`` steps make of it, if any."""
+    if not steps:
+        return {}
     scene = load_scene(embedded_scene(), resolution=SMALL, report=str)
     found = {"photographs": np.stack([view.image for view in scene.train]), "points": scene.points}
     flags = [f"--{name}={value}" for name, value in {**GROWTH, "iterations": steps, "seed": 1, "threads": 1}.items()]
@@ -87,9 +89,12 @@ def main() -> None:
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(1)
-    arrays = rendered(arguments.adjoints) | (trained(arguments.steps) if arguments.steps else {})
-    for name, array in arrays.items():
-        print(hashlib.sha256(np.ascontiguousarray(array)).hexdigest()[:12], name, array.shape)
+    arrays = {}
+    for compute, how in ((rendered, arguments.adjoints), (trained, arguments.steps)):
+        found = compute(how)
+        for name, array in found.items():
+            print(hashlib.sha256(np.ascontiguousarray(array)).hexdigest()[:12], name, array.shape, flush=True)
+        arrays |= found
     if arguments.out:
         np.savez(arguments.out, **arrays)
 
