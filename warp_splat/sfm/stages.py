@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -29,53 +29,34 @@ BLOCK = 10
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
 
-def run_watched(
-    title: str, total: int, work: Callable[[pycolmap.CancellationToken], object], count: Callable[[], int], quiet: bool
-) -> None:
+def run_watched(title: str, total: int, work: Callable, count: Callable[[], int], quiet: bool) -> None:
     """Run ``work`` in a thread and show a bar until it ends; Ctrl-C lets it end at the next image, then raises."""
-    token, errors = pycolmap.CancellationToken(), []
-
-    def run():
-        try:
-            work(token)
-        except BaseException as error:  # raised again below, in the thread that the user sees
-            errors.append(error)
-
-    thread = threading.Thread(target=run, name=title)
+    token = pycolmap.CancellationToken()
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     bar = tqdm(total=total, desc=title, disable=quiet, bar_format=BAR, mininterval=pause, maxinterval=pause)
-    with interruptible() as interrupted, bar:
-        thread.start()
-        while thread.is_alive():
-            thread.join(POLL)
+    with interruptible() as interrupted, bar, ThreadPoolExecutor(1) as pool:
+        running = pool.submit(work, cancellation_token=token)
+        while not running.done():
+            wait([running], POLL)
             bar.update(min(count(), total) - bar.n)
             if interrupted:
                 token.cancel()
     if interrupted:
         raise KeyboardInterrupt
-    if errors:
-        raise errors[0]
+    running.result()  # what it raised, in the thread that the user sees
 
 
-@contextmanager
-def opened(database: Path) -> Iterator[pycolmap.Database]:
-    """The database, closed at the end of the block.
+def opened(database: Path) -> pycolmap.Database:
+    """The database, which a ``with`` closes.
 
     What shows the progress of a stage opens it before the stage begins: opening writes, and may be refused, or refuse
     another. Python's sqlite3 would do harm: it drops the locks of pycolmap's copy of SQLite.
     """
-    connection = pycolmap.Database.open(database)
-    try:
-        yield connection
-    finally:
-        connection.close()
+    return pycolmap.Database.open(database)
 
 
 def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig) -> None:
     """Find SIFT features in the photographs below ``root``; those of a group share a lens."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = config.threads, False
-
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = LENS
     for names in groups:  # first, so that images are numbered by name and not by which thread was faster
@@ -85,17 +66,10 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
                 reader.existing_camera_id = connection.read_image_with_name((set(names) - set(new)).pop()).camera_id
         if new:
             pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, new, reader)
-
-    def work(token):
-        pycolmap.extract_features(
-            database,
-            root,
-            image_names=[name for names in groups for name in names],
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-            cancellation_token=token,
-        )
-
+    options = pycolmap.FeatureExtractionOptions(num_threads=config.threads, use_gpu=False)
+    every = [name for names in groups for name in names]
+    on_cpu = {"extraction_options": options, "device": pycolmap.Device.cpu}
+    work = partial(pycolmap.extract_features, database, root, every, **on_cpu)
     with opened(database) as connection:
         numbers = [image.image_id for image in connection.read_all_images()]
         found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
@@ -104,31 +78,19 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
 
 def match(database: Path, matching: str, config: SfmConfig) -> int:
     """Match all pairs of photographs or, "sequential", neighbors by name; returns how many pairs fit together."""
-    options, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
-    options.num_threads, options.use_gpu = config.threads, False
+    options = pycolmap.FeatureMatchingOptions(num_threads=config.threads, use_gpu=False)
+    verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
     with opened(database) as connection:
         images = connection.num_images()
     if matching == "sequential":
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.num_threads = config.threads
+        pairing = pycolmap.SequentialPairingOptions(num_threads=config.threads)
         # neighbors up to `overlap`, and at distances 2, 4, 8 ... up to 2^(overlap - 1)
         total, run = _sequential_pairs(images, pairing.overlap), pycolmap.match_sequential
     else:
-        pairing = pycolmap.ExhaustivePairingOptions()
-        pairing.block_size = BLOCK
+        pairing = pycolmap.ExhaustivePairingOptions(block_size=BLOCK)
         total, run = images * (images - 1) // 2, pycolmap.match_exhaustive
-
-    def work(token):
-        run(
-            database,
-            matching_options=options,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-            cancellation_token=token,
-        )
-
+    work = partial(run, database, options, pairing, verification, pycolmap.Device.cpu)
     with opened(database) as connection:
         run_watched("matches", total, work, connection.num_matched_image_pairs, config.quiet)
         _, inliers = connection.read_two_view_geometry_num_inliers()
@@ -155,18 +117,11 @@ def reconstruct(database: Path, root: Path, models: Path, config: SfmConfig) -> 
         registered = []
         with opened(database) as connection:
             images = connection.num_images()
-
-        def work(token):
-            pycolmap.incremental_mapping(
-                database,
-                root,
-                part,
-                options,
-                initial_image_pair_callback=lambda: registered.extend((1, 1)),
-                next_image_callback=lambda: registered.append(1),
-                cancellation_token=token,
-            )
-
+        found = {
+            "initial_image_pair_callback": lambda: registered.extend((1, 1)),
+            "next_image_callback": lambda: registered.append(1),
+        }
+        work = partial(pycolmap.incremental_mapping, database, root, part, options, **found)
         run_watched("cameras", images, work, lambda: len(registered), config.quiet)
         os.replace(part, models)
     return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir() if folder.is_dir()}
@@ -176,9 +131,7 @@ def write_undistorted(model: Path, root: Path, scene: Path, part: Path, count: i
     """Write the photographs without distortion to ``scene``/images and their pinhole cameras to ``scene``/sparse/0."""
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
-
-    def work(token):
-        pycolmap.undistort_images(part, model, root, num_threads=config.threads, cancellation_token=token)
+    work = partial(pycolmap.undistort_images, part, model, root, num_threads=config.threads)
 
     def written() -> int:
         return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
