@@ -152,6 +152,3 @@ def test_free_port():
         port = taken.getsockname()[1]
         assert port < server.free_port(port) < port + server.PORTS
     assert server.free_port(port) == port
-    for number in (0, -1, 65536):
-        with pytest.raises(InputError, match="--port: expected 1 to 65535"):
-            server.free_port(number)

@@ -28,7 +28,7 @@ COMPENSATION_MIN = 2.5e-5  # floor of the share of its area that antialiasing le
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
 
-PORT = 8080  # of the viewer
+PORT, LAST_PORT = 8080, 65535  # of the viewer
 PORT_HELP = "of the viewer; if it is busy, the next free one"
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
@@ -81,7 +81,7 @@ class RenderConfig:
 
     model_path: str = flag("", "folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)", "-m")
     source_path: str = flag("", "scene folder, if it has moved since training; a file of Gaussians needs one", "-s")
-    iteration: int = flag(-1, "which saved model; -1: the last")
+    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
     skip_train: bool = flag(False, "no images of the training views")
     skip_test: bool = flag(False, "no images of the test views")
     video: str = flag(
@@ -92,7 +92,7 @@ class RenderConfig:
     )
     quiet: bool = flag(False, "print only the summary")
 
-    frames: int = film(250, "frames of the video, 25 a second")
+    frames: int = film(250, "frames of the video, 25 a second", least=1)
     video_output: str = film(
         "",
         "where to keep the frames: an .mp4 file, or a folder for PNG files; default: <model>/<video>.mp4",
@@ -118,8 +118,8 @@ class ViewConfig:
 
     model: str = argument("folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
     source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
-    iteration: int = flag(-1, "which saved model; -1: the last")
-    port: int = flag(PORT, PORT_HELP)
+    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
+    port: int = flag(PORT, PORT_HELP, least=1, most=LAST_PORT)
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores")
 
@@ -130,7 +130,7 @@ class SfmConfig:
 
     photos: str = argument("folder of photographs, or a video")
     scene: str = argument("the folder to write: images/ without distortion, sparse/0, and the work in sfm/")
-    frames: int = flag(150, "frames to take from a video: the sharpest of each of as many equal spans")
+    frames: int = flag(150, "frames to take from a video: the sharpest of each of as many equal spans", least=3)
     matching: str = flag(
         "auto",
         "which photographs to compare: exhaustive, all pairs; sequential, neighbors by name; auto: sequential for more "
@@ -138,7 +138,7 @@ class SfmConfig:
         choices=("auto", "exhaustive", "sequential"),
     )
     threads: int = flag(0, "CPU threads; 0: all cores")
-    seed: int = flag(0, "seed of everything random")
+    seed: int = flag(0, "seed of everything random", most=2**31 - 1)
     quiet: bool = flag(False, "print only the summary")
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import MISSING, Field, field, fields
 from functools import partial
 from typing import Any
+
+from warp_splat.errors import InputError
 
 
 def flag(default: Any, help: str, *names: str, **metadata: Any) -> Any:
     """A dataclass field that is also a command-line flag: its default, its help, further names.
 
-    ``metadata`` may have ``choices``, a tuple; ``many``, the type of a list's elements; ``least``, the smallest
-    whole number if that is not 0. Without a ``group`` it is one of the few that ``--help`` lists first.
+    ``metadata`` may have ``choices``, a tuple; ``many``, the type of a list's elements; ``least`` and ``most``, bounds
+    of a number if those are not 0 and none. Without a ``group`` it is one of the few that ``--help`` lists first.
     """
-    metadata = {"help": help, "names": names, "choices": None, "many": None, "group": "", **metadata}
+    usual = {"choices": None, "many": None, "group": "", "least": 0, "most": math.inf}
+    metadata = {"help": help, "names": names, **usual, **metadata}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -21,7 +25,7 @@ def flag(default: Any, help: str, *names: str, **metadata: Any) -> Any:
 
 def argument(help: str) -> Any:
     """A dataclass field that is also an argument of the command line without a flag: known by its place."""
-    return field(default="", metadata={"help": help, "group": None})
+    return flag("", help, group=None)
 
 
 data = partial(flag, group="what is read")
@@ -44,6 +48,19 @@ def flags_of(config_type: Any) -> list[Field]:
 def default_of(item: Field) -> Any:
     """The default of a flag."""
     return item.default if item.default_factory is MISSING else item.default_factory()
+
+
+def check_numbers(config: Any) -> None:
+    """Raise InputError if a number of ``config`` is out of its bounds."""
+    values = config.flat() if hasattr(config, "flat") else vars(config)
+    for item in flags_of(type(config)):
+        value, least, most = values[item.name], item.metadata["least"], item.metadata["most"]
+        if isinstance(value, list) and item.metadata["many"] is int and min(value, default=1) < 1:
+            raise InputError(f"--{item.name}: expected numbers of steps, at least 1, got {min(value)}.")
+        if type(value) in (int, float) and not (least <= value <= most and value < math.inf):
+            bounds = f"{least} to {most}" if most < math.inf else f"at least {least}"
+            finite = "a finite number, " * isinstance(value, float)
+            raise InputError(f"--{item.name}: expected {finite}{bounds}, got {value}.")
 
 
 def fits(value: Any, item: Field) -> bool:

@@ -18,6 +18,7 @@ from warp_splat.color import TOE
 from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.export_html import pack
+from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_text
 from warp_splat.formats.splats import SplatArrays
@@ -41,8 +42,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     path = Path(config.page)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
-    if config.max_gaussians < 0:
-        raise InputError(f"--max_gaussians: expected at least 0, got {config.max_gaussians}.")
+    check_numbers(config)
     _, (splats, _), trained = model_folder.open_model(config.model)
     cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
     kept = pack.shown(splats, config.max_gaussians)

@@ -18,6 +18,7 @@ from warp_splat.config import RasterOptions, RenderConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
+from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.formats.splats import SplatFile
@@ -76,12 +77,11 @@ def render_model(config: RenderConfig) -> int:
 
 
 def _check(config: RenderConfig) -> None:
+    check_numbers(config)
     if config.orbit and config.video:
         raise InputError(f"--orbit, --video {config.video}: expected one of them; leave the other out.")
     if config.video_output and not (config.orbit or config.video):
         raise InputError(f"--video_output {config.video_output}: expected --video or --orbit beside it.")
-    if config.frames < 1:
-        raise InputError(f"--frames: expected at least 1, got {config.frames}.")
     if config.frames != RenderConfig.frames and not config.video:
         raise InputError(f"--frames {config.frames}: expected --video beside it.")
     suffix = Path(config.video_output).suffix.lower()

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, reason_of
+from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_json
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
@@ -55,7 +56,7 @@ def sfm(config: SfmConfig) -> int:
     source, scene = Path(config.photos), Path(config.scene)
     say = (lambda *_: None) if config.quiet else tqdm.write
     require_pycolmap("warp-splat sfm")
-    _check_numbers(config)
+    check_numbers(config)
     _check_source(source)
     work = _claim(source, scene, config)
     config = replace(config, threads=min(config.threads or CORES, CORES))
@@ -101,12 +102,6 @@ def _explained(work: Path) -> Iterator[None]:
             f"{work}: pycolmap cannot go on there ({reason_of(error)}); free some space if the disk is full and run "
             "again, or remove this folder to start anew."
         ) from error
-
-
-def _check_numbers(config: SfmConfig) -> None:
-    for name, low in (("frames", LEAST), ("threads", 0), ("seed", 0)):
-        if not low <= getattr(config, name) < 2**31:
-            raise InputError(f"--{name}: expected {low} to 2^31 - 1, got {getattr(config, name)}.")
 
 
 def _check_source(source: Path) -> None:

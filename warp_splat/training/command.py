@@ -54,9 +54,7 @@ def train(config: TrainConfig) -> int:
     Raises:
         InputError: if an option, the scene or the output folder is not usable.
     """
-    problem = check_train(config)
-    if problem:
-        raise InputError(problem)
+    check_train(config)
     with join(config.machine.device) as processes:
         if config.report.viewer and processes.count > 1:
             raise InputError("--viewer: expected one process, since others would wait for it; leave it out.")

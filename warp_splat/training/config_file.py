@@ -70,8 +70,10 @@ def load_options(path: str | Path) -> dict[str, Any]:
             if not fits(value, options[name]):
                 raise Unexpected(f"{value!r:.50} as its option {name}")
         config = TrainConfig(**found)
-        if problem := check_train(config):
-            raise Unexpected(f"an impossible option ({problem.rstrip('.')})")
+        try:
+            check_train(config)
+        except InputError as error:
+            raise Unexpected(f"an impossible option ({str(error).rstrip('.')})") from error
     return config.flat()
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from warp_splat.config import ADJOINTS, LOSS_SPACES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
+from warp_splat.config import ADJOINTS, LAST_PORT, LOSS_SPACES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
 from warp_splat.errors import InputError
-from warp_splat.flags import data, flag, flags_of, growing, learning, machinery, rendering, reporting
+from warp_splat.flags import check_numbers, data, flag, growing, learning, machinery, rendering, reporting
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.parts import AUTO, PARTS
 
@@ -62,7 +62,7 @@ class LearnOptions:
         least=1,
     )
 
-    lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss")
+    lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss", most=1)
     position_lr_init: float = learning(0.00016, "rate of the means at the start (times the scene's extent)")
     position_lr_final: float = learning(0.0000016, "rate of the means after position_lr_max_steps")
     position_lr_max_steps: int = learning(30_000, "steps over which the means' rate decays", least=1)
@@ -79,7 +79,7 @@ class LearnOptions:
     coarse_until_iter: int = learning(
         3000, "by this step the size has doubled, at equal intervals, to the full one", least=1
     )
-    seed: int = learning(0, "seed of everything random")
+    seed: int = learning(0, "seed of everything random", most=2**63 - 1)
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class ReportOptions:
     lpips_weights: str = reporting("", LPIPS_HELP)
     tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
     viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
-    port: int = reporting(PORT, PORT_HELP)
+    port: int = reporting(PORT, PORT_HELP, least=1, most=LAST_PORT)
     verify: str = reporting("", "the sha256 that the model must have, or how it begins; exit code 1 if it has another")
     profile: int = reporting(0, "time the stages of the last N iterations, as a table and a plot")
 
@@ -191,30 +191,21 @@ FIXED_OPTIONS = {
 }
 
 
-def check_train(config: TrainConfig) -> str | None:
-    """What is wrong with the values of ``config``, in one sentence, or None."""
-    learn, values = config.learn, config.flat()
-    if not 1 <= config.report.port <= 65535:
-        return f"--port: expected 1 to 65535, got {config.report.port}."
-    if not 0 <= learn.seed < 2**63:
-        return f"--seed: expected 0 to 2^63 - 1, got {learn.seed}."
-    for item in flags_of(TrainConfig):
-        name, value = f"--{item.name}", values[item.name]
-        if isinstance(value, list) and min(value, default=1) < 1:
-            return f"{name}: expected numbers of steps, at least 1, got {min(value)}."
-        if isinstance(value, float) and not 0 <= value < float("inf"):
-            return f"{name}: expected a finite number, at least 0, got {value}."
-        if type(value) is int and value < (least := item.metadata.get("least", 0)):
-            return f"{name}: expected at least {least}, got {value}."
+def check_train(config: TrainConfig) -> None:
+    """Raise InputError if a value of ``config`` cannot be."""
+    check_numbers(config)
+    learn, parts = config.learn, config.model.parts
     if (verify := config.report.verify) and (len(verify) < 8 or set(verify) - set("0123456789abcdef")):
-        return f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
-    if learn.lambda_dssim > 1:
-        return f"--lambda_dssim: expected 0 to 1, got {learn.lambda_dssim}."
+        raise InputError(
+            f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
+        )
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:
-        return "--position_lr_init, --position_lr_final: expected more than 0 (the rate decays from one to the other)."
+        raise InputError(
+            "--position_lr_init, --position_lr_final: expected more than 0 (the rate decays from one to the other)."
+        )
     if config.grow.growth not in GROWTHS:
-        return f"--growth: expected one of {', '.join(GROWTHS)}, got {config.grow.growth!r:.50}."
-    for name in config.model.parts.split(",") if config.model.parts else ():
-        if name not in (PARTS if "," in config.model.parts else [*PARTS, AUTO]):
-            return f"--parts: expected {AUTO}, or some of {', '.join(PARTS)} between commas, got {name!r:.50}."
-    return None
+        raise InputError(f"--growth: expected one of {', '.join(GROWTHS)}, got {config.grow.growth!r:.50}.")
+    unknown = set(parts.split(",")) - {*PARTS} if parts and parts != AUTO else ()
+    if unknown:
+        some = f"expected {AUTO}, or some of {', '.join(PARTS)} between commas"
+        raise InputError(f"--parts: {some}, got {min(unknown)!r:.50}.")

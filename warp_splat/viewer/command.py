@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
+from warp_splat.flags import check_numbers
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
@@ -26,6 +27,7 @@ def view_model(config: ViewConfig) -> int:
     """
     if not config.model:
         raise InputError("MODEL: expected the folder of a trained model, or a file of Gaussians; name one.")
+    check_numbers(config)
     free_port(config.port)  # before the scene is loaded
     device = settle_device(launch.prepare(config.device, config.threads), config.device)
     iteration, gaussians, trained = open_model(config.model, config.iteration)

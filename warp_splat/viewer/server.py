@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import TILE
+from warp_splat.config import LAST_PORT, TILE
 from warp_splat.errors import InputError
 from warp_splat.raster.api import RenderOutput
 from warp_splat.rendering.camera_paths import focus_point
@@ -168,10 +168,8 @@ class Viewer:
 
 
 def free_port(port: int) -> int:
-    """The first free port from ``port`` on. Raises InputError if there is none among PORTS, or no such port."""
-    if not 1 <= port <= 65535:
-        raise InputError(f"--port: expected 1 to 65535, got {port}.")
-    for number in range(port, min(port + PORTS, 65536)):
+    """The first free port from ``port`` on. Raises InputError if there is none among PORTS."""
+    for number in range(port, min(port + PORTS, LAST_PORT + 1)):
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
             try:
