@@ -50,7 +50,8 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
     assert not worst(findings)
     html = page.read_text()
     assert html.count('src="data:image/jpeg;base64,') == html.count("<img") == 4
-    assert "http" not in html and "<script" not in html
+    text = re.sub('base64,[^"]*', "", html)  # in which any word may stand
+    assert "http" not in text and "<script" not in text
     assert {check for _, check, _ in findings} >= {
         "cameras", "intrinsics", "sizes", "files", "sub-models", "reprojection", "coverage", "unseen points",
         "axes", "duplicates", "masks", "loading", "forecast",

@@ -158,15 +158,12 @@ def test_video_plays_everywhere(tmp_path, height, width):
     assert data.index(b"moov") < data.index(b"mdat")
 
 
-def test_video_errors_leave_no_file(tmp_path, monkeypatch):
+def test_video_errors_leave_no_file(tmp_path):
     pytest.importorskip("av")
     frame = np.zeros((8, 8, 3), np.uint8)
     for frames, sentence in (([], "at least one"), ([frame, frame[:4]], "each, got"), ([frame[0]], "image: expected")):
         with pytest.raises(InputError, match=sentence):
             save_video(tmp_path / "a.mp4", frames, fps=10)
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match="pip install av"):
-        save_video(tmp_path / "a.mp4", [frame], fps=10)
     assert not list(tmp_path.iterdir())
 
 

@@ -10,7 +10,7 @@ from warp_splat.errors import InputError
 NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
 
 
-NAMED = 5  # things that a message names
+NAMED = 3  # things that a message names
 
 
 def few(names: Iterable[str]) -> str:

@@ -10,7 +10,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.gltf import load_gltf, save_gltf
 from warp_splat.formats.ply import ANTIALIASED, is_antialiased, load_ply, save_ply
 from warp_splat.formats.splat32 import load_splat, save_splat
-from warp_splat.formats.splats import SplatFile
+from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows
 from warp_splat.formats.spz import load_spz, save_spz
 
 Report = Callable[[str], None]
@@ -53,7 +53,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:
-    """Read Gaussians of any format, in the frame of their training.
+    """Read Gaussians of any format, in the frame of their training; those with a value that is not finite are left out.
 
     Args:
         path: a file of one of FORMATS.
@@ -62,7 +62,8 @@ def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:
     Raises:
         InputError: if the file is missing, damaged, or of another format than its name says.
     """
-    return format_of(path).load(path, report)
+    file = format_of(path).load(path, report)
+    return file._replace(splats=finite_rows(file.splats, path, report))
 
 
 def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) -> None:
@@ -74,6 +75,7 @@ def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) ->
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
-        InputError: if the ending is unknown or the file cannot be written.
+        InputError: if the ending is unknown, a shape disagrees with the others, or the file cannot be written.
     """
+    check_shapes(file.splats)
     format_of(path).save(path, file, report)

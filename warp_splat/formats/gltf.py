@@ -25,9 +25,7 @@ from warp_splat.formats.splats import (
     SH_C0,
     SplatArrays,
     SplatFile,
-    check_shapes,
     clipped,
-    finite_rows,
     frame,
     log_scales,
     logit,
@@ -58,9 +56,8 @@ def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] =
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
-        InputError: if a shape disagrees with the others; if a file cannot be written.
+        InputError: if there are no Gaussians; if a file cannot be written.
     """
-    check_shapes(file.splats)
     path = Path(path)
     if not len(file.splats.means):
         raise InputError(f"{path}: there are no Gaussians, and a glTF file cannot say so; choose another format.")
@@ -112,7 +109,7 @@ def load_gltf(path: str | Path, report: Callable[[str], None] = print) -> SplatF
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
     antialiased = all(_render_mode(piece) == "mip" for piece, _ in placed)
-    return SplatFile(finite_rows(_joined(parts), path, report), antialiased)
+    return SplatFile(_joined(parts), antialiased)
 
 
 def _attributes(splats: SplatArrays, report: Callable[[str], None]) -> dict[str, np.ndarray]:

@@ -20,9 +20,7 @@ from warp_splat.formats.splats import (
     SH_C0,
     SplatArrays,
     SplatFile,
-    check_shapes,
     clipped,
-    finite_rows,
     log_scales,
     logit,
     sigmoid,
@@ -41,9 +39,8 @@ def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] 
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
-        InputError: if a shape disagrees with the others; if there are no Gaussians; if the file cannot be written.
+        InputError: if there are no Gaussians; if the file cannot be written.
     """
-    check_shapes(file.splats)
     means, sh, opacities, scales, quats = file.splats
     if not len(means):
         raise InputError(f"{path}: there are no Gaussians, and a .splat file cannot say so; choose another format.")
@@ -59,11 +56,11 @@ def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] 
 
 
 def load_splat(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
-    """Read a .splat file; rows with a value that is not finite, or a negative scale, are left out.
+    """Read a .splat file; what is no number, or a negative scale, becomes one that is not finite.
 
     Args:
         path: the file.
-        report: called with one line if rows were left out.
+        report: not called; other formats have things to say.
 
     Raises:
         InputError: if the file is missing or not a whole number of rows.
@@ -80,4 +77,4 @@ def load_splat(path: str | Path, report: Callable[[str], None] = print) -> Splat
         scales=log_scales(rows["scale"]),
         quats=(rows["quat"].astype(np.float32) - 128) / 128,
     )
-    return SplatFile(finite_rows(splats, path, report))
+    return SplatFile(splats)

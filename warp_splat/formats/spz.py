@@ -27,9 +27,7 @@ from warp_splat.formats.splats import (
     COEFFICIENTS,
     SplatArrays,
     SplatFile,
-    check_shapes,
     clipped,
-    finite_rows,
     frame,
     logit,
     sigmoid,
@@ -75,9 +73,8 @@ def save_spz(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
-        InputError: if a shape disagrees with the others; if the file cannot be written.
+        InputError: if the file cannot be written.
     """
-    check_shapes(file.splats)
     means, sh, opacities, scales, quats = turned(file.splats, frame("RUB").T)
     count, coefficients, _ = sh.shape
     widest = float(np.abs(means).max(initial=0.0))
@@ -124,7 +121,7 @@ def load_spz(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
         splats = _unpack(packed)
     if packed.degree == 4:
         report(f"{path}: left out the harmonics of degree 4 of {len(splats.means)} Gaussians; degree 3 is the highest.")
-    return SplatFile(finite_rows(turned(splats, frame(packed.axes)), path, report), packed.antialiased)
+    return SplatFile(turned(splats, frame(packed.axes)), packed.antialiased)
 
 
 def _unpack(packed: _Packed) -> SplatArrays:

@@ -38,8 +38,10 @@ def inspect(config: InspectConfig) -> int:
     findings += geometry.check_reprojection(subject, measured)
     findings += geometry.check_coverage(subject, measured)
     findings += geometry.check_axes(subject)
-    findings += verdicts.check_names(subject) + verdicts.check_masks(subject)
-    findings += [*verdicts.check_loading(subject, config.images), *verdicts.check_cost(subject)]
+    findings += verdicts.check_names(subject)
+    findings += verdicts.check_masks(subject)
+    findings += verdicts.check_loading(subject, config.images)
+    findings += verdicts.check_cost(subject)
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     verdict = _verdict(findings)
     write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject, measured))

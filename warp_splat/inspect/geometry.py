@@ -66,24 +66,22 @@ def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding
         measured.errors[image.name], measured.pixels[image.name] = errors, keypoints
         widths[image.name] = image.camera.width
     if not measured.errors:
-        text = "the model keeps no observations to compare points with; look at the picture."
-        yield Finding("reprojection", "note", text)
+        yield Finding("reprojection", "note", "the model keeps no observations of its points; look at the picture.")
         return
     medians = measured.medians
     every = np.concatenate(list(measured.errors.values()))
     typical, width = float(np.median(every)), float(np.median(list(widths.values())))
     behind = np.count_nonzero(~np.isfinite(every))
-    text = f"median {typical:.2f} px over {len(every)} observations in {len(medians)} images of {width:.0f} px"
+    level, meaning = "ok", ""
     if not typical <= BAD * width or behind > 0.2 * len(every):
-        text += f", {behind} of points behind their camera: poses and points do not belong together."
-        yield Finding("reprojection", "error", text)
+        level, meaning = "error", f", {behind} of them behind a camera: poses and points do not belong together"
     elif typical > max(GOOD * width, 1.0):
-        yield Finding("reprojection", "warning", f"{text}: the cameras are imprecise and views will blur.")
-    else:
-        yield Finding("reprojection", "ok", f"{text}.")
+        level, meaning = "warning", ": views will blur, since the cameras are imprecise"
+    text = f"median {typical:.2f} px over {len(every)} observations in {len(medians)} images of {width:.0f} px"
+    yield Finding("reprojection", level, f"{text}{meaning}.")
     worst = [n for n in sorted(medians, key=lambda n: -medians[n]) if medians[n] > max(WORSE * typical, 1.0)]
     if worst:
-        text = ", ".join(f"{name} ({medians[name]:.1f} px)" for name in worst[:3])
+        text = few(f"{name} ({medians[name]:.1f} px)" for name in worst)
         yield Finding("reprojection", "warning", f"{len(worst)} images are much worse than the others: {text}.")
 
 
@@ -99,12 +97,10 @@ def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
         counts += inside
         measured.seen[photo.name] = round(scale * np.count_nonzero(inside))
     poor = [name for name, seen in measured.seen.items() if seen < FEW_POINTS]
-    text = f"{np.median(list(measured.seen.values())):.0f} points lie inside the median image"
-    if poor:
-        yield Finding("coverage", "warning", f"{text}, but fewer than {FEW_POINTS} in {few(poor)}.")
-    else:
-        text += f", each point inside {np.median(counts):.0f} of {len(subject.photos)}"
-        yield Finding("coverage", "ok", f"{text}.")
+    text = f", each point inside {np.median(counts):.0f} of {len(subject.photos)}"
+    text = f", but fewer than {FEW_POINTS} in {few(poor)}" if poor else text
+    median = f"{np.median(list(measured.seen.values())):.0f} points lie inside the median image"
+    yield Finding("coverage", "warning" if poor else "ok", f"{median}{text}.")
     unseen = np.count_nonzero(counts == 0) / len(points)
     level = "error" if unseen == 1 else "warning" if unseen > UNSEEN and not subject.random_points else "ok"
     yield Finding("unseen points", level, f"{100 * unseen:.1f} % of the points lie outside every image.")
@@ -117,20 +113,17 @@ def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:
     distances = np.linalg.norm(points - middle, axis=1)
     if np.median(distances) > 0 and distances.max() > FAR * np.median(distances):
         far = np.count_nonzero(distances > FAR * np.median(distances))
-        text = f"{far} of {len(points)} points are more than {FAR:.0f} times as far away as most."
-        yield Finding("points", "warning", text)
+        yield Finding("points", "warning", f"{far} of {len(points)} points are {FAR:.0f} times as far away as most.")
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     reach = np.median(np.linalg.norm(points - centers.mean(axis=0), axis=1))
     if len(centers) > 1 and spread < STILL * reach:
-        text = "all cameras stand at one place: depth cannot be seen, and new places cannot be shown."
-        yield Finding("coverage", "warning", text)
+        yield Finding("coverage", "warning", "all cameras stand at one place, from where depth cannot be seen.")
     elif len(centers) > 2:
         _, _, axes = np.linalg.svd(centers - centers.mean(axis=0))
         around = np.sort(np.arctan2(*(axes[:2] @ (centers - middle).T)))
         gap = np.degrees(np.diff(np.append(around, around[0] + 2 * np.pi)).max())
         if gap > GAP:
-            text = f"nobody photographed from {gap:.0f} of the 360 degrees around: views from there are guesses."
-            yield Finding("coverage", "note", text)
+            yield Finding("coverage", "note", f"nobody photographed from {gap:.0f} of the 360 degrees around.")
 
 
 def check_axes(subject: Subject) -> Iterator[Finding]:
@@ -139,16 +132,14 @@ def check_axes(subject: Subject) -> Iterator[Finding]:
         return
     points = np.array(sample(list(subject.points), 2000))
     photos = sample(subject.photos, VIEWS)
-    seen = {
-        name: sum(np.count_nonzero(visible(turn(p.camera), points)) for p in photos) for name, turn in TURNS.items()
-    }
+    count = lambda turn: sum(np.count_nonzero(visible(turn(photo.camera), points)) for photo in photos)  # noqa: E731
+    seen = {name: count(turn) for name, turn in TURNS.items()}
     best = max(seen, key=lambda name: seen[name])
     shares = ", ".join(f"{name} {100 * count / (len(points) * len(photos)):.0f} %" for name, count in seen.items())
     if seen[best] > BETTER * seen["as stored"]:
-        text = (
-            f"with {best} the images would show more of the points ({shares}); the poses' axes are probably mixed up."
+        yield Finding(
+            "axes", "error", f"with {best} the images show more points ({shares}); the axes are mixed up."
         )
-        yield Finding("axes", "error", text)
     else:
         yield Finding("axes", "ok", f"the poses show as many points as in no other convention ({shares}).")
 

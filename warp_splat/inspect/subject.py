@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import OpenImageIO as oiio
+from PIL import Image
 
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
@@ -53,12 +54,12 @@ class Subject:
 def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     """Read what can be read of the scene in ``source``, with its images in ``folder`` if it is COLMAP's."""
     if takes_colmap(source):
-        subject, findings = _read_colmap(source, source / folder)
+        subject = Subject(source, source / folder)
+        findings = list(_read_colmap(subject))
     else:
         subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []
         try:
-            lines: list[str] = []
-            train, test, subject.points, _ = transforms.read_transforms(source, lines.append)
+            train, test, subject.points, _ = transforms.read_transforms(source, lambda line: None)
             subject.photos = train + test
         except InputError as error:
             findings.append(Finding("transforms", "error", str(error)))
@@ -67,44 +68,44 @@ def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     return subject, findings
 
 
-def _read_colmap(source: Path, root: Path) -> tuple[Subject, list[Finding]]:
-    subject, findings, models = Subject(source, root), [], {}
+def _read_colmap(subject: Subject) -> Iterator[Finding]:
+    """Read the largest model and what belongs to it."""
+    models: dict[str, pycolmap.Reconstruction] = {}
     try:
-        folders = colmap.find_models(source / "sparse")
+        folders = colmap.find_models(subject.source / "sparse")
     except InputError as error:
-        return subject, [Finding("model", "error", str(error))]
+        yield Finding("model", "error", str(error))
+        return
     for path in folders:
         try:
-            models[path] = colmap.read_model(path)
+            models[path.relative_to(subject.source).as_posix()] = colmap.read_model(path)
         except InputError as error:
-            findings.append(Finding("model", "error", str(error)))
+            yield Finding("model", "error", str(error))
     if not models:
-        return subject, findings
-    counts = {path.relative_to(source).as_posix(): model.num_reg_images() for path, model in models.items()}
-    largest = max(models, key=lambda path: models[path].num_reg_images())
+        return
+    counts = {name: model.num_reg_images() for name, model in models.items()}
+    largest = max(counts, key=lambda name: counts[name])
     if len(models) > 1:
-        text = f"training takes the largest, {largest.relative_to(source)}; the images of the others are lost."
-        findings.append(Finding("sub-models", "warning", f"{len(models)} models {counts}: {text}"))
+        yield Finding("sub-models", "warning", f"{len(models)} models {counts}: only the largest, {largest}, is used.")
     else:
-        text = f"one model, {largest.relative_to(source)}, with {counts.popitem()[1]} registered images."
-        findings.append(Finding("sub-models", "ok", text))
+        yield Finding("sub-models", "ok", f"one model, {largest}, with {counts[largest]} registered images.")
     subject.model = models[largest]
     xyz = np.array([point.xyz for point in subject.model.points3D.values()], np.float64).reshape(-1, 3)
     subject.points = xyz[np.isfinite(xyz).all(axis=1)]
-    if len(subject.points) < len(xyz):
-        text = f"{len(xyz) - len(subject.points)} of {len(xyz)} points are not finite; training leaves them out."
-        findings.append(Finding("points", "warning", text))
-    return subject, findings + _match_files(subject)
+    odd = len(xyz) - len(subject.points)
+    if odd:
+        yield Finding("points", "warning", f"{odd} of {len(xyz)} are not finite; training leaves them out.")
+    yield from _match_files(subject)
 
 
-def _match_files(subject: Subject) -> list[Finding]:
+def _match_files(subject: Subject) -> Iterator[Finding]:
     """Find the file of each registered image and compare its size with the camera's; fills ``subject.photos``."""
-    model = subject.model
+    model, root = subject.model, subject.root
     registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     if not registered:
-        return [Finding("files", "error", "the model has no registered images; run the mapper again.")]
-    findings, missing, scaled = [], [], []
-    finder, sampling = ImageFinder(subject.root), make_sampling()
+        yield Finding("files", "error", "the model has no registered images; run the mapper again.")
+    missing, scaled, wrong = [], [], False
+    finder, sampling = ImageFinder(root), make_sampling()
     for image in registered:
         try:
             path = finder.find(image.name)
@@ -113,30 +114,29 @@ def _match_files(subject: Subject) -> list[Finding]:
                 continue
             size = images.read_size(path)
         except InputError as error:
-            findings.append(Finding("files", "error", str(error)))
+            yield Finding("files", "error", str(error))
             continue
         try:
             subject.photos.append(
                 make_photo(image.name, path, colmap.lens_of(image), colmap.pose_of(image), size, sampling)
             )
         except InputError as error:
-            findings.append(Finding("sizes", "error", str(error)))
+            wrong = True
+            yield Finding("sizes", "error", str(error))
         if size != (image.camera.width, image.camera.height):
             scaled.append(image.name)
     if missing:
-        hint = "copy them there" if subject.root.is_dir() else "there is no such folder; name another with --images"
-        text = f"{len(missing)} of {len(registered)} images are missing in {subject.root}: {few(missing)}; {hint}."
-        findings.append(Finding("files", "error", text))
-    wrong = any(finding.check == "sizes" for finding in findings)
+        hint = "copy them there" if root.is_dir() else "there is no such folder; name another with --images"
+        text = f"{len(missing)} of {len(registered)} images are missing in {root}: {few(missing)}; {hint}."
+        yield Finding("files", "error", text)
     if scaled and not wrong:
-        text = f"{len(scaled)} images have another size than their cameras ({few(scaled)}); the cameras are scaled."
-        findings.append(Finding("sizes", "note", text))
+        text = f"{len(scaled)} images have another size than their cameras, which are scaled: {few(scaled)}."
+        yield Finding("sizes", "note", text)
     elif not wrong and subject.photos:
-        findings.append(Finding("sizes", "ok", "every image has the size that its camera says."))
-    return findings
+        yield Finding("sizes", "ok", "every image has the size that its camera says.")
 
 
-def _decode(subject: Subject) -> list[Finding]:
+def _decode(subject: Subject) -> Iterator[Finding]:
     """Read every image and every mask to its end; fills the thumbnails and what the images are."""
 
     def read(photo: Photo) -> tuple[np.ndarray, list[list[str]]] | str:
@@ -147,26 +147,20 @@ def _decode(subject: Subject) -> list[Finding]:
             if photo.mask and not images.read_mask(photo.mask, (image.shape[1], image.shape[0]), False).any():
                 lists.append(subject.black)
             image = to_srgb(image.clip(0), np.where) if linear else image
-            scale = THUMBNAIL / max(image.shape[:2])
-            size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-            roi = oiio.ROI(0, size[0], 0, size[1], 0, 1, 0, 3)
-            small = oiio.ImageBufAlgo.resample(oiio.ImageBuf(np.ascontiguousarray(image)), roi=roi, nthreads=1)
-            pixels = np.asarray(small.get_pixels(oiio.FLOAT))
-            return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.uint8), lists
+            small = Image.fromarray(np.rint(255 * image.clip(0, 1)).astype(np.uint8))
+            small.thumbnail((THUMBNAIL, THUMBNAIL))
+            return np.array(small), lists
         except InputError as error:
             return str(error)
 
     with ThreadPoolExecutor(images.THREADS) as pool:
         outcomes = list(pool.map(read, subject.photos))
-    findings = []
     for photo, outcome in zip(subject.photos, outcomes, strict=True):
         if isinstance(outcome, str):
-            findings.append(Finding("files", "error", outcome))
+            yield Finding("files", "error", outcome)
         else:
-            subject.thumbnails[photo.name] = outcome[0]
-            for names in outcome[1]:
+            subject.thumbnails[photo.name], lists = outcome
+            for names in lists:
                 names.append(photo.name)
-    if not findings and subject.photos:
-        text = f"{len(subject.photos)} images of {subject.root} were read to their ends."
-        findings.append(Finding("files", "ok", text))
-    return findings
+    if subject.photos and len(subject.thumbnails) == len(subject.photos):
+        yield Finding("files", "ok", f"{len(subject.photos)} images of {subject.root} were read to their ends.")

@@ -24,16 +24,13 @@ AT_LEAST = 20  # images; fewer train, but show little from new sides
 
 def check_cameras(subject: Subject) -> Iterator[Finding]:
     """Lenses, how many, and whether their numbers are those of a real camera."""
-    lenses = Counter()
+    lenses = Counter(f"PINHOLE {photo.camera.width} x {photo.camera.height}" for photo in subject.photos)
     if subject.model is not None:
         cameras = [subject.model.image(i).camera for i in subject.model.reg_image_ids()]
         lenses = Counter(f"{lens.model_name} {lens.width} x {lens.height}" for lens in cameras)
-    elif subject.photos:
-        lenses = Counter(f"PINHOLE {photo.camera.width} x {photo.camera.height}" for photo in subject.photos)
-    text = "; ".join(f"{name} px in {count} images" for name, count in lenses.most_common(5)) or "none"
+    text = few(f"{name} px in {count} images" for name, count in lenses.most_common()) or "none"
     distorted = sum(photo.sampling is not None for photo in subject.photos)
-    if distorted:
-        text += f"; {distorted} images are undistorted on loading"
+    text += f"; {distorted} images are undistorted on loading" * (distorted > 0)
     yield Finding("cameras", "ok" if lenses else "error", f"{text}.")
     odd: dict[str, list[str]] = defaultdict(list)
     for photo in subject.photos:
@@ -50,35 +47,32 @@ def check_cameras(subject: Subject) -> Iterator[Finding]:
         yield Finding("intrinsics", "warning", f"{what} is unusual: {few(names)}.")
     if not odd and subject.photos:
         focal = sorted(photo.camera.fx / photo.camera.width for photo in subject.photos)
-        text = f"focal lengths of {focal[0]:.2f} to {focal[-1]:.2f} widths of the image, all plausible."
-        yield Finding("intrinsics", "ok", text)
+        yield Finding("intrinsics", "ok", f"focal lengths are {focal[0]:.2f} to {focal[-1]:.2f} widths of the image.")
     if 0 < len(subject.photos) < AT_LEAST:
-        text = f"{len(subject.photos)} images are few: new views will be poor where only one or two of them look."
-        yield Finding("cameras", "warning", text)
+        yield Finding("cameras", "warning", f"{len(subject.photos)} images are few: new views will be poor.")
 
 
-def check_names(subject: Subject) -> list[Finding]:
+def check_names(subject: Subject) -> Iterator[Finding]:
     """Names that occur twice, images that are the same file, images that no camera belongs to."""
-    findings = []
     stems: dict[str, list[str]] = defaultdict(list)
     copies: dict[tuple[int, str], list[str]] = defaultdict(list)
     for photo in subject.photos:
         stems[str(Path(photo.name).with_suffix("")).lower()].append(photo.name)
         copies[photo.path.stat().st_size, _digest(photo.path)].append(photo.name)
+    once = True
     for what, groups in (("the same name but for ending or case", stems), ("the same bytes", copies)):
         twice = [" = ".join(names) for names in groups.values() if len(names) > 1]
         if twice:
-            text = f"{len(twice)} groups of images have {what}: {few(twice)}."
-            findings.append(Finding("duplicates", "warning", text))
-    if not findings and subject.photos:
-        findings.append(Finding("duplicates", "ok", "no image occurs twice."))
+            once = False
+            yield Finding("duplicates", "warning", f"{len(twice)} groups of images have {what}: {few(twice)}.")
+    if once and subject.photos:
+        yield Finding("duplicates", "ok", "no image occurs twice.")
     if subject.model is not None and subject.root.is_dir():
         known = {subject.model.image(i).name for i in subject.model.reg_image_ids()}
         extra = [name for name in find_files(subject.root, READABLE) if name not in known]
         if extra:
             text = f"{len(extra)} images in {subject.root} have no camera and are not used: {few(extra)}."
-            findings.append(Finding("unregistered", "note", text))
-    return findings
+            yield Finding("unregistered", "note", text)
 
 
 def _digest(path: Path) -> str:
@@ -86,47 +80,43 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def check_masks(subject: Subject) -> list[Finding]:
+def check_masks(subject: Subject) -> Iterator[Finding]:
     """Alpha channels and masks."""
-    findings, count = [], len(subject.photos)
-    if subject.alpha:
-        text = f"{len(subject.alpha)} of {count} images have alpha: black behind them, with -w white"
-        level = "warning" if 0 < len(subject.alpha) < count else "note"
-        findings.append(Finding("alpha", level, f"{text}."))
+    count, alpha, black = len(subject.photos), len(subject.alpha), len(subject.black)
     without = [photo.name for photo in subject.photos if photo.mask is None]
-    if len(without) < count or (subject.source / MASKS).is_dir():
-        text = f"there are masks for {count - len(without)} of {count} images"
-        if without:
-            findings.append(Finding("masks", "warning", f"{text}; none for {few(without)}."))
-        else:
-            findings.append(Finding("masks", "ok", f"{text}."))
-    if subject.black:
-        text = f"the masks of {len(subject.black)} images are black; these are left out: {few(subject.black)}."
-        findings.append(Finding("masks", "note", text))
-    return findings or [Finding("masks", "ok", "no alpha channels and no masks.")]
+    masked = len(without) < count or (subject.source / MASKS).is_dir()
+    if alpha:
+        text = f"{alpha} of {count} images have alpha: black behind them, with -w white."
+        yield Finding("alpha", "warning" if alpha < count else "note", text)
+    if masked:
+        rest = f"; none for {few(without)}" if without else ""
+        text = f"there are masks for {count - len(without)} of {count} images{rest}."
+        yield Finding("masks", "warning" if without else "ok", text)
+    if black:
+        yield Finding("masks", "note", f"the masks of {black} images are black, which leaves out {few(subject.black)}.")
+    if not (alpha or masked or black):
+        yield Finding("masks", "ok", "no alpha channels and no masks.")
 
 
-def check_loading(subject: Subject, folder: str) -> list[Finding]:
+def check_loading(subject: Subject, folder: str) -> Iterator[Finding]:
     """What training itself would say of this scene before its first step."""
     notes: list[str] = []
-    missing: list[Finding] = []
     try:
         train, _, points, _ = read_photos(subject.source, folder, notes.append)
         if len(points):
             require_visible(train, points, subject.source)
-        else:
-            text = "there are none to start from; training takes random ones, which gives worse results."
-            missing = [Finding("points", "warning", text)]
         if subject.thumbnails:
             require_one_kind([(name, name in subject.linear) for name in subject.thumbnails], subject.source)
             require_unmasked(len(subject.photos), len(subject.black), subject.source)
+        if unread := len(subject.photos) - len(subject.thumbnails):
+            raise InputError(f"{unread} images cannot be read.")
     except InputError as error:
-        return [Finding("loading", "error", f"training would refuse this scene: {error}")]
-    unread = len(subject.photos) - len(subject.thumbnails)
-    if unread:
-        return [Finding("loading", "error", f"training would refuse this scene: {unread} images cannot be read.")]
-    accepted = Finding("loading", "ok", "training would accept this scene.")
-    return [accepted, *missing, *(Finding("loading", "note", note) for note in notes)]
+        yield Finding("loading", "error", f"training would refuse this scene: {error}")
+        return
+    yield Finding("loading", "ok", "training would accept this scene.")
+    if not len(points):
+        yield Finding("points", "warning", "there are none; training takes random ones, which trains worse.")
+    yield from (Finding("loading", "note", note) for note in notes)
 
 
 def check_cost(subject: Subject) -> Iterator[Finding]:

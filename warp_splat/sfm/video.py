@@ -10,10 +10,12 @@ from pathlib import Path
 
 import av
 import numpy as np
-import OpenImageIO as oiio
 from av.error import FFmpegError, InvalidDataError
+from PIL import Image
+from scipy.ndimage import laplace
 
 from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
 
 SHARPNESS_WIDTH = 960  # px; frames are shrunk to this width before they are judged, and noise with them
 QUALITY = 97  # of the JPEG files, 0 to 100
@@ -21,9 +23,7 @@ QUALITY = 97  # of the JPEG files, 0 to 100
 
 def sharpness(luma: np.ndarray) -> float:
     """Variance of the Laplacian of an image [H, W]: large where edges are sharp."""
-    image = luma.astype(np.float32)
-    inner = image[1:-1, 1:-1]
-    return float(np.var(4 * inner - image[:-2, 1:-1] - image[2:, 1:-1] - image[1:-1, :-2] - image[1:-1, 2:]))
+    return float(np.var(laplace(luma.astype(np.float32))[1:-1, 1:-1]))
 
 
 def sample_frames(
@@ -100,10 +100,6 @@ def _write(best: tuple[float, int, av.VideoFrame | None], folder: Path) -> int:
     if frame is None:
         return 0
     pixels = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
-    spec.attribute("compression", f"jpeg:{QUALITY}")
-    path = str(folder / f"frame_{index:06d}.jpg")
-    output = oiio.ImageOutput.create(path)
-    if not (output and output.open(path, spec) and output.write_image(pixels) and output.close()):
-        raise InputError(f"{path}: could not be written ({oiio.geterror()}); free some space or choose another folder.")
+    with atomic_write(folder / f"frame_{index:06d}.jpg") as temporary:
+        Image.fromarray(pixels).save(temporary, quality=QUALITY)
     return 1
