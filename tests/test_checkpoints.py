@@ -135,7 +135,7 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
         assert train(folder, "--threads", "2", "--checkpoint_iterations", "20") == 130
     out = capsys.readouterr().out
     assert f"To continue after iteration {STOP}: warp-splat train --resume {folder}\n" in out
-    checkpoint, model = load_checkpoint(folder), load_ply(ply_path(folder, STOP))
+    checkpoint, model = load_checkpoint(folder), load_ply(ply_path(folder, STOP)).splats
     assert np.array_equal(checkpoint.arrays["parameters.means"], model.means)
     assert safetensors.numpy.load_file(folder / LAST)["parameters.scales"].tobytes() == model.scales.tobytes()
     named = folder / "chkpnt20.safetensors"
@@ -150,7 +150,7 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert "already holds" in fails(capsys, "train", "-s", str(SCENE), "-m", str(folder))
     assert f"--resume {folder}" in fails(capsys, "train", "--resume", str(named))
-    assert "at least the 60 after which" in fails(capsys, "train", "--resume", str(folder), "--iterations", "59")
+    assert "expected at least 60, as in" in fails(capsys, "train", "--resume", str(folder), "--iterations", "59")
     for option, value in (("sh_degree", "2"), ("optimizer_type", "sparse_adam"), ("seed", "1"), ("preset", "fast")):
         assert f"--{option} {value}: expected" in fails(capsys, "train", "--resume", str(folder), f"--{option}", value)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
@@ -186,7 +186,7 @@ def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
     config = parse(["train", "--resume", str(whole)])
     assert (config.data.resolution, config.model.adjoint, config.grow.max_gaussians) == (8, "stepwise", 40000)
     assert config.learn.sh_interval == 15
-    assert len(load_ply(ply_path(whole, 120)).means) <= 40000
+    assert len(load_ply(ply_path(whole, 120)).splats.means) <= 40000
 
 
 @pytest.mark.parametrize("gone", [False, True], ids=["the file is there", "the file has gone"])

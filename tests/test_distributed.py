@@ -136,7 +136,7 @@ def test_when_a_process_is_killed_the_other_saves_and_stops(killed, tmp_path):
     assert f"Process {1 - killed}: expected an answer from all 2 processes, but one has ended" in err
     assert err.count("warp-splat: error:") == 1 and "warp_splat/" not in err  # no traceback of ours
     saved = list(tmp_path.glob("point_cloud/*/point_cloud.ply"))
-    assert all(len(load_ply(path).means) == 4500 for path in saved)
+    assert all(len(load_ply(path).splats.means) == 4500 for path in saved)
     assert ply_path(tmp_path, 20) in saved and re.search(r"Model after \d+ iterations: (.*)", out)[1] in map(str, saved)
     assert not list(tmp_path.rglob(".tmp-*"))
 
@@ -182,7 +182,7 @@ def test_when_a_process_fails_or_hangs_the_other_saves_and_stops(failure, said, 
         [*TORCHRUN, script, *options], check=False, capture_output=True, text=True, env=ENVIRONMENT, timeout=200
     )
     assert run.returncode != 0 and all(words in run.stderr for words in said)
-    assert len(load_ply(ply_path(tmp_path, 56)).means) == 4500
+    assert len(load_ply(ply_path(tmp_path, 56)).splats.means) == 4500
     assert str(ply_path(tmp_path, 56)) in run.stdout and "warp_splat/" not in run.stderr
 
 
@@ -193,7 +193,7 @@ def test_ctrl_c_stops_all_after_the_same_step(tmp_path):
     out, err = run.communicate(timeout=120)
     (entry,) = json.loads((tmp_path / "results.json").read_text()).values()
     assert f"Interrupted after {entry['iterations']} iterations" in out and "warp-splat: error" not in err
-    assert len(load_ply(ply_path(tmp_path, entry["iterations"])).means) == 4500
+    assert len(load_ply(ply_path(tmp_path, entry["iterations"])).splats.means) == 4500
 
 
 @pytest.mark.slow

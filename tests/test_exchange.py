@@ -27,7 +27,6 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.convert import losses
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
-from warp_splat.formats.ply import is_antialiased
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import make_picture
@@ -213,7 +212,7 @@ def test_antialiasing_by_the_comments_of_others(tmp_path):
     data = (tmp_path / "a.ply").read_bytes()
     for comment, wanted in (("SplatRenderMode: default", False), ("antialiased 1", True), ("antialiased 0", False)):
         (tmp_path / "b.ply").write_bytes(data.replace(b"SplatRenderMode: mip", comment.encode()))
-        assert is_antialiased(tmp_path / "b.ply") is wanted
+        assert load_gaussians(tmp_path / "b.ply").antialiased is wanted
 
 
 def test_convert_says_what_is_lost(tmp_path, capsys):

@@ -63,7 +63,7 @@ def test_output_folder(trained):
     for name in ("training.png", "profile.png", "preview.png"):
         assert load_png(trained / name).std() > 1
     assert ply_path(trained, 40).is_file() and ply_path(trained, 60).is_file()
-    assert len(load_ply(ply_path(trained, 60)).means) > 4500
+    assert len(load_ply(ply_path(trained, 60)).splats.means) > 4500
     entry = json.loads((trained / "results.json").read_text())["ours_60"]
     assert entry["iterations"] == 60 and entry["split"] == "test" and entry["seconds"] > 0
     assert entry["dropped"] == {"pixels": 0, "gradients": 0, "gaussians": 0, "prunings": 0}
@@ -167,7 +167,7 @@ def test_ctrl_c_saves_the_model(tmp_path):
     assert process.returncode == 130, err
     assert "Interrupted after" in out and "Traceback" not in err
     (saved,) = (tmp_path / "point_cloud").glob("*/point_cloud.ply")
-    assert str(saved) in out and len(load_ply(saved).means) >= 4500
+    assert str(saved) in out and len(load_ply(saved).splats.means) >= 4500
     assert f"{sys.executable} {ROOT / 'train.py'} --resume {tmp_path}\n" in out
 
 
@@ -240,7 +240,7 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
     assert train(tmp_path / "model", "--iterations", "5", "--antialiasing") == 1
     (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
     assert load_gaussians(saved).antialiased
-    assert str(saved) in capsys.readouterr().err.splitlines()[-1] and len(load_ply(saved).means) == 4500
+    assert str(saved) in capsys.readouterr().err.splitlines()[-1] and len(load_ply(saved).splats.means) == 4500
 
 
 def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, capsys):
@@ -284,7 +284,7 @@ def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
     )  # the first call warms up
     with pytest.raises(RuntimeError, match="planted"):
         train(tmp_path)
-    assert len(load_ply(ply_path(tmp_path, 9)).means) == 4500
+    assert len(load_ply(ply_path(tmp_path, 9)).splats.means) == 4500
 
 
 @pytest.mark.parametrize(
@@ -307,7 +307,7 @@ def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
     assert train(tmp_path) == 1
     text = capsys.readouterr()
     (saved,) = tmp_path.glob("point_cloud/*/point_cloud.ply")
-    assert len(load_ply(saved).means) == 4500 and str(saved) in text.out
+    assert len(load_ply(saved).splats.means) == 4500 and str(saved) in text.out
     assert where in text.err and "4500 Gaussians on" in text.err and "Traceback" not in text.err
     assert "--max_gaussians" in text.err and "-r" in text.err
 
@@ -322,7 +322,7 @@ def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
 def test_memory_that_runs_out_while_rendering_is_explained(options, error, words, trained, monkeypatch, capsys):
     fail_at(monkeypatch, "driver.bin", 3, error)
     message = fails(capsys, "render", "-m", str(trained), *options)
-    count = len(load_ply(ply_path(trained, 60)).means)
+    count = len(load_ply(ply_path(trained, 60)).splats.means)
     assert all(word in message for word in (*words, f"Out of memory on cpu in stage 'bin', with {count} Gaussians"))
     assert "--max_gaussians" in message and "\n" not in message
 
@@ -343,7 +343,7 @@ def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkey
     assert train(tmp_path, "--iterations", "25") == 0
     assert "66 pixels" in capsys.readouterr().out
     assert json.loads((tmp_path / "results.json").read_text())["ours_25"]["dropped"]["pixels"] == 66
-    assert np.isfinite(load_ply(ply_path(tmp_path, 25)).means).all()
+    assert np.isfinite(load_ply(ply_path(tmp_path, 25)).splats.means).all()
 
 
 @pytest.mark.long

@@ -29,24 +29,12 @@ from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
 #: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
 COMMANDS = {
     "sfm": (SfmConfig, "sfm.command.sfm", "compute the cameras of photographs or of a video: a scene to train on"),
-    "inspect": (
-        InspectConfig,
-        "inspect.command.inspect",
-        "examine a scene before training: verdicts, a page with pictures",
-    ),
+    "inspect": (InspectConfig, "inspect.command.inspect", "examine a scene before training: verdicts and pictures"),
     "train": (TrainConfig, "training.command.train", "train Gaussians on a scene's photographs"),
-    "render": (
-        RenderConfig,
-        "rendering.command.render_model",
-        "render the views of a trained model with their metrics, or a video",
-    ),
+    "render": (RenderConfig, "rendering.command.render_model", "render a model: its views with metrics, or a video"),
     "view": (ViewConfig, "viewer.command.view_model", "look at a trained model in a browser"),
     "convert": (ConvertConfig, "formats.convert.convert", "convert Gaussians between .ply, .splat, .spz and glTF"),
-    "export-html": (
-        ExportHtmlConfig,
-        "export_html.command.export_html",
-        "write a page that shows a model in any browser",
-    ),
+    "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
     "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }
 

@@ -37,6 +37,7 @@ ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; 
 PROJECTIONS = ("affine", "ellipsoid")  # files of kernels/project; see RasterOptions, as for all that follow
 EXTENTS = ("ellipse", "square")
 LOSS_SPACES = ("srgb", "log")
+OPTIMIZERS = ("default", "sparse_adam")
 EXP_DEGREES = (3, 4, 5, 6, None)
 VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.rendering.camera_paths
 
@@ -93,11 +94,7 @@ class RenderConfig:
     quiet: bool = flag(False, "print only the summary")
 
     frames: int = film(250, "frames of the video, 25 a second", least=1)
-    video_output: str = film(
-        "",
-        "where to keep the frames: an .mp4 file, or a folder for PNG files; default: <model>/<video>.mp4",
-        "--orbit_output",
-    )
+    video_output: str = film("", "an .mp4 file, or a folder for PNG; default: <model>/<video>.mp4", "--orbit_output")
     orbit: bool = film(False, "time an orbit of 100 frames at 980 x 545; kept only if --orbit_output says where")
     orbit_center: str = film(
         "",

@@ -63,11 +63,10 @@ def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
     """Error of the worst gradient against the time of forward and backward pass, a panel per scene."""
     scenes = list(dict.fromkeys(item.scene for item in measurements))
     rows = -(-len(scenes) // 3)
-    figure = report.new_figure(report.WIDTH, 0.8 + 2.0 * rows, layout="constrained")
-    grid = figure.subplots(rows, 3, squeeze=False, sharey=True)
+    figure, grid = report.new_panels(0.8 + 2.0 * rows, rows, 3, sharey=True)
     handles = {}
     for axes, scene in zip(grid.flat, scenes, strict=False):
-        report.plain_axes(axes, scene)
+        report.plain_axes(axes, scene, "forward and backward [ms]")
         here = [item for item in measurements if item.scene == scene and item.backward and item.errors]
         for item in here:
             error = max(item.worst[1], LEAST)
@@ -82,7 +81,6 @@ def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
         axes.set_xlim(0.7 * min(drawn), 1.5 * max(drawn))
         axes.set_ylim(LEAST, 3.0)
         _plain_ticks(axes)
-        axes.set_xlabel("forward and backward [ms]", fontsize=8, color=report.INK)
     for axes in grid.flat[len(scenes) :]:
         axes.set_axis_off()
     figure.supylabel("relative error of the worst gradient", fontsize=9, color=report.INK)
@@ -92,9 +90,8 @@ def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
 
 def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
     """Peak memory against depth complexity, a line per variant."""
-    figure = report.new_figure(report.WIDTH / 2, 2.8, layout="constrained")
-    axes = figure.subplots()
-    report.plain_axes(axes, "peak memory of a pass [MiB]")
+    figure, axes = report.new_panels(2.8, width=report.WIDTH / 2)
+    report.plain_axes(axes, "peak memory of a pass [MiB]", "candidates per pixel")
     for variant in dict.fromkeys(item.variant for item in measurements):
         points = [
             (candidates, item.memory / 2**20)
@@ -105,7 +102,6 @@ def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
         if points and not variant.startswith("cap"):
             color, marker = STYLES[variant]
             axes.loglog(*np.array(points).T, marker=marker, color=color, linewidth=1.2, markersize=5, label=variant)
-    axes.set_xlabel("candidates per pixel", fontsize=9, color=report.INK)
     axes.legend(fontsize=8, frameon=False)
     report.save_figure(figure, path)
 
@@ -113,8 +109,7 @@ def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
 def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence[str]) -> None:
     """Share of each stage of rendering and differentiating, a bar per scene and mode."""
     chosen = [item for item in measurements if item.variant in modes and item.stages]
-    figure = report.new_figure(report.WIDTH, 0.8 + 0.2 * len(chosen), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = report.new_panels(0.8 + 0.2 * len(chosen))
     report.plain_axes(axes, "share of each stage of rendering and differentiating")
     labels = [f"{item.scene}: {item.variant}" for item in chosen]
     totals = np.array([sum(item.stages.get(stage, 0.0) for stage in STAGES) for item in chosen])
@@ -135,13 +130,12 @@ def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence
 def plot_knobs(path: Path, measurements: Sequence[Measurement]) -> None:
     """Error of image and gradient against time, relative to the default, a row per scene."""
     scenes = list(dict.fromkeys(item.scene for item in measurements))
-    figure = report.new_figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
-    grid = figure.subplots(len(scenes), 2, squeeze=False)
+    figure, grid = report.new_panels(0.5 + 2.8 * len(scenes), len(scenes), 2)
     handles = {}
     for row, scene in zip(grid, scenes, strict=True):
         here = [item for item in measurements if item.scene == scene]
         for axes, what in zip(row, ("image", "gradient"), strict=True):
-            report.plain_axes(axes, f"{scene}: error of the {what}")
+            report.plain_axes(axes, f"{scene}: error of the {what}", "time of the pixel loop, default (*) = 1")
             for knob, (color, marker) in KNOB_STYLES.items():
                 turned = [item for item in here if item.variant.startswith(f"{knob} ")]
                 times = [_both(item) / _both(_default(here, item)) for item in turned]
@@ -153,7 +147,6 @@ def plot_knobs(path: Path, measurements: Sequence[Measurement]) -> None:
                         name = item.variant.removeprefix(f"{knob} ")
                         axes.annotate(name, place, (3, 3), textcoords="offset points", fontsize=6, color=color)
             _plain_ticks(axes)
-            axes.set_xlabel("time of the pixel loop, default (*) = 1", fontsize=9, color=report.INK)
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     report.save_figure(figure, path)
 

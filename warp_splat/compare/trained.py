@@ -277,12 +277,10 @@ def _verdict(equality: Mapping[str, Any]) -> str:
 def plot_modes(path: Path, runs: Sequence[Trained], modes: Sequence[str]) -> None:
     """Draw PSNR over iterations and over seconds of training steps, by scene: mean and range of the seeds."""
     scenes = list(dict.fromkeys(r.scene for r in runs))
-    figure = report.new_figure(report.WIDTH, 0.5 + 2.8 * len(scenes), layout="constrained")
-    grid = figure.subplots(len(scenes), 2, squeeze=False, sharey="row")
+    figure, grid = report.new_panels(0.5 + 2.8 * len(scenes), len(scenes), 2, sharey="row")
     for row, scene in zip(grid, scenes, strict=True):
         for axes, key in zip(row, ("iteration", "seconds"), strict=True):
-            report.plain_axes(axes, f"{scene}: test PSNR [dB]")
-            axes.set_xlabel(key, fontsize=9, color=report.INK)
+            report.plain_axes(axes, f"{scene}: test PSNR [dB]", key)
             for mode, (color, dash) in zip(modes, STYLES, strict=False):
                 histories = [r.history for r in runs if (r.scene, r.variant, r.refused) == (scene, mode, "")]
                 if histories:

@@ -12,7 +12,7 @@ import platform
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -96,11 +96,10 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]], spli
     drawn = [panel for panel in panels if series[panel[0]]]
     if not drawn:
         raise InputError("history: expected records with loss, psnr or gaussians, got none.")
-    figure = new_figure(WIDTH, 2.5, layout="constrained")
-    all_axes = figure.subplots(1, len(drawn), squeeze=False, sharex=True)[0]
-    for axes, (key, title, color) in zip(all_axes, drawn, strict=True):
+    figure, grid = new_panels(2.5, 1, len(drawn), sharex=True)
+    for axes, (key, title, color) in zip(np.ravel(grid), drawn, strict=True):
         iterations, values = np.array(series[key], dtype=np.float64).T
-        plain_axes(axes, title)
+        plain_axes(axes, title, "iteration")
         if key == "loss":
             axes.plot(iterations, values, color=color, linewidth=0.6, alpha=0.25)
             values = _smooth(values)
@@ -109,7 +108,6 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]], spli
             label_point(axes, (iterations[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
         else:
             axes.set_ylim(bottom=0)
-        axes.set_xlabel("iteration", fontsize=9, color=INK)
         axes.yaxis.set_major_formatter(_thousands)
         axes.xaxis.set_major_formatter(_thousands)
     save_figure(figure, path)
@@ -129,8 +127,7 @@ def plot_profile(path: str | Path, stages: Mapping[str, float]) -> None:
         raise InputError("stages: expected at least one, got none.")
     times = np.array(list(stages.values()), dtype=np.float64)
     total = times.sum()
-    figure = new_figure(WIDTH, 0.7 + 0.28 * len(times), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_panels(0.7 + 0.28 * len(times))
     plain_axes(axes, f"time by stage, {total:.3g} ms in all")
     axes.grid(False)
     axes.barh(list(stages), times, color=BLUE, height=0.7)
@@ -174,6 +171,12 @@ def new_figure(width: float, height: float, layout: Literal["constrained", "comp
     return Figure(figsize=(width, height), dpi=DPI, layout=layout, facecolor="white")
 
 
+def new_panels(height: float, rows: int = 1, columns: int = 1, width: float = WIDTH, **shared) -> tuple[Figure, Any]:
+    """A figure in inches with axes in rows and columns, [rows, columns]; one alone for 1 x 1."""
+    figure = new_figure(width, height, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=rows * columns == 1, **shared)
+
+
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure, whole or not at all. Raises InputError if the file cannot be written."""
     with atomic_write(path) as temporary:
@@ -214,8 +217,9 @@ def _shorten(name: str, inches: float) -> str:
     return name if len(name) <= letters else "…" + name[1 - letters :]
 
 
-def plain_axes(axes: Axes, title: str) -> None:
-    """The look of all plots: a bold title in place of a label, few lines, a faint grid."""
+def plain_axes(axes: Axes, title: str, x: str = "") -> None:
+    """The look of all plots: a bold title in place of a label, few lines, a faint grid; ``x`` is told below."""
+    axes.set_xlabel(x, fontsize=9, color=INK)
     axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(FAINT)

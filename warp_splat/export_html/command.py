@@ -55,13 +55,9 @@ def export_html(config: ExportHtmlConfig) -> int:
     page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
     write_text(path, page)
     size, total = len(page) / 1e6, len(splats.means)
-    print(
-        f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; open it in a browser"
-    )
+    print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
     if size > LARGE:
-        print(
-            "  This is a large page, for which phones lack the memory; --max_gaussians N keeps the N that matter most."
-        )
+        print("  This is large, and phones lack the memory; --max_gaussians N keeps the N that matter most.")
     return 0
 
 

@@ -56,10 +56,7 @@ class Checkpoint:
         """A value of exactly this type."""
         found = self.facts.get(name)
         if type(found) is not kind:
-            raise InputError(
-                f"{self.path}: expected {name!r} as {kind.__name__}, found {type(found).__name__}; start from another "
-                "checkpoint."
-            )
+            raise InputError(f"{self.path}: expected {name!r} as {kind.__name__}, found {found!r:.50}; name another.")
         return found
 
     def count(self, name: str) -> int:

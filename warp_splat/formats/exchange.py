@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from warp_splat.errors import InputError
 from warp_splat.formats.gltf import load_gltf, save_gltf
-from warp_splat.formats.ply import ANTIALIASED, is_antialiased, load_ply, save_ply
+from warp_splat.formats.ply import load_ply, save_ply
 from warp_splat.formats.splat32 import load_splat, save_splat
 from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows
 from warp_splat.formats.spz import load_spz, save_spz
@@ -23,16 +23,8 @@ class Format(NamedTuple):
     save: Callable[[str | Path, SplatFile, Report], None]
 
 
-def _load_ply(path: str | Path, report: Report) -> SplatFile:
-    return SplatFile(load_ply(path, report), is_antialiased(path))
-
-
-def _save_ply(path: str | Path, file: SplatFile, report: Report) -> None:
-    save_ply(path, *file.splats, comments=(ANTIALIASED,) if file.antialiased else ())
-
-
 FORMATS = {
-    ".ply": Format(_load_ply, _save_ply),
+    ".ply": Format(load_ply, save_ply),
     ".splat": Format(load_splat, save_splat),
     ".spz": Format(load_spz, save_spz),
     ".glb": Format(load_gltf, save_gltf),

@@ -77,9 +77,7 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise InputError(
-            f"{folder}: another training writes into this folder; wait for its end, or choose another with -m."
-        ) from error
+        raise InputError(f"{folder}: another training writes here; wait for it, or choose another with -m.") from error
     except OSError as error:
         raise InputError(
             f"{lock.lock_file}: expected a file to write, which tells other trainings that this one is at work, found "
@@ -109,9 +107,7 @@ def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     )
     saved = sorted({int(match[1]) for match in matches if match and ply_path(folder, int(match[1])).is_file()})
     if not saved:
-        raise InputError(
-            f"{folder}: expected point_cloud/iteration_*/point_cloud.ply, found none; is it a model folder?"
-        )
+        raise InputError(f"{folder}: expected point_cloud/iteration_*/*.ply, found none; is it a model folder?")
     if iteration == -1:
         return saved[-1]
     if iteration not in saved:
@@ -185,9 +181,7 @@ def _parse_namespace(text: str, path: Path) -> dict[str, object]:
             raise ValueError("an argument without a name")
         return {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
-        raise InputError(
-            f"{path}: expected one line Namespace(name=literal, ...), found something else ({error})."
-        ) from error
+        raise InputError(f"{path}: expected one line Namespace(name=literal, ...), found another ({error}).") from error
 
 
 def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: Sequence[View]) -> None:
@@ -207,16 +201,9 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
 
 def camera_entry(camera: Camera) -> dict[str, object]:
     """A camera as ``cameras.json`` has it, with the principal point, which the reference's lacks."""
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.center.tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fy": camera.fy,
-        "fx": camera.fx,
-        "cx": camera.cx,
-        "cy": camera.cy,
-    }
+    pose = {"position": camera.center.tolist(), "rotation": camera.rotation.T.tolist()}
+    lens = {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
+    return {"width": camera.width, "height": camera.height, **pose, **lens}
 
 
 def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:

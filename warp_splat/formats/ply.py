@@ -20,7 +20,7 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, reading
-from warp_splat.formats.splats import SplatArrays, check_shapes, finite_rows
+from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # zeros; only there because readers of the reference's files may expect them
@@ -44,46 +44,25 @@ LIST = "list"  # in place of a NumPy type
 TYPES_WRITTEN = {"f4": "float", "u1": "uchar"}
 
 
-def save_ply(
-    path: str | Path,
-    means: np.ndarray,
-    sh: np.ndarray,
-    opacities: np.ndarray,
-    scales: np.ndarray,
-    quats: np.ndarray,
-    comments: Sequence[str] = (),
-) -> None:
+def save_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
     """Write Gaussians as stored (see :class:`SplatArrays`); equal arrays give equal bytes.
 
     Args:
         path: the file to write.
-        means: centers, [N, 3], world units.
-        sh: spherical harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16.
-        opacities: logits, [N].
-        scales: natural logarithms of the standard deviations, [N, 3].
-        quats: rotations w x y z, [N, 4].
-        comments: lines for the header, ASCII.
+        file: the Gaussians, float32.
+        report: not called: the format holds everything.
 
     Raises:
-        InputError: if a shape disagrees with the others; if a comment is not one line of ASCII; if the file cannot be
-            written.
+        InputError: if a shape disagrees with the others; if the file cannot be written.
     """
-    splats = SplatArrays(*(np.asarray(array, np.float32) for array in (means, sh, opacities, scales, quats)))
-    check_shapes(splats)
-    count, coefficients, _ = splats.sh.shape
-    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
-    columns = (
-        splats.means,
-        np.zeros((count, 3)),
-        splats.sh[:, 0],
-        rest,
-        splats.opacities[:, None],
-        splats.scales,
-        splats.quats,
-    )
+    check_shapes(file.splats)
+    means, sh, opacities, scales, quats = file.splats
+    count, coefficients, _ = sh.shape
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
+    columns = (means, np.zeros((count, 3)), sh[:, 0], rest, opacities[:, None], scales, quats)
     names = (*POSITION, *NORMAL, *F_DC, *_rest_names(rest.shape[1]), "opacity", *SCALE, *ROTATION)
     table = np.concatenate(columns, axis=1, dtype="<f4")
-    _write(path, table.view([(name, "<f4") for name in names])[:, 0], comments)
+    _write(path, table.view([(name, "<f4") for name in names])[:, 0], [ANTIALIASED] * file.antialiased)
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -115,7 +94,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     Raises:
         InputError: if the file is missing, damaged, or has no positions.
     """
-    vertex = _read_vertices(path)
+    vertex, _ = _read_vertices(path)
     names = vertex.dtype.names or ()
     if not set(POSITION) <= set(names):
         raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {', '.join(names):.200}.")
@@ -132,7 +111,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     return points[finite], colors[finite]
 
 
-def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatArrays:
+def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
     """Read Gaussians by property name: any order, with or without normals, SH degree 0 to 3.
 
     Rows with a value that is not finite (as a float32) are left out, since one of them can spoil a whole image.
@@ -142,12 +121,12 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatAr
         report: called with one line if rows were left out.
 
     Returns:
-        The Gaussians as stored.
+        The Gaussians as stored; whether a comment says that they are antialiased.
 
     Raises:
         InputError: if the file is missing, damaged, or not a PLY file of 3D Gaussians.
     """
-    vertex = _read_vertices(path)
+    vertex, comments = _read_vertices(path)
     names = vertex.dtype.names or ()
     rest_count = sum(name.startswith("f_rest_") for name in names)
     if rest_count not in REST_COUNTS:
@@ -164,17 +143,8 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatAr
         )
     with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
         table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
-    return finite_rows(_split_columns(table, rest_count // 3), path, report)
-
-
-def is_antialiased(path: str | Path) -> bool:
-    """Whether a comment says that the Gaussians are to be rendered with the opacities of Mip-Splatting.
-
-    Raises:
-        InputError: if the file is missing or not a PLY file of Gaussians.
-    """
-    with reading(path, EXPECTED), open(path, "rb") as file:
-        return not ANTIALIASED_READ.isdisjoint(_read_header(file)[2])
+    splats = finite_rows(_split_columns(table, rest_count // 3), path, report)
+    return SplatFile(splats, not ANTIALIASED_READ.isdisjoint(comments))
 
 
 def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:
@@ -195,8 +165,6 @@ def _rest_names(count: int) -> list[str]:
 
 
 def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
-    if not all(comment.isascii() and comment.isprintable() for comment in comments):
-        raise InputError(f"{path}: expected comments of one line of ASCII each, got {list(comments)}.")
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     header += [f"element vertex {len(rows)}"]
     header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code, *_ in rows.dtype.descr]
@@ -218,10 +186,11 @@ class _Element(NamedTuple):
         return self.rows * sum(2 if text else int(code[1]) for code in self.properties.values())
 
 
-def _read_vertices(path: str | Path) -> np.ndarray:
-    """The rows of the element ``vertex``, one field for each property."""
+def _read_vertices(path: str | Path) -> tuple[np.ndarray, list[str]]:
+    """The rows of the element ``vertex``, one field for each property, and the comments."""
     with reading(path, EXPECTED), open(path, "rb") as file:
-        return _read_rows(file, *_read_header(file)[:2])
+        byte_order, elements, comments = _read_header(file)
+        return _read_rows(file, byte_order, elements), comments
 
 
 def _read_header(file: BinaryIO) -> tuple[str, list[_Element], list[str]]:

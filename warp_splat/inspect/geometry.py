@@ -137,9 +137,7 @@ def check_axes(subject: Subject) -> Iterator[Finding]:
     best = max(seen, key=lambda name: seen[name])
     shares = ", ".join(f"{name} {100 * count / (len(points) * len(photos)):.0f} %" for name, count in seen.items())
     if seen[best] > BETTER * seen["as stored"]:
-        yield Finding(
-            "axes", "error", f"with {best} the images show more points ({shares}); the axes are mixed up."
-        )
+        yield Finding("axes", "error", f"with {best} the images show more points ({shares}); the axes are mixed up.")
     else:
         yield Finding("axes", "ok", f"the poses show as many points as in no other convention ({shares}).")
 

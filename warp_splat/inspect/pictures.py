@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from matplotlib.figure import Figure
 
-from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, plain_axes
+from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, new_panels, plain_axes
 from warp_splat.inspect.geometry import Measured, sample, worst_and_best
 from warp_splat.inspect.subject import THUMBNAIL, Subject
 from warp_splat.scene.types import visible
@@ -51,11 +51,10 @@ def _grid(count: int, columns: int, aspect: float) -> tuple[Figure, list]:
     """A figure with ``count`` cells of height / width ``aspect``, or of TALLEST."""
     rows = math.ceil(count / columns)
     height = WIDTH / columns * min(aspect, TALLEST) * 0.97 + 0.2
-    figure = new_figure(WIDTH, rows * height, layout="constrained")
-    cells = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in cells:
+    figure, cells = new_panels(rows * height, rows, columns)
+    for axes in np.ravel(cells):
         axes.set_axis_off()
-    return figure, list(cells[:count])
+    return figure, list(np.ravel(cells)[:count])
 
 
 def _sheet(subject: Subject, names: list[str]) -> Figure:
@@ -113,9 +112,9 @@ def _map(subject: Subject) -> Figure:
     middle = np.median(points, axis=0)
     _, _, axes_of_spread = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=True)
     reach = 1.3 * np.percentile(np.linalg.norm(np.concatenate([centers, points]) - middle, axis=1), 95)
-    figure = new_figure(WIDTH, WIDTH / 2 + 0.3, layout="constrained")
+    figure, grid = new_panels(WIDTH / 2 + 0.3, 1, 2)
     sides = (("in the plane of the cameras", (0, 1)), ("across it", (0, 2)))
-    for axes, (title, chosen) in zip(figure.subplots(1, 2), sides, strict=True):
+    for axes, (title, chosen) in zip(grid[0], sides, strict=True):
         plane = axes_of_spread[list(chosen)].T
         plain_axes(axes, title)
         axes.scatter(*((points - middle) @ plane).T, s=0.5, color=BLUE, alpha=0.4)
@@ -127,12 +126,11 @@ def _map(subject: Subject) -> Figure:
 
 
 def _bars(measured: Measured) -> Figure:
-    figure = new_figure(WIDTH, 2.6, layout="constrained")
-    medians = [float(np.median(errors)) for errors in measured.errors.values()]
+    figure, grid = new_panels(2.6, 1, 2)
+    medians = list(measured.medians.values())
     counts = [len(errors) for errors in measured.errors.values()]
     panels = (("median reprojection error [px]", medians, ORANGE), ("observations", counts, BLUE))
-    for axes, (title, values, color) in zip(figure.subplots(1, 2), panels, strict=True):
-        plain_axes(axes, title)
+    for axes, (title, values, color) in zip(grid[0], panels, strict=True):
+        plain_axes(axes, title, "image")
         axes.bar(range(len(values)), values, color=color)
-        axes.set_xlabel("image", fontsize=9, color=INK)
     return figure

@@ -70,9 +70,7 @@ def render_model(config: RenderConfig) -> int:
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-                print(
-                    f"  {metrics_line(means)} in {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}"
-                )
+                print(f"  {metrics_line(means)}: {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
     return 0
 
 
@@ -151,15 +149,8 @@ def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Ca
     resolution = trained.get("resolution", -1)
     if not isinstance(resolution, int):
         raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
-    return load_scene(
-        source,
-        images=str(trained.get("images", "images")),
-        resolution=resolution,
-        white_background=bool(trained.get("white_background")),
-        eval=bool(trained.get("eval")),
-        invert_masks=bool(trained.get("invert_masks")),
-        report=say,
-    )
+    flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
+    return load_scene(source, images=str(trained.get("images", "images")), resolution=resolution, **flags, report=say)
 
 
 def make_picture(

@@ -57,9 +57,7 @@ def load_scene(
         InputError: if an argument is out of range, or a file is missing, unreadable, or disagrees with another.
     """
     if not isinstance(resolution, int) or (resolution < 1 and resolution != -1):
-        raise InputError(
-            f"resolution: expected a positive whole number or -1, got {resolution}; see -r in warp-splat train --help."
-        )
+        raise InputError(f"resolution: expected a positive whole number or -1, got {resolution}; see -r in --help.")
     train, test, points, colors = read_photos(source, images, report)
     if not eval:
         train, test = train + test, []
@@ -127,9 +125,7 @@ def read_photos(
 
     source = Path(source)
     if is_video(source):
-        raise InputError(
-            f"{source}: expected the folder of a scene, found a video without cameras; {sfm_hint(source)}."
-        )
+        raise InputError(f"{source}: expected the folder of a scene, found a video; {sfm_hint(source)}")
     if not source.is_dir():
         found = "a file" if source.exists() else "nothing"
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")

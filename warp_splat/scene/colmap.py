@@ -42,9 +42,7 @@ def read_colmap(
     where, model = _largest_model(source / "sparse", report)
     registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     if not registered:
-        raise InputError(
-            f"{where}: expected a COLMAP model with registered images, found none; run COLMAP's mapper again."
-        )
+        raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run its mapper again.")
     points, colors = _points(model, report)
     return _photos(where, registered, source / folder, report), points, colors
 

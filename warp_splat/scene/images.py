@@ -222,9 +222,7 @@ def _text(get: Callable[..., str], *arguments: str) -> str:
 
 
 def _unreadable(path: Path, error: str) -> InputError:
-    return InputError(
-        f"{path}: expected a complete image file, but it cannot be read ({reason_of(error)}); replace this file."
-    )
+    return InputError(f"{path}: expected a complete image file, found none ({reason_of(error)}); replace it.")
 
 
 def _buffer(array: np.ndarray) -> oiio.ImageBuf:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from warp_splat.errors import InputError
+from warp_splat.text import few
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")  # what both pycolmap and the loader read, in sRGB
 OTHER_PHOTOS = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
@@ -79,9 +80,7 @@ class ImageFinder:
             file for file in files if Path(file).stem == path.stem and file.lower().endswith(READABLE)
         )
         if len(alike) > 1:
-            raise InputError(
-                f"{self.root / path}: no such file, but several of this stem ({', '.join(alike[:3])}); keep one."
-            )
+            raise InputError(f"{self.root / path}: no such file, but several of this stem ({few(alike)}); keep one.")
         if not alike:
             return None
         if path.suffix:

@@ -68,9 +68,7 @@ def _parse(path: Path) -> dict[str, Any]:
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:  # of the syntax, of the encoding, or of the depth
-            raise InputError(
-                f"{path}: expected JSON, but it cannot be parsed ({error!s:.200}); correct the file."
-            ) from error
+            raise InputError(f"{path}: expected JSON, but it cannot be parsed ({error!s:.200}); correct it.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object with the key frames, found another value; correct the file.")
     return content
@@ -157,9 +155,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Lens:
     else:
         angle = _value(values, "camera_angle_x", where)
         if not 0 < number("camera_angle_x") < np.pi:
-            raise InputError(
-                f"{where}: expected camera_angle_x between 0 and pi radians, got {reprlib.repr(angle)}; correct it."
-            )
+            raise InputError(f"{where}: expected camera_angle_x between 0 and pi, got {angle!r:.80}; correct it.")
         fx = 0.5 * width / np.tan(0.5 * angle)
     focal = (fx, number("fl_y", fx), number("cx", width / 2), number("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -233,7 +229,5 @@ def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 def _value(content: Any, key: str, where: str | Path) -> Any:
     if not isinstance(content, dict) or key not in content:
-        raise InputError(
-            f"{where}: expected the key {key} (as nerf-synthetic or nerfstudio has), found none; correct the file."
-        )
+        raise InputError(f"{where}: expected the key {key} (of nerf-synthetic or nerfstudio), found none; correct it.")
     return content[key]

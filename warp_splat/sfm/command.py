@@ -176,9 +176,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
     groups, broken = _groups(root, names, config.threads, say)
     names = [name for group in groups for name in group]
     if len(names) < LEAST:
-        raise InputError(
-            f"{root}: expected at least {LEAST} photographs that can be read, found {len(names)}; add photographs."
-        )
+        raise InputError(f"{root}: expected at least {LEAST} readable photographs, found {len(names)}; add some.")
     lenses = f"{len(groups)} lens{'es' * (len(groups) > 1)}"
     say(f"{len(names)} photographs, {lenses}, {config.threads} threads; work in {work}")
     database = work / "database.db"

@@ -47,13 +47,12 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         writer_class()
     if machine.portable and not PORTABLE:
         raise InputError("portable: expected to be set before kernels are loaded; set WARP_SPLAT_PORTABLE=1 instead.")
-    begun = _verified(data.start_checkpoint) if data.start_checkpoint else None
+    begun = None
+    if data.start_checkpoint:  # whole, without its arrays: beside the trainer's they would take as much memory again
+        begun = replace(load_checkpoint(data.start_checkpoint), arrays={})
     done = begun.count("iteration") if begun else 0
     if begun and done > iterations:  # at the end, what is written there is written again
-        raise InputError(
-            f"--iterations {iterations}: expected at least the {done} after which {begun.path} was written; name a "
-            "later end."
-        )
+        raise InputError(f"--iterations {iterations}: expected at least {done}, as in {begun.path}; name a later end.")
     folder = _choose_folder(config, begun)
     say = speaker(quiet)
     device = settle_device(launch.prepare(machine.device, threads), machine.device, [config.model.adjoint], say)
@@ -76,11 +75,6 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     return config, begun
 
 
-def _verified(path: str) -> Checkpoint:
-    """A checkpoint that is whole, without its arrays: beside the trainer's they would take as much memory again."""
-    return replace(load_checkpoint(path), arrays={})
-
-
 def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
     """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
     default = begun.path.parent if begun else model_folder.default_model_path()
@@ -96,10 +90,7 @@ def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
     """Raise InputError if the folder holds a training that does not go on from here."""
     continued = begun and begun.path.resolve() == (folder / LAST).resolve()
     if not continued and ((folder / LAST).exists() or any(folder.glob("point_cloud/*/*.ply"))):
-        raise InputError(
-            f"{folder}: this folder already holds a training; choose another with -m, move it, or continue where it "
-            f"ended with --resume {folder}."
-        )
+        raise InputError(f"{folder}: it already holds a training; choose another with -m, or --resume {folder}.")
 
 
 def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene:
@@ -108,16 +99,9 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene
     say(f"Scene {data.source_path}")
     if learn.coarse > 1 and learn.coarse_until_iter > learn.iterations:
         say(f"Warning: images reach their full size at --coarse_until_iter {learn.coarse_until_iter}, after the end.")
-    scene = load_scene(
-        data.source_path,
-        images=data.images,
-        resolution=data.resolution,
-        white_background=data.white_background,
-        eval=data.eval,
-        invert_masks=data.invert_masks,
-        start=data.start_ply if not begun or os.path.isfile(data.start_ply) else "",  # if it has gone
-        report=say,
-    )
+    start = data.start_ply if not begun or os.path.isfile(data.start_ply) else ""  # if it has gone
+    same = {name: getattr(data, name) for name in ("images", "resolution", "white_background", "eval", "invert_masks")}
+    scene = load_scene(data.source_path, **same, start=start, report=say)
     if scene.random_points and not begun:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
     if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from warp_splat.config import ADJOINTS, LAST_PORT, LOSS_SPACES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
+from warp_splat.config import ADJOINTS, LAST_PORT, LOSS_SPACES, LPIPS_HELP, OPTIMIZERS, PORT, PORT_HELP, PROJECTIONS
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers, data, flag, growing, learning, machinery, rendering, reporting
 from warp_splat.training.growth import GROWTHS
@@ -16,25 +16,19 @@ from warp_splat.training.parts import AUTO, PARTS
 class DataOptions:
     """What is read."""
 
-    source_path: str = flag(
-        "", "scene folder (COLMAP, nerf-synthetic, transforms.json); without it, the embedded scene", "-s"
-    )
+    source_path: str = flag("", "scene folder (COLMAP, nerf-synthetic, transforms.json); else the embedded one", "-s")
     sfm: bool = flag(False, "if the source is photographs or a video without cameras, run warp-splat sfm on them first")
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
-    resolution: int = flag(
-        -1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px wide", "-r", least=-1
-    )
+    resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px", "-r", least=-1)
     preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
     start_checkpoint: str = flag(
-        "", "continue a training: its folder, or a checkpoint; options are the same but for those given", "--resume"
+        "", "a training to continue: folder, or checkpoint; flags change its options", "--resume"
     )
 
     images: str = data("images", "folder of the photographs inside a COLMAP scene", "-i")
     white_background: bool = data(False, "composite on white instead of black", "-w")
     invert_masks: bool = data(False, "of the masks in masks/, the dark part counts, not the bright one")
-    loss_space: str = data(
-        "srgb", "photographs in linear light (EXR, HDR): the curve under which they are compared", choices=LOSS_SPACES
-    )
+    loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=LOSS_SPACES)
     start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")
 
@@ -47,20 +41,14 @@ class ModelOptions:
     adjoint: str = rendering("manual", "how the pixel loop is differentiated", choices=ADJOINTS)
     projection: str = rendering("affine", "from 3D to 2D Gaussians", choices=PROJECTIONS)
     antialiasing: bool = rendering(False, "keep small Gaussians from growing brighter (Mip-Splatting)")
-    parts: str = rendering(
-        "", f"what is learned or done besides: names between commas ({', '.join(PARTS)}), or auto: what the scene needs"
-    )
+    parts: str = rendering("", f"what is done besides: {', '.join(PARTS)} (with commas), or auto: what a scene needs")
 
 
 @dataclass(frozen=True)
 class LearnOptions:
     """How it learns; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
-    iterations: int = flag(
-        30_000,
-        "images to train on, one in each step; n in each under torchrun with n processes; schedules count images",
-        least=1,
-    )
+    iterations: int = flag(30_000, "images to train on, one in a step of each process; schedules count images", least=1)
 
     lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss", most=1)
     position_lr_init: float = learning(0.00016, "rate of the means at the start (times the scene's extent)")
@@ -72,13 +60,9 @@ class LearnOptions:
     rotation_lr: float = learning(0.001, "rate of the quaternions")
     cooldown: int = learning(0, "over this many steps at the end, all rates fall to a tenth")
     sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1)
-    optimizer_type: str = learning(
-        "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
-    )
+    optimizer_type: str = learning("default", "sparse_adam updates only what the image shows", choices=OPTIMIZERS)
     coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
-    coarse_until_iter: int = learning(
-        3000, "by this step the size has doubled, at equal intervals, to the full one", least=1
-    )
+    coarse_until_iter: int = learning(3000, "by this step the size has doubled to the full one", least=1)
     seed: int = learning(0, "seed of everything random", most=2**63 - 1)
 
 
@@ -101,9 +85,7 @@ class ReportOptions:
     test_iterations: list[int] = reporting([7_000, 30_000], "evaluate after these steps, and 20 times in all", many=int)
     save_iterations: list[int] = reporting([7_000, 30_000], "save the model after these steps, and the last", many=int)
     checkpoint_iterations: list[int] = reporting([], "keep a checkpoint of these steps, besides the last one", many=int)
-    checkpoint_interval: float = reporting(
-        5.0, "minutes between two checkpoints, of which the last is kept; 0: one at the start and one at the end"
-    )
+    checkpoint_interval: float = reporting(5.0, "minutes between checkpoints (one stays); 0: only at start and end")
     lpips_weights: str = reporting("", LPIPS_HELP)
     tensorboard: bool = reporting(False, "also write event files for TensorBoard into the output folder")
     viewer: bool = reporting(False, "show the training in a browser, with pause and continue")
@@ -118,9 +100,7 @@ class MachineOptions:
 
     device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = machinery("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
-    threads: int = machinery(
-        0, "CPU threads of a process; 0: all cores, or under torchrun its share (results do not depend on it)", least=0
-    )
+    threads: int = machinery(0, "CPU threads of a process; 0: all cores, or its share (results do not depend on it)")
     portable: bool = machinery(
         False, "multiply and add apart, as processors without fused multiply-adds do: slower, the same bytes there, too"
     )
@@ -200,9 +180,7 @@ def check_train(config: TrainConfig) -> None:
             f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
         )
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:
-        raise InputError(
-            "--position_lr_init, --position_lr_final: expected more than 0 (the rate decays from one to the other)."
-        )
+        raise InputError("--position_lr_init, --position_lr_final: expected more than 0, for rates to decay between.")
     if config.grow.growth not in GROWTHS:
         raise InputError(f"--growth: expected one of {', '.join(GROWTHS)}, got {config.grow.growth!r:.50}.")
     unknown = set(parts.split(",")) - {*PARTS} if parts and parts != AUTO else ()

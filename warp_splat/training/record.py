@@ -114,9 +114,7 @@ def restore(trainer: Trainer, run: Run, checkpoint: Checkpoint) -> None:
     run.history = checkpoint.fact("history", list)
     for record in run.history:
         if not isinstance(record, dict) or {name: type(value) for name, value in record.items()} != RECORD:
-            raise InputError(
-                f"{checkpoint.path}: expected records of {', '.join(RECORD)}, found others in its history."
-            )
+            raise InputError(f"{checkpoint.path}: expected a history of {', '.join(RECORD)}, found another.")
     if "losses" in checkpoint.arrays:
         run.losses = list(torch.from_numpy(checkpoint.array("losses", (-1,))).to(trainer.device))
     run.kept_at = time.perf_counter()

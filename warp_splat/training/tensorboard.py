@@ -56,7 +56,5 @@ def writer_class() -> type[SummaryWriter]:
     try:
         from tensorboardX import SummaryWriter  # noqa: PLC0415 - optional
     except ImportError as error:
-        raise InputError(
-            "--tensorboard: expected the package tensorboardX; install it with `pip install tensorboardX`."
-        ) from error
+        raise InputError("--tensorboard: expected the package tensorboardX; `pip install tensorboardX`.") from error
     return SummaryWriter

@@ -103,11 +103,10 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
 
 def plot(path: Path, rows: Sequence[Row]) -> None:
     """Draw the growth of rounding along a chain against its bound, and the error of two formulas for a determinant."""
-    figure = report.new_figure(report.WIDTH, 3.2, layout="constrained")
-    left, right = figure.subplots(1, 2)
-    _plot_chains(left, {row.case.name: row for row in rows})
-    _plot_determinant(right)
-    for axes in (left, right):
+    figure, grid = report.new_panels(3.2, 1, 2)
+    _plot_chains(grid[0, 0], {row.case.name: row for row in rows})
+    _plot_determinant(grid[0, 1])
+    for axes in grid[0]:
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.minorticks_off()
@@ -115,7 +114,7 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _plot_chains(axes, rows: dict[str, Row]) -> None:
-    report.plain_axes(axes, "error of gradients and of T, n layers")
+    report.plain_axes(axes, "error of gradients and of T, n layers", "n")
     chains = {layers: rows[f"chain_{layers}"].outcomes for layers in pixel_loop.CHAINS}
     lengths = list(chains)
     axes.plot(lengths, [layers * EPS for layers in lengths], color=report.INK, linewidth=1.0, linestyle="--")
@@ -130,11 +129,10 @@ def _plot_chains(axes, rows: dict[str, Row]) -> None:
     recovered = [arithmetic.recovery_error(layers) for layers in lengths]
     axes.plot(lengths, recovered, color="#999999", linewidth=1.2, label="T recovered")
     axes.legend(frameon=False, fontsize=9, labelcolor=report.INK, loc="upper left")
-    axes.set_xlabel("n", fontsize=9, color=report.INK)
 
 
 def _plot_determinant(axes) -> None:
-    report.plain_axes(axes, "error of det, worst of all angles")
+    report.plain_axes(axes, "error of det, worst of all angles", "scale ratio of the needle")
     errors = arithmetic.determinant_errors()
     ratios = arithmetic.RATIOS
     axes.plot(ratios, errors["usual"], color=report.ORANGE, marker="s", markersize=4)
@@ -143,4 +141,3 @@ def _plot_determinant(axes) -> None:
     report.label_point(axes, (ratios[-1], errors["ours"][-1]), "sum of squares", (0, 7), "right")
     axes.axhline(1.0, color=report.INK, linewidth=1.0, linestyle="--")
     report.label_point(axes, (ratios[0], 1.0), "no digit right", (0, 4), "left")
-    axes.set_xlabel("scale ratio of the needle", fontsize=9, color=report.INK)

@@ -15,10 +15,9 @@ from warp_splat.evaluation.report import FAINT, INK
 
 def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limits: Sequence[Mapping[str, Any]]) -> None:
     """Draw error against run time, a panel for each optical depth, and error against tau ds around the limits."""
-    figure = report.new_figure(report.WIDTH, 5.4, layout="constrained")
+    figure, grid = report.new_panels(5.4, 2, 3)
     figure.supylabel("largest error of the radiance (colors 0 to 1)", fontsize=9, color=INK)
-    panels = figure.subplots(2, 3).ravel()
-    for axes, optical_depth in zip(panels, media.OPTICAL_DEPTHS, strict=False):
+    for axes, optical_depth in zip(grid.flat, media.OPTICAL_DEPTHS, strict=False):
         chosen = [r for r in integrators if r["optical_depth"] == optical_depth]
         _style(axes, f"optical depth {media.plain(optical_depth)}", f"run time for {media.RAYS} rays [ms]")
         for name, (*_, color, marker) in media.METHODS.items():
@@ -30,7 +29,7 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
             axes.plot(unstable, [6.0 if name == "Euler" else 60.0] * len(unstable), "x", color=color, markersize=5)
         axes.set_ylim(1e-16, 1e3)
         axes.axhline(media.UNSTABLE, color=INK, linewidth=0.6, linestyle=":")
-    axes = panels[-1]
+    axes = grid[-1, -1]
     _style(axes, f"step limit at {media.plain(media.LIMIT_DEPTHS[-1])}", "tau ds at the peak of tau")
     for record in limits[-len(media.METHODS) :]:  # those of the densest medium
         theory, color = media.METHODS[record["method"]][2:4]
@@ -40,19 +39,17 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
     axes.set_ylim(1e-16, 1e3)
     axes.set_xticks([1, 2, 5, 10, 20], labels=["1", "2", "5", "10", "20"])
     axes.minorticks_off()
-    lines = [
-        axes.plot([], [], color=color, marker=marker, markersize=4)[0] for *_, color, marker in media.METHODS.values()
-    ]
-    cross = axes.plot([], [], "x", color=INK)[0]
-    dashed = axes.plot([], [], "--", color=INK, linewidth=1)[0]
-    labels = [*media.METHODS, "unstable: error above 1", "stability limit for constant tau"]
-    figure.legend([*lines, cross, dashed], labels, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    for name, (*_, color, marker) in media.METHODS.items():
+        axes.plot([], [], color=color, marker=marker, markersize=4, label=name)
+    axes.plot([], [], "x", color=INK, label="unstable: error above 1")
+    axes.plot([], [], "--", color=INK, linewidth=1, label="stability limit for constant tau")
+    figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     report.save_figure(figure, path)
 
 
 def _style(axes: Any, title: str, x: str) -> None:
-    report.plain_axes(axes, title)
-    axes.set(xlabel=x, xscale="log", yscale="log")
+    report.plain_axes(axes, title, x)
+    axes.set(xscale="log", yscale="log")
     axes.grid(color=FAINT, linewidth=0.5)
 
 
