@@ -32,17 +32,10 @@ def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> st
     table = [[str(cell).replace("|", "\\|") for cell in row] for row in (headers, *rows)]
     if any(len(row) != len(headers) for row in table):
         raise InputError(f"rows: expected {len(headers)} cells each, got {sorted({len(row) for row in table})}.")
-    widths = [max(3, *(len(cell) for cell in column)) for column in zip(*table, strict=True)]
-    right = [
-        index > 0 and all(NUMBER.fullmatch(cell) for cell in column[1:])
-        for index, column in enumerate(zip(*table, strict=True))
-    ]
-    rule = ["-" * (width - 1) + (":" if to_right else "-") for width, to_right in zip(widths, right, strict=True)]
-    lines = [
-        [
-            f"{cell:>{width}}" if to_right else f"{cell:<{width}}"
-            for cell, width, to_right in zip(row, widths, right, strict=True)
-        ]
-        for row in (table[0], rule, *table[1:])
-    ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    columns = []
+    for place, (head, *cells) in enumerate(zip(*table, strict=True)):
+        to_right = place > 0 and all(NUMBER.fullmatch(cell) for cell in cells)
+        width = max(3, *(len(cell) for cell in (head, *cells)))
+        rule = "-" * (width - 1) + (":" if to_right else "-")
+        columns.append([f"{cell:{'>' if to_right else '<'}{width}}" for cell in (head, rule, *cells)])
+    return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))

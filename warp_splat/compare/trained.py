@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warp_splat.compare.workloads import SHORT
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import psnr, ssim
@@ -35,15 +36,6 @@ from warp_splat.text import format_table
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
-SHORT: dict[str, Any] = {
-    **EMBEDDED_DEFAULTS[""],
-    "iterations": 300,
-    "position_lr_max_steps": 300,
-    "densify_from_iter": 50,
-    "densify_until_iter": 200,
-    "densification_interval": 50,
-    "sh_interval": 100,
-}
 SEEDS = (0, 1, 2)
 CAPS = (2048, 512, 128)  # the thesis's first; the last is pictured
 EVALUATIONS, VIEWS = 12, 8

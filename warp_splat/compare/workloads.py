@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera
-from warp_splat.compare.trained import SHORT
 from warp_splat.config import RasterOptions
+from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.raster.data import Gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
@@ -20,6 +21,16 @@ from warp_splat.scene.types import Scene
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
+#: The schedule of the embedded scene, shrunk.
+SHORT: dict[str, Any] = {
+    **EMBEDDED_DEFAULTS[""],
+    "iterations": 300,
+    "position_lr_max_steps": 300,
+    "densify_from_iter": 50,
+    "densify_until_iter": 200,
+    "densification_interval": 50,
+    "sh_interval": 100,
+}
 CANDIDATES = (10, 100, 1000, 10_000)  # per pixel of the layered scenes
 LAYERED_SIZE = 96  # px
 STAGES = (0, 100, 300)  # steps of the short schedule after which a scene in training is measured

@@ -181,13 +181,10 @@ def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:
     if config.orbit:
         return focus_orbit(scene, TIMED)
     lens = scene.train[0].camera
-    if config.video == "spiral":
-        return spiral_cameras(scene, config.frames, lens)
-    if config.video == "path":
-        return path_cameras(scene, config.frames, lens)
-    if config.orbit_center == "origin":
+    if config.video == "orbit" and config.orbit_center == "origin":
         return origin_orbit(config.frames, lens)
-    return focus_orbit(scene, config.frames, lens)
+    make = {"orbit": focus_orbit, "spiral": spiral_cameras, "path": path_cameras}[config.video]
+    return make(scene, config.frames, lens)
 
 
 def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output: str, config: RenderConfig) -> None:

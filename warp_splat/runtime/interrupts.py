@@ -5,37 +5,35 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+
+
+@contextmanager
+def _handling(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
+    """Let ``handler`` take these signals; elsewhere than in the main thread, which alone may, nothing happens."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, before in previous.items():
+            signal.signal(number, before)
 
 
 @contextmanager
 def interruptible() -> Iterator[list[int]]:
     """Yield a list that Ctrl-C (and SIGTERM) adds to, instead of raising: the block looks at it when it can stop."""
     interrupted: list[int] = []
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+    with _handling((signal.SIGINT, signal.SIGTERM), lambda number, frame: interrupted.append(number)):
         yield interrupted
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    previous = [signal.signal(number, lambda number, frame: interrupted.append(number)) for number in numbers]
-    try:
-        yield interrupted
-    finally:
-        for number, handler in zip(numbers, previous, strict=True):
-            signal.signal(number, handler)
 
 
-@contextmanager
-def leaving_at_once() -> Iterator[None]:
+def leaving_at_once() -> AbstractContextManager[None]:
     """Let Ctrl-C end the process instead of raising: in libraries that are half loaded, exceptions become others."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGINT, _leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
+    return _handling((signal.SIGINT,), _leave)
 
 
 def _leave(*_: object) -> None:

@@ -113,7 +113,7 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
     processes = trainer.processes
     with interruptible() as interrupted:
         if viewer:  # only now: who has read it may press Ctrl-C
-            viewer.announce()
+            print(viewer.viewer.announcement, flush=True)
         try:
             _loop(trainer, run, interrupted, viewer)
         except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet

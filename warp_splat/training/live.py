@@ -36,10 +36,6 @@ class TrainingViewer:
             self._button = viewer.gui.add_button("Pause")
         self._button.on_click(self._toggle)
 
-    def announce(self) -> None:
-        """Say where it is."""
-        print(self.viewer.announcement, flush=True)
-
     def _toggle(self, _=None) -> None:
         self.paused = not self.paused
         self._button.label = "Continue" if self.paused else "Pause"

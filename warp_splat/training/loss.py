@@ -46,45 +46,37 @@ def image_loss(
         InputError: if the shapes differ, are not [H, W, 3] or hold no pixel, a type is another, or ``lambda_dssim``
             lies outside 0..1.
     """
-    if not isinstance(image, torch.Tensor) or not isinstance(target, torch.Tensor):
-        raise InputError(
-            f"image_loss: expected two tensors, got {type(image).__name__} and {type(target).__name__}; convert them."
-        )
-    for tensor in (image, target, mask):
-        if isinstance(tensor, torch.Tensor) and (tensor.layout, tensor.device) != (torch.strided, image.device):
-            raise InputError(
-                f"image_loss: expected dense tensors on one device, got one of {tensor.layout} on {tensor.device} "
-                f"beside an image on {image.device}; convert it."
-            )
-    if image.device.type not in DRIVERS:
-        raise InputError(
-            f"image_loss: expected tensors on the CPU or an NVIDIA GPU, got one on {image.device}; convert it."
-        )
-    if not isinstance(lambda_dssim, Real) or not 0.0 <= lambda_dssim <= 1.0:
-        raise InputError(f"image_loss: expected lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}.")
-    if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
-        raise InputError(
-            f"image_loss: expected an image of float32 and a target of float32 or uint8, got {image.dtype} and "
-            f"{target.dtype}; convert them."
-        )
-    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS or not image.numel():
-        raise InputError(
-            f"image_loss: expected two images [H, W, 3] of one size, 1 x 1 or more, got {list(image.shape)} and "
-            f"{list(target.shape)}."
-        )
+    if problem := _problem(image, target, lambda_dssim, mask):
+        raise InputError(f"image_loss: expected {problem}.")
     if mask is not None:
-        is_tensor = isinstance(mask, torch.Tensor)
-        if not is_tensor or mask.dtype != torch.uint8 or mask.shape != (*image.shape[:2], 1):
-            found = f"{list(mask.shape)} of {mask.dtype}" if is_tensor else type(mask).__name__
-            raise InputError(
-                f"image_loss: expected a mask, a tensor {[*image.shape[:2], 1]} of uint8, 0 for pixels that do not "
-                f"count, got {found}."
-            )
         counts = mask != 0
         image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))
     if driver_of(image.device).lanes == 1:
         return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
     return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
+
+
+def _problem(image, target, lambda_dssim, mask) -> str | None:
+    """What :func:`image_loss` expects of its arguments, and what it got; None if that is the same."""
+    if not isinstance(image, torch.Tensor) or not isinstance(target, torch.Tensor):
+        return f"two tensors, got {type(image).__name__} and {type(target).__name__}; convert them"
+    for tensor in (image, target, mask):
+        if isinstance(tensor, torch.Tensor) and (tensor.layout, tensor.device) != (torch.strided, image.device):
+            found = f"one of {tensor.layout} on {tensor.device} beside an image on {image.device}"
+            return f"dense tensors on one device, got {found}; convert it"
+    if image.device.type not in DRIVERS:
+        return f"tensors on the CPU or an NVIDIA GPU, got one on {image.device}; convert it"
+    if not isinstance(lambda_dssim, Real) or not 0.0 <= lambda_dssim <= 1.0:
+        return f"lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}"
+    if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
+        return f"an image of float32, a target of float32 or uint8, got {image.dtype} and {target.dtype}; convert them"
+    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS or not image.numel():
+        return f"two images [H, W, 3] of one size, 1 x 1 or more, got {list(image.shape)} and {list(target.shape)}"
+    wanted, is_tensor = [*image.shape[:2], 1], isinstance(mask, torch.Tensor)
+    if mask is None or (is_tensor and mask.dtype == torch.uint8 and list(mask.shape) == wanted):
+        return None
+    found = f"{list(mask.shape)} of {mask.dtype}" if is_tensor else type(mask).__name__
+    return f"a mask, a tensor {wanted} of uint8, 0 for pixels that do not count, got {found}"
 
 
 def loss_by_convolution(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float) -> torch.Tensor:

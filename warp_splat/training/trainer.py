@@ -145,10 +145,8 @@ class Trainer:
 
     def _asked(self, step: Step) -> RasterOptions:
         """What parts and growth need of the renderer."""
-        options = self._through("asks", self.options, step)
-        for asks in having([self.growth], "asks"):
-            options = asks(options, step)
-        return options
+        asked = self._through("asks", self.options, step)
+        return self.growth.asks(asked, step) if hasattr(self.growth, "asks") else asked
 
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
@@ -259,12 +257,8 @@ class Trainer:
         return float(np.mean([psnr(self.picture(view.camera), view.picture, view.mask) for view in views]))
 
 
-def _log_curve(linear: torch.Tensor) -> torch.Tensor:
-    return torch.log1p(linear / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR)
-
-
 #: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.
 LOSS_CURVES = {
     "srgb": lambda linear: to_srgb(linear.clamp_min(0.0), torch.where),
-    "log": lambda linear: _log_curve(linear.clamp_min(0.0)),
+    "log": lambda linear: torch.log1p(linear.clamp_min(0.0) / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR),
 }

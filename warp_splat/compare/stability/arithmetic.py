@@ -11,15 +11,8 @@ import numpy as np
 import torch
 
 from warp_splat.compare.scenes import cloud, look, tensors
-from warp_splat.compare.stability.verdict import (
-    EPS,
-    FLOAT_MAX,
-    GRADIENT_LIMIT,
-    Case,
-    Outcome,
-    count_text,
-    relative_error,
-)
+from warp_splat.compare.stability import verdict as check
+from warp_splat.compare.stability.verdict import EPS, GRADIENT_LIMIT, Case, Outcome, relative_error
 from warp_splat.config import ALPHA_MAX, BLUR, TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
@@ -185,7 +178,7 @@ def adam(gradient: float, kind: str, _mode: str) -> Outcome:
         for parameter in model.parameters.values():
             parameter.grad = torch.full_like(parameter, gradient)
         optimizer.step(torch.ones(count, dtype=torch.int32))
-    overflows, sparse = 0.001 * gradient**2 > FLOAT_MAX, kind == "sparse_adam"
+    overflows, sparse = 0.001 * gradient**2 > check.FLOAT_MAX, kind == "sparse_adam"
     found, exact, stuck = [], [], 0
     for group in optimizer.adam.param_groups:
         (parameter,) = group["params"]
@@ -195,7 +188,7 @@ def adam(gradient: float, kind: str, _mode: str) -> Outcome:
     error, limit = relative_error(torch.cat(found), torch.cat(exact)), 1e-5
     failures = () if error < limit else (f"steps off by {error:.1e} > {limit:.1e}",)
     says = f"moves by {exact_adam(gradient, 1.0, sparse):.3g} rates"
-    return Outcome(says, error, limit, None, 0.0, count_text(overflows=stuck), failures)
+    return Outcome(says, error, limit, None, 0.0, check.count_text(overflows=stuck), failures)
 
 
 def too_many_tiles(_mode: str) -> Outcome:
