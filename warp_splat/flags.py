@@ -57,7 +57,8 @@ def check_numbers(config: Any) -> None:
         value, least, most = values[item.name], item.metadata["least"], item.metadata["most"]
         if isinstance(value, list) and item.metadata["many"] is int and min(value, default=1) < 1:
             raise InputError(f"--{item.name}: expected numbers of steps, at least 1, got {min(value)}.")
-        if type(value) in (int, float) and not (least <= value <= most and value < math.inf):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if number and not (least <= value <= most and value < math.inf):
             bounds = f"{least} to {most}" if most < math.inf else f"at least {least}"
             finite = "a finite number, " * isinstance(value, float)
             raise InputError(f"--{item.name}: expected {finite}{bounds}, got {value}.")
