@@ -54,11 +54,10 @@ def check_numbers(config: Any) -> None:
     """Raise InputError if a number of ``config`` is out of its bounds."""
     values = config.flat() if hasattr(config, "flat") else vars(config)
     for item in flags_of(type(config)):
-        value, least, most = values[item.name], item.metadata["least"], item.metadata["most"]
+        value, least, most = values[item.name], item.metadata["least"], item.metadata["most"]  # True is 1
         if isinstance(value, list) and item.metadata["many"] is int and min(value, default=1) < 1:
             raise InputError(f"--{item.name}: expected numbers of steps, at least 1, got {min(value)}.")
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if number and not (least <= value <= most and value < math.inf):
+        if isinstance(value, int | float) and not (least <= value <= most and value < math.inf):
             bounds = f"{least} to {most}" if most < math.inf else f"at least {least}"
             finite = "a finite number, " * isinstance(value, float)
             raise InputError(f"--{item.name}: expected {finite}{bounds}, got {value}.")

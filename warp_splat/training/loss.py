@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from numbers import Real
-from typing import Any
 
 import numpy as np
 import torch
@@ -57,7 +56,7 @@ def image_loss(
     return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
 
 
-def _problem(image, target, lambda_dssim: Any, mask) -> str | None:
+def _problem(image, target, lambda_dssim: float, mask) -> str | None:
     """What :func:`image_loss` expects of its arguments, and what it got; None if that is the same."""
     if not isinstance(image, torch.Tensor) or not isinstance(target, torch.Tensor):
         return f"two tensors, got {type(image).__name__} and {type(target).__name__}; convert them"
