@@ -23,6 +23,7 @@ CONFIG = {
     "densification_interval": 6,
     "sh_interval": 4,
     "random_background": True,
+    "parts": "floaters",
 }
 
 

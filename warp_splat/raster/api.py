@@ -36,6 +36,7 @@ class RenderOutput:
     depths: torch.Tensor  # [N] world units, z in the camera
     opacities2d: torch.Tensor  # [N] after antialiasing
     invalid_count: int | torch.Tensor  # see `invalid`; on a GPU, reading it waits for the image
+    gaussians: Gaussians  # that were rendered
     dropped: Dropped = field(default_factory=Dropped)
 
     @property
@@ -163,5 +164,6 @@ def render(
         depths=splats.depths,
         opacities2d=splats.opacities,
         invalid_count=bins.invalid,
+        gaussians=gaussians,
         dropped=dropped,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from warp_splat.flags import rendering
+from warp_splat.flags import learning, rendering
 from warp_splat.training.seams import Entry
 
 if TYPE_CHECKING:
@@ -22,9 +22,17 @@ class BackgroundOptions:
     random_background: bool = rendering(False, "a random background color in every step")
 
 
+@dataclass(frozen=True)
+class FloatersOptions:
+    """A price on opacity."""
+
+    opacity_reg: float = learning(0.05, "weight of the mean opacity in the loss of --parts floaters")
+
+
 #: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
     "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
+    "floaters": Entry(FloatersOptions, "warp_splat.training.parts.floaters.Floaters"),
 }
 
 
