@@ -7,7 +7,9 @@ runs this file on an emulated processor and compares.
 """
 
 import argparse
+import contextlib
 import hashlib
+import sys
 import tempfile
 from pathlib import Path
 
@@ -73,7 +75,7 @@ def trained(steps: int) -> dict[str, np.ndarray]:
     scene = load_scene(embedded_scene(), resolution=SMALL, report=str)
     found = {"photographs": np.stack([view.image for view in scene.train]), "points": scene.points}
     flags = [f"--{name}={value}" for name, value in {**GROWTH, "iterations": steps, "seed": 1, "threads": 1}.items()]
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
         if command(["train", "-m", folder, "-r", str(SMALL), "--quiet", *flags]):
             raise RuntimeError("the training ended with an error")
         model = load_ply(Path(folder) / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply")
