@@ -147,7 +147,7 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say)
     if trainer.processes.rank == 0 and not (found := sha256_of(run)).startswith(verify):
         raise InputError(
             f"--verify: expected a model whose sha256 begins with {verify}, got {found}; another scene, version, "
-            "option or kind of device makes another model, see docs/performance.md."
+            "option or kind of device makes another model, see docs/platforms.md."
         )
     return 0
 

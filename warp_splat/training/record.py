@@ -134,7 +134,7 @@ def how_to_continue(folder: Path, processes: Processes) -> str:
 
 
 def sha256_of(run: Run) -> str:
-    """The hash of the saved model, a .ply file: equal where the bytes are (docs/performance.md says where)."""
+    """The hash of the saved model, a .ply file: equal where the bytes are (docs/platforms.md says where)."""
     assert run.saved
     return hashlib.sha256(run.saved.read_bytes()).hexdigest()
 
