@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from warp_splat.errors import InputError
-from warp_splat.evaluation.metrics import METRICS, evaluate_folder, psnr, ssim, write_results
+from warp_splat.evaluation.metrics import METRICS, cc_psnr, evaluate_folder, psnr, ssim, write_results
 from warp_splat.evaluation.perceptual import choose_metrics, flip
 from warp_splat.formats.png import load_png, save_png
 
@@ -60,7 +60,62 @@ def test_psnr_counts_every_channel_alike():
     assert psnr(black, one) == pytest.approx(10 * math.log10(3), abs=1e-12)
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
+#: Of red, green, blue and 255: whole numbers, so that no color of the tests below is rounded.
+MAP = np.array([[2, -1, 0, 0], [0, 1, 0, 0.2], [1, 1, -1, 0]])
+
+
+def mapped(image):
+    return np.concatenate([image, np.full((*image.shape[:2], 1), 255)], 2) @ MAP.T
+
+
+def between(low, high, shape=(40, 30, 3), seed=0):
+    return np.random.default_rng(seed).integers(low, high, shape).astype(np.uint8)
+
+
+def test_cc_psnr_forgives_an_affine_map_of_the_colors():
+    image = between(60, 110)
+    assert psnr(image, mapped(image).astype(np.uint8)) < 25
+    assert cc_psnr(image, mapped(image).astype(np.uint8)) > 200
+    assert cc_psnr(image, image) > 200
+
+
+def test_cc_psnr_leaves_out_what_is_saturated_in_either_and_cuts_what_comes_out():
+    """A third of the reference is cut at 255 or 0, where no affine map leads; of the image, an eighth is black."""
+    image = between(2, 240)
+    reference = np.clip(mapped(image), 0, 255).astype(np.uint8)
+    assert 0.2 < (reference % 255 == 0).mean() < 0.5
+    assert cc_psnr(image, reference) > 200
+    image[:5] = 0  # says nothing of the map, but counts
+    wrong = (np.clip(mapped(image), 0, 255) - reference) / 255
+    assert cc_psnr(image, reference) == pytest.approx(-10 * np.log10((wrong**2).mean()), abs=1e-6)
+
+
+def test_cc_psnr_is_that_of_the_least_squares_where_nothing_is_saturated():
+    image, noise = between(60, 190), np.random.default_rng(1).normal(0, 8, (40, 30, 3))
+    reference = np.round(0.6 * image + 40 + noise).astype(np.uint8)
+    terms, wanted = np.c_[image.reshape(-1, 3) / 255, np.ones(image.size // 3)], reference.reshape(-1, 3) / 255
+    _, left, *_ = np.linalg.lstsq(terms, wanted, rcond=None)
+    assert cc_psnr(image, reference) == pytest.approx(-10 * np.log10(left.sum() / wanted.size), abs=1e-9)
+
+
+def test_cc_psnr_of_what_cannot_be_fitted():
+    """Gray images leave the map open; where all is saturated, colors stay."""
+    gray = between(60, 110, (20, 20, 1)).repeat(3, 2)
+    assert cc_psnr(gray, 2 * gray + 3) > 150
+    black, white, middle = (np.full((4, 5, 3), value, np.uint8) for value in (0, 255, 100))
+    assert cc_psnr(black, white) == psnr(black, white) == 0 and cc_psnr(black, middle) == psnr(black, middle)
+    assert cc_psnr(white, white) == math.inf and cc_psnr(middle, middle + np.uint8(50)) > 200
+
+
+def test_cc_psnr_neither_fits_nor_counts_what_is_masked():
+    image = between(60, 110)
+    mask = np.ones(image.shape[:2], np.uint8)
+    mask[:, 15:] = 0
+    reference = np.where(mask[..., None] > 0, mapped(image), between(0, 255, seed=2)).astype(np.uint8)
+    assert cc_psnr(image, reference, mask) > 200 > 30 > cc_psnr(image, reference)
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim, cc_psnr])
 def test_metrics_check_their_images(metric):
     image, _ = images(4, 5)
     for bad in (image[:3], image.astype(np.float32), image[..., 0]):
@@ -97,7 +152,7 @@ def rendered_folder(folder, pairs):
 
 def test_evaluate_folder_means_the_values_of_the_images(tmp_path):
     pairs = [images(20, 30, 5, seed=1), images(25, 12, 60, seed=2)]
-    means, per_view = evaluate_folder(rendered_folder(tmp_path, pairs))
+    means, per_view = evaluate_folder(rendered_folder(tmp_path, pairs), {"SSIM": ssim, "PSNR": psnr})
     assert per_view["PSNR"] == {f"{index:05d}.png": psnr(*pair) for index, pair in enumerate(pairs)}
     assert per_view["SSIM"] == {f"{index:05d}.png": ssim(*pair) for index, pair in enumerate(pairs)}
     assert means == {
@@ -131,10 +186,11 @@ def test_results_are_json_and_keep_other_methods(tmp_path):
     image, _ = images(12, 12)
     means, per_view = evaluate_folder(rendered_folder(tmp_path / "test", [(image, image)]))
     write_results(tmp_path, 30000, means, per_view, {"gaussians": 12, "seconds": 1.5})
-    ours = {"SSIM": means["SSIM"], "PSNR": None, "gaussians": 12, "seconds": 1.5}
+    ours = {"SSIM": means["SSIM"], "PSNR": None, "CC_PSNR": None, "gaussians": 12, "seconds": 1.5}
     expected = {"ours_7000": {"SSIM": 0.5, "PSNR": None}, "ours_30000": ours}
     assert read_strictly(tmp_path / "results.json") == expected
-    views = {"SSIM": {"00000.png": means["SSIM"]}, "PSNR": {"00000.png": None}}
+    equal = {"00000.png": None}
+    views = {"SSIM": {"00000.png": means["SSIM"]}, "PSNR": equal, "CC_PSNR": equal}
     assert read_strictly(tmp_path / "per_view.json") == {"ours_30000": views}
 
 

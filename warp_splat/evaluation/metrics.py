@@ -1,6 +1,6 @@
 """How close renders are to photographs: PSNR and SSIM of 8-bit images, and the files they are kept in.
 
-Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64.
+Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64. CC_PSNR is PSNR after a fit of colors.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from warp_splat.formats.png import check_image, load_png
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 1e-4, 9e-4
+ROUNDS = 5  # of the fit of colors; rounds and threshold as in multinerf's color_correct (Mildenhall et al. 2022)
+SATURATED = 0.5 / 255  # values nearer to 0 or 1 say little of the light
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -35,8 +37,7 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     """
     image, reference = unit_images(image, reference)
     squares = (image - reference) ** 2
-    error = np.mean(squares if mask is None else squares[mask > 0])
-    return float(-10 * np.log10(error)) if error > 0 else math.inf
+    return _decibels(squares if mask is None else squares[mask > 0])
 
 
 def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -59,8 +60,48 @@ def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     return float(np.mean(similarity if mask is None else similarity[mask > 0]))
 
 
+def cc_psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """:func:`psnr` after the affine map of the image's colors that suits the reference best, cut to 0..1, not rounded.
+
+    Each channel becomes a weighted sum of all three and 1, by least squares over its values that are saturated neither
+    in the image, nor in the reference, nor in what the round before made of it. Without any, it stays as it is.
+
+    Args:
+        image: [H, W, 3] uint8.
+        reference: [H, W, 3] uint8.
+        mask: as for :func:`psnr`; what is 0 takes no part in the fit either.
+
+    Raises:
+        InputError: if the shapes differ or the type is not uint8.
+    """
+    pair = unit_images(image, reference)
+    colors, wanted = (values.reshape(-1, 3) if mask is None else values[mask > 0] for values in pair)
+    terms = np.column_stack([colors, np.ones(len(colors))])
+    difference, usable = wanted - colors, _unsaturated(colors) & _unsaturated(wanted)
+    corrected = colors
+    for _ in range(ROUNDS):
+        used = (usable & _unsaturated(corrected)).T
+        changes = [_least_squares(terms[rows], column[rows]) for rows, column in zip(used, difference.T, strict=True)]
+        corrected = np.clip(colors + terms @ np.column_stack(changes), 0.0, 1.0)
+    return _decibels((corrected - wanted) ** 2)
+
+
+def _decibels(squares: np.ndarray) -> float:
+    error = np.mean(squares)
+    return float(-10 * np.log10(error)) if error > 0 else math.inf
+
+
+def _unsaturated(values: np.ndarray) -> np.ndarray:
+    return (values >= SATURATED) & (values <= 1.0 - SATURATED)
+
+
+def _least_squares(terms: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The smallest weights of ``terms`` [M, 4]: gray images leave some of them open."""
+    return np.linalg.lstsq(terms.T @ terms, terms.T @ wanted, rcond=1e-12)[0]
+
+
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]  # of an image, its reference, a mask as for psnr
-METRICS: dict[str, Metric] = {"SSIM": ssim, "PSNR": psnr}  # those that need nothing but this file
+METRICS: dict[str, Metric] = {"SSIM": ssim, "PSNR": psnr, "CC_PSNR": cc_psnr}  # those that need nothing but this file
 
 
 def evaluate_folder(
@@ -73,8 +114,8 @@ def evaluate_folder(
         metrics: what to measure, by name.
 
     Returns:
-        The mean over the images of each metric, ``{"SSIM": ..., "PSNR": ...}``, and the values for each image,
-        ``{"SSIM": {"00000.png": ...}, "PSNR": {...}}``. PSNR is infinite if the images are equal.
+        The mean over the images of each metric, ``{"SSIM": ..., "PSNR": ..., ...}``, and the values for each image,
+        ``{"SSIM": {"00000.png": ...}, "PSNR": {...}, ...}``. PSNR is infinite if the images are equal.
 
     Raises:
         InputError: if there are no renders, an image has no partner, or their sizes differ.

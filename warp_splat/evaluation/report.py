@@ -72,7 +72,8 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
                 _write(figure, left + place * cell, top + 0.04, head, weight="bold")
         top -= text + height
         for left, (name, photo, render, said) in zip(lefts, line, strict=False):
-            captions = (_shorten(name, cell), said if cell > 2 else said.partition(",")[0], "")
+            told = [said] if cell > 2 else said.split(", ")[: 1 + (cell > 1)]  # as many as there is room for
+            captions = (_shorten(name, cell), *told, *[""] * (2 - len(told)))
             pictures = (photo, render, _difference(photo, render))
             for place, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
                 _place_picture(figure, (left + place * cell, top, cell - gap, height), picture, caption)

@@ -16,6 +16,7 @@ from warp_splat.formats.png import save_png
 from warp_splat.scene.types import View
 from warp_splat.text import format_table
 
+DECIBELS = ("PSNR", "CC_PSNR")
 TOLD = 10  # views, at most, in the table that is printed
 
 
@@ -106,9 +107,9 @@ def show_views(
 
 
 def metrics_line(values: Mapping[str, float]) -> str:
-    """PSNR 27.68 dB, SSIM 0.8514, ..."""
-    order = sorted(values, key=lambda name: name != "PSNR")
-    return ", ".join(f"{name} {_rounded(name, values[name])}{' dB' * (name == 'PSNR')}" for name in order)
+    """PSNR 27.68 dB, CC_PSNR 28.10 dB, SSIM 0.8514, ..."""
+    order = sorted(values, key=lambda name: name not in DECIBELS)
+    return ", ".join(f"{name} {_rounded(name, values[name])}{' dB' * (name in DECIBELS)}" for name in order)
 
 
 def _table(views: list[Comparison]) -> str:
@@ -118,4 +119,4 @@ def _table(views: list[Comparison]) -> str:
 
 
 def _rounded(metric: str, value: float) -> str:
-    return f"{value:.2f}" if metric == "PSNR" else f"{value:.4f}"
+    return f"{value:.2f}" if metric in DECIBELS else f"{value:.4f}"
