@@ -24,7 +24,7 @@ from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_bl
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.falloff import reach_of
-from warp_splat.kernels.project import affine, ellipsoid
+from warp_splat.kernels.project import adj_camera, affine, ellipsoid
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.splat import BlendVariant
@@ -42,6 +42,8 @@ def modules() -> dict[str, wp.Module]:
     found = {
         "project": make_project(affine.PROJECTION, reach_of, 1).module,
         "project, ellipsoid": make_project(ellipsoid.PROJECTION, reach_of, 1).module,
+        "adjoint of pose": adj_camera.make_adj_pose(1).module,
+        "adjoint of intrinsics": adj_camera.make_adj_intrinsics(1).module,
         "shade": sh_colors.make_shade(1).module,
         "adjoint of shade": sh_colors.make_adj_shade(1).module,
         "quarantine": quarantine.module,

@@ -10,6 +10,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "camera",
+    "CameraParameters": "raster.camera_parameters",
     "Falloff": "kernels.falloff",
     "InputError": "errors",
     "RasterOptions": "config",
@@ -23,6 +24,7 @@ _HOMES = {
 }
 __all__ = [
     "Camera",
+    "CameraParameters",
     "Falloff",
     "InputError",
     "RasterOptions",
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from warp_splat.errors import InputError
     from warp_splat.kernels.falloff import Falloff
     from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
+    from warp_splat.raster.camera_parameters import CameraParameters
     from warp_splat.raster.gradcheck import check_gradients
     from warp_splat.runtime.launch import get_threads, set_threads
     from warp_splat.scene import load_scene

@@ -97,14 +97,18 @@ def sh_basis(directions, degree):
 
 
 def jacobians(points, camera):
-    """d(pixel) / d(camera point) at ``points`` [N, 3], [N, 2, 3]; x/z and y/z limited to a frame around the image."""
+    """d(pixel) / d(camera point) at ``points`` [N, 3], [N, 2, 3]; x/z and y/z limited to a frame around the image.
+
+    The frame stands still: no gradient of the camera flows through it.
+    """
     z = points[:, 2]
     entries = []
     for axis, (focal, center, size) in enumerate(
         ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     ):
-        margin = SIDE * size / (2 * focal)
-        slope = (points[:, axis] / z).clamp(-center / focal - margin, (size - center) / focal + margin)
+        held = _double(focal).item()
+        margin, middle = SIDE * size / (2 * held), _double(center).item() / held
+        slope = (points[:, axis] / z).clamp(-middle - margin, size / held - middle + margin)
         row = [torch.zeros_like(z), torch.zeros_like(z), -focal * slope / z]
         row[axis] = focal / z
         entries.append(torch.stack(row, 1))
@@ -118,7 +122,8 @@ def outlines(points, sigma, live, camera):
     Zisserman 2004, 8.3), and that of an ellipse with center c and covariance S is
     a multiple of [S - c c^T, -c; -c^T, -1].
     """
-    calibration = points.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    rows = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    calibration = torch.stack([torch.stack([_double(entry) for entry in row]) for row in rows])
     dual = OUTLINE**2 * sigma - points[:, :, None] * points[:, None, :]
     dual = torch.where(live[:, None, None], dual, -torch.eye(3, dtype=dual.dtype))
     dual = calibration @ dual @ calibration.T
@@ -127,10 +132,14 @@ def outlines(points, sigma, live, camera):
     return center.clone(), (dual[:, :2, :2] + center[:, :, None] * center[:, None, :]) / OUTLINE**2
 
 
+def _double(value):
+    """As a float64 tensor; what is one keeps its gradient."""
+    return value.double() if isinstance(value, torch.Tensor) else torch.tensor(value, dtype=torch.float64)
+
+
 def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
-    """Gaussians as the camera sees them."""
-    world_to_camera = torch.as_tensor(camera.rotation.copy(), dtype=torch.float64)
-    translation = torch.as_tensor(camera.translation.copy(), dtype=torch.float64)
+    """Gaussians as the camera sees them. Its numbers may be tensors that want gradients."""
+    world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
     points = means @ world_to_camera.T + translation
     live = (points[:, 2] > NEAR) & (quats.norm(dim=1) > 0)
     points = torch.where(live[:, None], points, points.new_tensor([0.0, 0, 1]))  # no division by zero, no gradient
@@ -150,7 +159,7 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
         ratio = torch.linalg.det(sharp) / torch.linalg.det(cov2d)
         opacity = opacities * ratio.clamp_min(2.5e-5).sqrt()  # the floor is the reference's
 
-    center = torch.as_tensor(camera.center, dtype=torch.float64)
+    center = -world_to_camera.T @ translation
     degree = int(sh.shape[1] ** 0.5) - 1
     degree = degree if sh_degree is None else min(degree, sh_degree)
     basis = sh_basis(torch.nn.functional.normalize(means - center, dim=1), degree)

@@ -15,6 +15,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.blend import blend
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
 from warp_splat.raster.data import Dropped, Gaussians
 from warp_splat.raster.drivers import driver_of
@@ -51,7 +52,7 @@ def rasterize(
     scales: torch.Tensor,
     opacities: torch.Tensor,
     sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
-    camera: Camera,
+    camera: Camera | CameraParameters,
     background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
     adjoint: str = "manual",
     options: RasterOptions | None = None,
@@ -65,7 +66,7 @@ def rasterize(
         opacities: [N], in 0..1.
         sh: spherical-harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16; or the pair ([N, 1, 3], [N, K-1, 3])
             as trainers keep them, which saves a copy. Color = max(0, 0.5 + sum of coefficients times basis).
-        camera: pinhole camera, world to camera in COLMAP's axes.
+        camera: pinhole camera, world to camera in COLMAP's axes; :class:`CameraParameters`, if it wants gradients.
         background: RGB behind everything; a tensor [3] receives a gradient.
         adjoint: how the pixel loop is differentiated; one image, one gradient up to rounding. "manual": by hand.
             "stepwise": reverse loop by hand, its body by Warp. "reversible": the whole loop by Warp, transmittance
@@ -91,7 +92,7 @@ def rasterize_views(
     scales: torch.Tensor,
     opacities: torch.Tensor,
     sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
-    cameras: Sequence[Camera],
+    cameras: Sequence[Camera | CameraParameters],
     background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
     adjoint: str = "manual",
     options: RasterOptions | None = None,
@@ -118,7 +119,7 @@ def rasterize_views(
     Raises:
         InputError: as :func:`rasterize` does.
     """
-    if isinstance(cameras, Camera) or not isinstance(cameras, Sequence):
+    if isinstance(cameras, (Camera, CameraParameters)) or not isinstance(cameras, Sequence):
         raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
     return _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options)
 
@@ -140,7 +141,7 @@ def _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, 
 
 def render(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | CameraParameters,
     background: torch.Tensor,
     options: RasterOptions,
     adjoint: str = "manual",
@@ -149,6 +150,7 @@ def render(
     driver, dropped = driver_of(gaussians.means.device), Dropped()
     with stage("project"):
         splats = project(gaussians, camera, options, driver, dropped)
+    camera = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
     with stage("bin"):
         bins = driver.bin(splats, camera, options)
     with stage("blend"):

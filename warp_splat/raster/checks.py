@@ -13,14 +13,16 @@ from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, Raste
 from warp_splat.errors import InputError
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.project import Projection
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import DRIVERS
 
 CAMERA_PIXELS_MOST = 2**32  # 80 GiB of image, alpha and what the adjoint reads; kernels number tiles with 32 bits
 
 
-def check_camera(camera: Camera) -> None:
+def check_camera(camera: Camera | CameraParameters) -> None:
     """Raise InputError if ``camera`` is something else, or its image absurdly large."""
+    camera = camera.base if isinstance(camera, CameraParameters) else camera
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
     if camera.width * camera.height > CAMERA_PIXELS_MOST:

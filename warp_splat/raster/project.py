@@ -20,6 +20,7 @@ from warp_splat.kernels.project.shared import UNSEEN, make_project
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES
 from warp_splat.kernels.structs import HarmonicsView
+from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import (
@@ -34,17 +35,22 @@ from warp_splat.runtime.launch import (
 )
 
 
-def camera_view(camera: Camera, rest: int, options: RasterOptions) -> CameraView:
-    """The camera as kernels read it; ``rest`` is the number of coefficients beyond the first."""
+def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camera | None = None) -> CameraView:
+    """The camera as kernels read it; ``rest`` is the number of coefficients beyond the first.
+
+    ``limits``: the camera whose field of view limits the slopes, if it is another.
+    """
     degree = {0: 0, 3: 1, 8: 2, 15: 3}[rest]
     focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height])
-    margin = FRUSTUM_MARGIN * 0.5 * size / focal
     cam = CameraView()
     cam.rotation = wp.mat33(*camera.rotation.ravel())
     center = camera.center.astype(np.float32)
     cam.center, cam.center_low = wp.vec3(*center), wp.vec3(*(camera.center - center))
     cam.focal, cam.principal, cam.size = wp.vec2(*focal), wp.vec2(*principal), wp.vec2(*size)
+    limits = limits or camera
+    focal, principal = np.array([limits.fx, limits.fy]), np.array([limits.cx, limits.cy])
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
     cam.slope_min = wp.vec2(*(-principal / focal - margin))
     cam.slope_max = wp.vec2(*((size - principal) / focal + margin))
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
@@ -62,16 +68,19 @@ def projection_of(options: RasterOptions) -> Projection:
 
 def project(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | CameraParameters,
     options: RasterOptions,
     driver: Driver | None = None,
     dropped: Dropped | None = None,
 ) -> Splats2D:
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
-    cam = camera_view(camera, gaussians.sh_rest.shape[1], options)
+    learned, limits = (None, None), camera
+    if isinstance(camera, CameraParameters):
+        learned, limits, camera = (camera.twist, camera.intrinsics), camera.base, camera.camera
+    cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     driver = driver or driver_of(gaussians.means.device)
     kernel = make_project(projection_of(options), falloff_of(options).reach_of, driver.lanes)
-    return Splats2D(*Project.apply(*gaussians, cam, kernel, driver, dropped or Dropped()))
+    return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, driver, dropped or Dropped()))
 
 
 def _project_geometry(
@@ -151,7 +160,9 @@ class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
     @staticmethod
-    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, cam, kernel, driver, dropped):
+    def forward(
+        ctx, means, quats, scales, opacities, sh_dc, sh_rest, twist, intrinsics, camera, cam, kernel, driver, dropped
+    ):
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
         count, new, lanes = means.shape[0], means.new_zeros, driver.lanes
         splats = Splats2D(
@@ -161,8 +172,8 @@ class Project(torch.autograd.Function):
         _project_geometry(cam, kernel, lanes, _shapes(gaussians), _geometry(splats))
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
-        ctx.save_for_backward(*gaussians, *splats)
-        ctx.cam, ctx.kernel, ctx.driver, ctx.dropped = cam, kernel, driver, dropped
+        ctx.save_for_backward(*gaussians, *splats, twist, intrinsics)
+        ctx.camera, ctx.cam, ctx.kernel, ctx.driver, ctx.dropped = camera, cam, kernel, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
         return tuple(splats)
 
@@ -171,20 +182,32 @@ class Project(torch.autograd.Function):
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
             given = Gaussians(*ctx.saved_tensors[: len(Gaussians._fields)])
-            splats = Splats2D(*ctx.saved_tensors[len(given) :])
+            splats = Splats2D(*ctx.saved_tensors[len(given) : -2])
+            twist, intrinsics = ctx.saved_tensors[-2:]
+            wants_twist, wants_intrinsics = ctx.needs_input_grad[len(given) : len(given) + 2]
             adj_splats = Splats2D(*(adj.contiguous() for adj in adj_outputs[:5]), splats.extents, splats.radii)
             lanes, count, device = ctx.driver.lanes, len(given.means), given.means.device
             seen, rest = view(splats.radii, wp.int32), given.sh_rest
-            adj_placed, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
+            adj_means, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
             tensors = (given.means, splats.colors, adj_splats.colors)
             means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
             inputs = [ctx.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
-            outputs = [view(adj_placed, wp.vec3), _harmonics(adj_dc, adj_rest)]
+            outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
             shapes = (torch.zeros_like(tensor) for tensor in (given.quats, given.scales, given.opacities))
-            adj = Gaussians(adj_placed, *shapes, adj_dc, adj_rest)
+            adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
+            adj_placed = torch.zeros_like(adj_means) if wants_twist else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
-            _project_geometry(ctx.cam, ctx.kernel, lanes, _shapes(given), outputs, _shapes(adj), adj_outputs)
+            adj_inputs = _shapes(adj._replace(means=adj_placed))
+            _project_geometry(ctx.cam, ctx.kernel, lanes, _shapes(given), outputs, adj_inputs, adj_outputs)
+            adj_twist = adj_intrinsics = None
+            if wants_twist:
+                adj_means += adj_placed
+                adj_twist = twist_gradient(ctx.camera, ctx.cam, lanes, twist, given, adj, adj_placed)
+            if wants_intrinsics:
+                adj_intrinsics = intrinsics_gradient(
+                    ctx.camera, ctx.cam, lanes, intrinsics, given.opacities, splats, adj_splats
+                )
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)
@@ -193,7 +216,7 @@ class Project(torch.autograd.Function):
                 launch(quarantine, count, [seen], found, device=device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
-        return *(tensor if wants else None for tensor, wants in wanted), *[None] * 4
+        return *(tensor if wants else None for tensor, wants in wanted), adj_twist, adj_intrinsics, *[None] * 5
 
 
 def _geometry(splats: Splats2D) -> list[torch.Tensor]:

@@ -1,0 +1,164 @@
+"""A camera that is learned: its parameters as torch tensors, and their gradients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+import warp as wp
+
+from warp_splat.camera import Camera
+from warp_splat.errors import InputError
+from warp_splat.kernels.project.adj_camera import make_adj_intrinsics, make_adj_pose
+from warp_splat.kernels.project.camera_view import CameraView
+from warp_splat.kernels.simd import Types
+from warp_splat.raster.data import Gaussians, Splats2D
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes, view
+
+TERMS = 16  # of the power series, for turns of up to half a circle
+
+
+class CameraParameters:
+    """A camera whose pose and intrinsics are tensors, for :func:`warp_splat.rasterize` in place of a camera.
+
+    Their gradients are those of the image that is drawn. Sums have one order, whatever the threads and the processor.
+    Where the Jacobian of the affine projection is clamped stays as ``base`` has it: it does not move with the
+    intrinsics.
+
+    Args:
+        base: the camera to start from.
+        twist: where the camera stands relative to ``base``, [6]: a rotation vector w [rad] and a translation v [world
+            units], both in the camera's axes and applied on the left of camera_from_world: ``x_camera = exp(w)
+            (rotation @ x_world + translation) + v``. None: a leaf of zeros, float64.
+        intrinsics: fx, fy, cx, cy [px], [4]. None: a leaf of those of ``base``, float64.
+
+    Raises:
+        InputError: if ``base`` is no camera, or a tensor has not its shape or holds no real numbers.
+    """
+
+    def __init__(self, base: Camera, twist: torch.Tensor | None = None, intrinsics: torch.Tensor | None = None):
+        if not isinstance(base, Camera):
+            raise InputError(f"base: expected a warp_splat.Camera, got {type(base).__name__}.")
+        self.base = base
+        self.twist = _checked("twist", twist, [0.0] * 6)
+        self.intrinsics = _checked("intrinsics", intrinsics, [base.fx, base.fy, base.cx, base.cy])
+
+    @property
+    def camera(self) -> Camera:
+        """The camera as it stands now.
+
+        Raises:
+            InputError: if the numbers make none.
+        """
+        twist = _numbers(self.twist)
+        pose = _turned(np.concatenate([self.base.rotation, self.base.translation[:, None]], 1), twist[:3, None], 1)
+        fx, fy, cx, cy = _numbers(self.intrinsics)
+        return replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, rotation=pose[:, :3], translation=pose[:, 3] + twist[3:])
+
+
+def _checked(name: str, tensor: torch.Tensor | None, start: list[float]) -> torch.Tensor:
+    """``tensor``, or a leaf of ``start``. Raises InputError if it is no such tensor."""
+    if tensor is None:
+        return torch.tensor(start, dtype=torch.float64, requires_grad=True)
+    if not isinstance(tensor, torch.Tensor) or tensor.shape != (len(start),) or not tensor.is_floating_point():
+        got = f"{tensor.dtype} {list(tensor.shape)}" if isinstance(tensor, torch.Tensor) else type(tensor).__name__
+        raise InputError(f"{name}: expected a tensor of {len(start)} real numbers, got {got}.")
+    return tensor
+
+
+def twist_gradient(
+    camera: Camera,
+    cam: CameraView,
+    lanes: int,
+    twist: torch.Tensor,
+    gaussians: Gaussians,
+    adj: Gaussians,
+    adj_placed: torch.Tensor,
+) -> torch.Tensor:
+    """Of the twist, like it; ``adj_placed`` is the part of ``adj.means`` that did not come through colors."""
+
+    def arguments(types: Types, rows: slice) -> list:
+        means = lanes_of(types.row3, gaussians.means[rows], adj.means[rows], adj_placed[rows])
+        quats = lanes_of(types.row4, gaussians.quats[rows], adj.quats[rows])
+        return [cam, means[0], quats[0], means[1], means[2], quats[1]]
+
+    sums = _sums(make_adj_pose, lanes, gaussians.means, 6, arguments)
+    turn, shift = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
+    turn, shift = (part[0] + part[1] + part[2] for part in (turn, shift))
+    now = _numbers(twist)
+    turn = _turned(turn - _cross(now[3:], shift), -now[:3], 2)  # by the left Jacobian of the rotation, transposed
+    return torch.tensor(np.concatenate([turn, shift])).to(twist)
+
+
+def intrinsics_gradient(
+    camera: Camera,
+    cam: CameraView,
+    lanes: int,
+    intrinsics: torch.Tensor,
+    opacities: torch.Tensor,
+    splats: Splats2D,
+    adj: Splats2D,
+) -> torch.Tensor:
+    """Of the intrinsics, like them."""
+
+    def arguments(types: Types, rows: slice) -> list:
+        found = [cam, *lanes_of(types.number, opacities[rows])]
+        for part in (splats, adj):
+            found += lanes_of(types.row2, part.means2d[rows]) + lanes_of(types.row3, part.conics[rows])
+            found += lanes_of(types.number, part.opacities[rows])
+        return found
+
+    sums = _sums(make_adj_intrinsics, lanes, opacities, 4, arguments)
+    return torch.tensor(sums / [camera.fx, camera.fy, 1.0, 1.0]).to(intrinsics)
+
+
+def _sums(
+    make: Callable[[int], wp.Kernel],
+    lanes: int,
+    like: torch.Tensor,
+    columns: int,
+    arguments: Callable[[Types, slice], list],
+) -> np.ndarray:
+    """The columns of what a kernel writes, summed in pairs in float64: one order, and exact additions, everywhere."""
+    count = len(like)
+    sums = like.new_empty(count // lanes + count % lanes, columns)
+
+    def with_output(types: Types, rows: slice) -> tuple[list, list]:
+        return arguments(types, rows), [view(sums[rows.start // lanes :], wp.float32)]
+
+    launch_in_lanes(make, lanes, count, with_output, like.device)
+    sums = torch.cat([sums.double(), sums.new_zeros(1, columns)])
+    while len(sums) > 1:
+        sums = torch.cat([sums, sums.new_zeros(len(sums) % 2, columns)])
+        sums = sums[::2] + sums[1::2]
+    return sums[0].cpu().numpy()
+
+
+def _turned(vectors: np.ndarray, axis: np.ndarray, order: int) -> np.ndarray:
+    """Vectors [3] or columns [3, M] turned by a rotation vector (``order`` 1), or the mean while it turns them (2)."""
+    across = _cross(axis, vectors)
+    x, y, z = axis.ravel().tolist()
+    square = x * x + y * y + z * z
+    return vectors + _series(square, order) * across + _series(square, order + 1) * _cross(axis, across)
+
+
+def _series(square: float, order: int) -> float:
+    """Sum of (-square)^k / (2 k + order)!: of angle^2, sin(angle) / angle for 1, (1 - cos(angle)) / angle^2 for 2.
+
+    Smooth at 0, and the same on every processor, unlike the library's sine.
+    """
+    value = 0.0
+    for k in reversed(range(TERMS)):
+        value = 1.0 / math.factorial(2 * k + order) - square * value
+    return value
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.roll(a, -1, 0) * np.roll(b, -2, 0) - np.roll(a, -2, 0) * np.roll(b, -1, 0)
+
+
+def _numbers(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().to("cpu", torch.float64).numpy()
