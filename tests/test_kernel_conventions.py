@@ -54,7 +54,7 @@ def test_kernels_are_found():
     assert len(list(find_kernels())) > 15
 
 
-@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
 def test_what_is_written_is_named_so(lines, kernel):
     """And what is named so is used: written here, or given to a function that writes it."""
     changed = {name for name in written(kernel) if name in parameters(kernel)}
@@ -63,7 +63,7 @@ def test_what_is_written_is_named_so(lines, kernel):
     assert {name for name in parameters(kernel) if name.endswith("_out")} <= used
 
 
-@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
 def test_order_of_parameters(lines, kernel):
     """``first`` (of a slice; blocks have none), inputs, a line ``# out``, outputs."""
     names = parameters(kernel)
@@ -75,7 +75,7 @@ def test_order_of_parameters(lines, kernel):
         assert lines[outputs[0].lineno - 2].strip().startswith("# out")
 
 
-@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
 def test_arrays_say_their_shape(lines, kernel):
     for parameter in kernel.args.args:
         if "wp.array" in ast.unparse(parameter.annotation):
@@ -92,7 +92,7 @@ def test_arrays_of_structs_say_their_shape():
                         assert comment(lines, field).strip().startswith("["), f"{struct.name}: {ast.unparse(field)}"
 
 
-@pytest.mark.parametrize(("lines", "kernel"), find_kernels())
+@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
 def test_size(lines, kernel):
     assert len(kernel.args.args) <= MOST_PARAMETERS, "put what belongs together into a struct (kernels/structs.py)"
     assert kernel.end_lineno - kernel.lineno < MOST_LINES
