@@ -78,7 +78,7 @@ def trained(steps: int) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
         if command(["train", "-m", folder, "-r", str(SMALL), "--quiet", *flags]):
             raise RuntimeError("the training ended with an error")
-        model = load_ply(Path(folder) / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply")
+        model = load_ply(Path(folder) / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply").splats
     return found | {f"trained {name}": getattr(model, name) for name in NAMES}
 
 
