@@ -122,15 +122,18 @@ def test_orbit(trained, tmp_path, capsys):
 
 def test_one_seed_one_result_for_any_number_of_threads(trained, tmp_path):
     """Byte-identical PLY files: a second run, in a fresh process, with another number of threads."""
-    threads = str(1 + CORES % 2)
-    command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *SHORT, "--threads", threads]
+    digest = json.loads((trained / "results.json").read_text())["ours_60"]["sha256"]
+    options = ("--threads", str(1 + CORES % 2), "--verify", digest[:16])
+    command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *SHORT, *options]
     subprocess.run(command, check=True, capture_output=True)
     assert ply_path(tmp_path, 60).read_bytes() == ply_path(trained, 60).read_bytes()
 
 
 @pytest.mark.slow
-def test_another_seed_is_another_result(trained, tmp_path):
-    assert train(tmp_path, "--seed", "1") == 0
+def test_another_seed_is_another_result(trained, tmp_path, capsys):
+    digest = json.loads((trained / "results.json").read_text())["ours_60"]["sha256"]
+    assert train(tmp_path, "--seed", "1", "--verify", digest) == 1
+    assert f"begins with {digest}, got " in capsys.readouterr().err
     assert ply_path(tmp_path, 60).read_bytes() != ply_path(trained, 60).read_bytes()
 
 
@@ -195,6 +198,7 @@ def test_help_answers_without_torch_or_warp():
         (("--lambda_dssim", "2"), ("--lambda_dssim", "0 to 1")),
         (("--feature_lr", "nan"), ("--feature_lr", "nan")),
         (("--threads", "-1"), ("--threads", "-1")),
+        (("--verify", "abc"), ("--verify", "sha256", "abc")),
         (("-s", "/no/such/scene"), ("/no/such/scene",)),
     ],
     ids=" ".join,
