@@ -1,9 +1,9 @@
 """Numbers side by side: the one vocabulary in which kernels for one number and for sixteen are written.
 
-Every operation has an overload for ``float`` and one for ``vec16``, under one name. A CPU runs ``vec16``: Warp's CPU
-backend is scalar C++, and LLVM turns sixteen lanes into one AVX-512 register (two of AVX2, four of NEON) if the code
-has no branch per lane and no libm call. A GPU's thread runs ``float``. What else there is, ``+``, ``-``, ``wp.min`` and
-``wp.max``, takes either.
+Every operation has an overload for ``float`` and one for ``vec16``, under one name. A CPU runs ``vec16``, whose
+operations are those of the compiler's vectors: one AVX-512 register, two of AVX2, four of NEON. A GPU's thread runs
+``float``. ``+``, ``-``, ``wp.min`` and ``wp.max`` are Warp's and take either. There LLVM has to find the vectors among
+scalars, which it does if the code has no branch per lane and no libm call.
 
 Kernels that Warp differentiates need operations that know their derivative. The generated one is slow in lanes:
 
@@ -119,7 +119,7 @@ def fma(a: float, b: float, c: float) -> float:
 
 
 @wp.func_native(
-    *_vectors("fused(a, b, c)", "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b);adj_c += adj_ret;")
+    *_vectors("fused(a, b, c)", "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b); adj_c += adj_ret;")
 )
 def fma(a: vec16, b: vec16, c: vec16) -> vec16: ...
 
