@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from warp_splat import Camera, RasterOptions, rasterize
+from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
 from warp_splat.cli import main as command
 from warp_splat.config import ADJOINTS
 from warp_splat.formats.ply import load_ply
@@ -57,14 +57,15 @@ def rendered(adjoints: list[str]) -> dict[str, np.ndarray]:
     found |= {f"projected {name}": tensor for name, tensor in zip(splats._fields, splats, strict=True)}
     found |= {"lists": bins.instances, "list ranges": bins.ranges}
     for adjoint in adjoints:
-        inputs = gaussians()
-        out = rasterize(*inputs, CAMERA, adjoint=adjoint)
+        inputs, learned = gaussians(), CameraParameters(CAMERA)
+        out = rasterize(*inputs, learned, adjoint=adjoint)
         out.means2d.retain_grad()
         loss = image_loss(out.image, target)
         loss.backward()
         found |= {"image": out.image, "loss": loss} if adjoint == adjoints[0] else {}
         found |= {f"{adjoint} d{name}": tensor.grad for name, tensor in zip(NAMES, inputs, strict=True)}
         found[f"{adjoint} dmeans2d"] = out.means2d.grad
+        found |= {f"{adjoint} d{name}": getattr(learned, name).grad for name in ("twist", "intrinsics")}
     return {name: tensor.detach().numpy() for name, tensor in found.items()}
 
 

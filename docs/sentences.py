@@ -195,6 +195,18 @@ def sentences() -> dict[str, list[tuple]]:
             ),
             ("two processes see {} times the images per second", f.two(f.images_gained())),
         ],
+        "cameras.md": [
+            (
+                "All {} get there, after {} steps at most, and end within {} degrees, {} mm and {} %.",
+                *(len(f.data("cameras")["reached"]), max(f.data("cameras")["reached"])),
+                *(f.small(unit * max(f.data("cameras")["last"][of])) for of, unit in f.CAMERA_ERRORS.items()),
+            ),
+            (
+                "takes {} % longer with a camera that learns (one thread, {}).",
+                f.one(100 * f.data("cameras")["added"] / f.data("cameras")["step"]),
+                f.data("cameras")["machine"],
+            ),
+        ],
         "cuda.md": [
             ("the blend has {} registers and", f.registers("blend")[0]),
             ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),

@@ -1,6 +1,8 @@
 """Gradients of a camera's pose and intrinsics against the float64 oracle, and what they leave as it is."""
 
 import functools
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,11 +11,17 @@ import scenes
 import torch
 from scenes import SCENES
 
-from warp_splat import CameraParameters, InputError, RasterOptions, rasterize, rasterize_views
+from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
 from warp_splat.compare import oracle, truth
 from warp_splat.config import ADJOINTS
+from warp_splat.raster import project
+from warp_splat.raster.differences import INPUTS
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.runtime import launch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import cameras
 
 ERROR = 1e-5  # relative L2, of each of the four
 PLAIN = RasterOptions()
@@ -78,7 +86,7 @@ def errors(name, options=PLAIN, adjoint="manual", start=HERE):
     return {key: float((gradients[key] - expected[key]).norm() / expected[key].norm().clamp_min(1e-6)) for key in NAMES}
 
 
-@pytest.mark.parametrize("name", [name for name in SCENES if name != "layers_4000"])
+@pytest.mark.parametrize("name", SCENES)
 def test_scene(name):
     found = errors(name)
     assert max(found.values()) < ERROR, found
@@ -233,3 +241,47 @@ def test_numbers_that_make_no_camera():
         rasterize(*scene.parameters(), CameraParameters(scene.camera, None, torch.tensor([-1.0, 1, 1, 1])))
     with pytest.raises(InputError, match="Camera rotation: expected finite numbers"):
         rasterize(*scene.parameters(), CameraParameters(scene.camera, torch.full((6,), torch.nan)))
+
+
+CHECKED = [
+    ("degree2", RasterOptions(depth=True)),
+    ("inside", RasterOptions(alpha_min=0.0)),
+    ("off_center", RasterOptions(projection="ellipsoid", antialiasing=True)),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), CHECKED, ids=str)
+def test_check_gradients_agrees(name, options):
+    scene = SCENES[name]()
+    report = check_gradients(*scene.parameters(), camera_at(scene, OTHER), options=options, parameters=NAMES)
+    assert [row.verdict for row in report.rows] == ["agrees"] * 4, str(report)
+
+
+def test_check_gradients_looks_at_the_camera():
+    scene = SCENES["single"]()
+    report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), directions=1)
+    assert report.ok and {row.name for row in report.rows} == {*INPUTS, *NAMES}
+    assert check_gradients(*SCENES["empty"]().parameters(), CameraParameters(scene.camera), directions=1).ok
+    with pytest.raises(InputError, match="parameters: expected a list of some of means"):
+        check_gradients(*scene.parameters(), scene.camera, parameters=["focal"])
+
+
+@pytest.mark.parametrize(("index", "entry", "name"), [(6, 0, "rotation"), (6, 5, "translation"), (7, 1, "focal")])
+def test_check_gradients_names_what_is_off(index, entry, name, monkeypatch):
+    backward = project.Project.backward
+
+    def spoiled(ctx, *upstream):
+        gradients = backward(ctx, *upstream)
+        gradients[index][entry] *= 1.02
+        return gradients
+
+    monkeypatch.setattr(project.Project, "backward", staticmethod(spoiled))
+    scene = SCENES["degree1"]()
+    report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), parameters=NAMES)
+    assert report.named("off") == [name] and report.worst is None, str(report)
+
+
+def test_a_camera_finds_its_way_back():
+    """From 5 degrees, 10 cm and 5 % of its focal lengths, in a picture that the renderer drew."""
+    angle, place, focal = cameras.recover(seed=1, steps=220)[-1]
+    assert angle < 0.05 and place < 1e-3 and focal < 1e-3, (angle, place, focal)

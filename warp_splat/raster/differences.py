@@ -32,12 +32,14 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.blend import blend
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 
 SHAPES = ("means", "quats", "scales", "opacities")
 INPUTS = (*SHAPES, "sh", "background")
+CAMERA = ("rotation", "translation", "focal", "principal")  # halves of the twist and of the intrinsics
 INTERMEDIATES = ("means2d", "conics", "opacities2d", "colors", "depths")
 LEAST = 2.0**-14  # the smallest step, relative to a parameter's natural size
 RUNGS = range(1, 10)  # steps h tried: LEAST times 2^rung
@@ -83,14 +85,17 @@ class MovableScene:
         self,
         gaussians: Gaussians,
         background: torch.Tensor,
-        camera: Camera,
+        camera: Camera | CameraParameters,
         options: RasterOptions,
         adjoint: str,
         seed: int,
     ):
-        self.camera, self.options, self.adjoint = camera, options, adjoint
+        self.options, self.adjoint = options, adjoint
         sh = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)
         values = {name: getattr(gaussians, name) for name in SHAPES} | {"sh": sh, "background": background}
+        self.camera = camera.base if isinstance(camera, CameraParameters) else camera
+        if isinstance(camera, CameraParameters):
+            values |= dict(zip(CAMERA, (*camera.twist.split(3), *camera.intrinsics.split(2)), strict=True))
         self.inputs = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         with torch.enable_grad():
             self.out = self._render(self.inputs)
@@ -99,14 +104,14 @@ class MovableScene:
             self.depth_weight = (self.out.alpha / deepest).detach()
             self.picture = self._stack(self.out.image, self.out.alpha, self.out.depth)
         with torch.no_grad():
-            self.splats = project(_gaussians(self.inputs), camera, options)
+            self.splats = project(_gaussians(self.inputs), self._camera(self.inputs), options)
         self.generator = torch.Generator().manual_seed(seed)
         random = torch.randn(self.picture.shape, generator=self.generator, dtype=torch.float32, device="cpu")
         self.weights = random.to(self.picture.device)
 
     def tensor(self, name: str) -> torch.Tensor:
         """The parameter in the graph of ``picture``."""
-        return self.inputs[name] if name in INPUTS else getattr(self.out, name)
+        return self.inputs[name] if name in self.inputs else getattr(self.out, name)
 
     def gradient(self, name: str, kept: torch.Tensor) -> torch.Tensor:
         """Of the loss over the pixels ``kept`` [H, W], float64, shaped like the parameter."""
@@ -121,7 +126,7 @@ class MovableScene:
     def draw(self, name: str, step: torch.Tensor) -> torch.Tensor:
         """The picture, [H, W, C] float64, with ``step`` added to a parameter."""
         moved = self.tensor(name) + step
-        if name in INPUTS:
+        if name in self.inputs:
             out = self._render(self.inputs | {name: moved})
             return self._stack(out.image, out.alpha, out.depth).double()
         key = "opacities" if name == "opacities2d" else name
@@ -132,7 +137,13 @@ class MovableScene:
         return self._stack(image, alpha, depth / alpha.clamp_min(1e-10) if self.options.depth else None).double()
 
     def _render(self, inputs: dict[str, torch.Tensor]) -> RenderOutput:
-        return render(_gaussians(inputs), self.camera, inputs["background"], self.options, self.adjoint)
+        return render(_gaussians(inputs), self._camera(inputs), inputs["background"], self.options, self.adjoint)
+
+    def _camera(self, inputs: dict[str, torch.Tensor]) -> Camera | CameraParameters:
+        if CAMERA[0] not in inputs:
+            return self.camera
+        rotation, translation, focal, principal = (inputs[name] for name in CAMERA)
+        return CameraParameters(self.camera, torch.cat([rotation, translation]), torch.cat([focal, principal]))
 
     def _stack(self, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None) -> torch.Tensor:
         """[H, W, 4 or 5], all of about the same size."""
@@ -179,6 +190,10 @@ def _natural(scene: MovableScene, name: str) -> torch.Tensor | float:
     if name == "sh":
         return float(value.square().mean().sqrt()) or 1.0
     pixel = scene.out.depths / scene.camera.fx  # at the Gaussian, world units
+    if name in CAMERA:  # the image moves by a pixel, by a focal length at its edge
+        typical = float(pixel[pixel > 0].median()) if (pixel > 0).any() else 1.0
+        focal = max(scene.camera.fx, scene.camera.fy)
+        return dict(zip(CAMERA, (1.0 / focal, typical, 2.0 * focal / scene.camera.width, 1.0), strict=True))[name]
     if name == "means":  # the short axis, which is no less than half a pixel wide on the image
         return torch.hypot(scene.inputs["scales"].amin(1), 0.5 * pixel)[:, None]
     xx, xy, yy = scene.out.conics.unbind(1)

@@ -15,6 +15,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.checks import (
     check_background,
     check_camera,
@@ -24,6 +25,7 @@ from warp_splat.raster.checks import (
     is_one_of,
 )
 from warp_splat.raster.differences import (
+    CAMERA,
     INPUTS,
     INTERMEDIATES,
     RUNGS,
@@ -69,7 +71,7 @@ class GradientReport:
     adjoint: str
     tolerance: float
     rows: tuple[GradientRow, ...]
-    worst: WorstGaussian | None  # of the parameter that is off most; None if none is, or it is the background
+    worst: WorstGaussian | None  # of the parameter that is off most; None if none is, or it is no Gaussian's
 
     @property
     def ok(self) -> bool:
@@ -108,7 +110,7 @@ def check_gradients(
     scales: torch.Tensor,
     opacities: torch.Tensor,
     sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor],
-    camera: Camera,
+    camera: Camera | CameraParameters,
     background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
     adjoint: str = "manual",
     options: RasterOptions | None = None,
@@ -125,7 +127,8 @@ def check_gradients(
         scales: [N, 3], world units.
         opacities: [N].
         sh: [N, K, 3], or the pair.
-        camera: pinhole camera.
+        camera: pinhole camera; with :class:`CameraParameters`, "rotation", "translation" (the twist), "focal" and
+            "principal" are checked, too.
         background: RGB.
         adjoint: the mode to check; also "generated" and "plain" (known to be wrong), which are there to be compared.
         options: what to compute; with ``depth``, it is part of the loss.
@@ -144,7 +147,8 @@ def check_gradients(
         InputError: as for :func:`warp_splat.rasterize`; if a parameter has no such name; if a number is out of range.
     """
     options = _check(adjoint, options, camera, parameters, directions, tolerance, seed)
-    names = INPUTS if parameters is None else tuple(parameters)
+    inputs = INPUTS + CAMERA if isinstance(camera, CameraParameters) else INPUTS
+    names = inputs if parameters is None else tuple(parameters)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = check_background(background, means.device)
     scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
@@ -152,7 +156,7 @@ def check_gradients(
         explain_invalid(scene.out.invalid, quats)
     trials = {name: try_directions(scene, name, directions, tolerance) for name in names}
     rows = tuple(_judge(name, trials[name], tolerance) for name in names)
-    off = [row for row in rows if row.verdict == "off" and row.name != "background"]
+    off = [row for row in rows if row.verdict == "off" and row.name not in ("background", *CAMERA)]
     worst = None
     if off:
         name = max(off, key=lambda row: row.error).name
@@ -164,7 +168,7 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
     """The options to use. Raises InputError for what :func:`check_gradients` itself demands of its arguments."""
     if not is_one_of(adjoint, MODES):
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
-    known = INPUTS + INTERMEDIATES
+    known = INPUTS + INTERMEDIATES + (CAMERA if isinstance(camera, CameraParameters) else ())
     if parameters is not None and not (
         isinstance(parameters, (list, tuple)) and parameters and all(is_one_of(name, known) for name in parameters)
     ):

@@ -1,0 +1,181 @@
+"""Cameras that find their way back, what their gradients are off by, and what those cost.
+
+A camera looks at random Gaussians in a cube of 1 m. It is then moved by 5 degrees, 10 cm and 5 % of its focal lengths,
+and follows the gradients of its pose and of fx and fy until it sees the picture that the renderer drew first.
+
+    python benchmarks/cameras.py [--out docs/benchmarks]
+"""
+
+import argparse
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from common import machine, write_table
+from made_up import steps_of
+from step import synthetic
+
+from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
+from warp_splat.compare import oracle, truth
+from warp_splat.config import ADJOINTS, PROJECTIONS
+from warp_splat.evaluation.report import BLUE, ORANGE, new_panels, plain_axes, save_figure
+from warp_splat.runtime import launch
+from warp_splat.training.trainer import Trainer
+
+SEEDS, STEPS = 10, 400
+SIZE = 96  # px
+SHOWN = {
+    "degrees": ("direction [degrees]", 0.05),
+    "meters": ("place [m]", 1e-3),
+    "share": ("focal length [share]", 1e-3),
+}
+HEADERS = ("projection", "adjoint", "rotation", "translation", "fx, fy", "cx, cy")
+COUNT, ROUNDS = 194_000, 30  # of the step whose price is measured
+LEVELS = (1, 2, 4, 8, 16)  # px, boxes over which pictures are averaged before they are compared
+RATE, LAST_RATE = 1e-2, 1e-4  # of Adam: radians, meters, share of the focal length
+ANGLE, SHIFT, ZOOM = np.radians(5.0), 0.1, 1.05
+
+
+def cube(seed: int, count: int = 400) -> list[torch.Tensor]:
+    """Means, quaternions, scales, opacities and SH of degree 1 of random Gaussians in a cube of 1 m."""
+    generator = torch.Generator().manual_seed(seed)
+    normal, uniform = (
+        lambda *shape, make=make: make(*shape, generator=generator) for make in (torch.randn, torch.rand)
+    )
+    scales = 0.02 + 0.06 * uniform(count, 3)
+    return [uniform(count, 3) - 0.5, normal(count, 4), scales, 0.2 + 0.7 * uniform(count), normal(count, 4, 3) * 0.5]
+
+
+def direction(generator: np.random.Generator, length: float) -> np.ndarray:
+    vector = generator.normal(size=3)
+    return length * vector / np.linalg.norm(vector)
+
+
+def looking() -> Camera:
+    """From 1.5 m at the middle of the cube."""
+    return Camera(SIZE, SIZE, 1.2 * SIZE, 1.2 * SIZE, SIZE / 2, SIZE / 2, np.eye(3), np.array([0.0, 0.0, 1.5]))
+
+
+def recover(seed: int, steps: int = STEPS) -> list[tuple[float, float, float]]:
+    """Before every step and at last: :func:`distance` from where the picture was drawn."""
+    generator, gaussians, right = np.random.default_rng(seed), cube(seed), looking()
+    with torch.no_grad():
+        target = rasterize(*gaussians, right).image
+    wrong = np.concatenate([direction(generator, ANGLE), direction(generator, SHIFT)])
+    numbers = torch.tensor([*wrong, np.log(ZOOM), np.log(ZOOM)], requires_grad=True)
+    adam = torch.optim.Adam([numbers], RATE, betas=(0.9, 0.9))
+    scheduler = torch.optim.lr_scheduler.ExponentialLR(adam, (LAST_RATE / RATE) ** (1 / steps))
+    middle, errors = torch.tensor([right.cx, right.cy]), []
+    for _ in range(steps):
+        focal = torch.tensor([right.fx, right.fy]) * numbers[6:].exp()
+        parameters = CameraParameters(right, numbers[:6], torch.cat([focal, middle]))
+        errors.append(distance(parameters.camera, right))
+        difference = (rasterize(*gaussians, parameters).image - target).permute(2, 0, 1)
+        pooled = [torch.nn.functional.avg_pool2d(difference, level) for level in LEVELS]
+        loss = torch.stack([picture.square().mean() for picture in pooled]).sum()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        scheduler.step()
+    focal = torch.tensor([right.fx, right.fy]) * numbers[6:].exp()
+    return [*errors, distance(CameraParameters(right, numbers[:6], torch.cat([focal, middle])).camera, right)]
+
+
+def distance(camera: Camera, right: Camera) -> tuple[float, float, float]:
+    """In degrees, in meters, and the larger error of the two focal lengths as a share."""
+    turn = camera.rotation @ right.rotation.T
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    focal = max(abs(camera.fx / right.fx - 1), abs(camera.fy / right.fy - 1))
+    return float(np.degrees(np.arcsin(sine))), float(np.linalg.norm(camera.center - right.center)), focal
+
+
+def exact_gradient(options: RasterOptions, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """In float64, of the sum of image times ``weight``: the twist's and the intrinsics'; and where it is sure."""
+    right = looking()
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    intrinsics = torch.tensor([right.fx, right.fy, right.cx, right.cy], dtype=torch.float64, requires_grad=True)
+    rotation, translation = torch.tensor(right.rotation), torch.tensor(right.translation)
+    fx, fy, cx, cy = intrinsics
+    camera = SimpleNamespace(
+        **{"width": SIZE, "height": SIZE, "fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        rotation=rotation + torch.linalg.cross(twist[:3, None], rotation, dim=0),  # to first order, which is all
+        translation=translation + torch.linalg.cross(twist[:3], translation) + twist[3:],
+    )
+    gaussians = [tensor.double() for tensor in cube(0)]
+    out = oracle.exact_render(*gaussians, camera, **truth.for_oracle(options))
+    sure = ~out.fragile[..., None]
+    found = torch.autograd.grad((out.image * weight * sure).sum(), [twist, intrinsics])
+    return torch.cat(found), sure
+
+
+def error_rows(projection: str) -> list[list[str]]:
+    """Of the gradients of a random loss, relative to those in float64; a row for each mode."""
+    options, rows = RasterOptions(projection=projection), []
+    weight = torch.randn(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(0))
+    expected, sure = exact_gradient(options, weight)
+    for adjoint in ADJOINTS:
+        parameters = CameraParameters(looking())
+        (rasterize(*cube(0), parameters, adjoint=adjoint, options=options).image * weight * sure).sum().backward()
+        found = torch.cat([parameters.twist.grad, parameters.intrinsics.grad])
+        parts = zip(found.split((3, 3, 2, 2)), expected.split((3, 3, 2, 2)), strict=True)
+        rows.append([projection, adjoint, *(f"{(one - two).norm() / two.norm():.1e}" for one, two in parts)])
+    return rows
+
+
+def measure_price() -> tuple[float, float]:
+    """Processor seconds of a training step, and what a camera that learns adds to its projection, both ways.
+
+    In turns, the least of each: what is added is less than the noise of a whole step.
+    """
+    trainer = synthetic(COUNT, 980, 545)
+    step, through = steps_of(trainer), Trainer._through
+
+    def learning(self, name, value, *rest):
+        return CameraParameters(value) if name == "camera" else through(self, name, value, *rest)
+
+    whole, projection = [], {through: [], learning: []}
+    for _ in range(ROUNDS):
+        for change, seconds in projection.items():
+            clock = patch.object(launch, "_now", time.process_time)
+            with patch.object(Trainer, "_through", change), clock, launch.profile() as stages:
+                start = time.process_time()
+                step()
+                whole.append(time.process_time() - start)
+                seconds.append(stages["project"] + stages["adjoint of project"])
+    return min(whole), min(projection[learning]) - min(projection[through])
+
+
+def plot(runs: list[list[tuple[float, float, float]]], path: Path) -> None:
+    """Errors over steps, a panel for each, and what was asked for."""
+    figure, panels = new_panels(2.8, columns=len(SHOWN))
+    for column, (axes, (title, wanted)) in enumerate(zip(panels[0], SHOWN.values(), strict=True)):
+        for run in runs:
+            axes.semilogy([errors[column] for errors in run], color=BLUE, linewidth=0.8)
+        axes.axhline(wanted, color=ORANGE)
+        plain_axes(axes, title, "steps")
+    save_figure(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for the plot")
+    arguments = parser.parse_args()
+    launch.prepare("cpu", 1)
+    rows = [row for projection in PROJECTIONS for row in error_rows(projection)]
+    runs = [recover(seed) for seed in range(SEEDS)]
+    step, added = measure_price()
+    wanted = [wanted for _, wanted in SHOWN.values()]
+    reached = [1 + max(n for n, found in enumerate(run) if not np.all(np.less(found, wanted))) for run in runs]
+    last = {name: [run[-1][column] for run in runs] for column, name in enumerate(SHOWN)}
+    data = {"last": last, "reached": reached, "step": step, "added": added, "machine": machine()}
+    note = f"Gradients of a random loss on the cube of seed 0 at {SIZE} x {SIZE} px, relative to those in float64."
+    if arguments.out:
+        plot(runs, arguments.out / "cameras.png")
+    write_table("cameras", arguments.out, HEADERS, rows, note, data)
+
+
+if __name__ == "__main__":
+    main()
