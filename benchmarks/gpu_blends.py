@@ -4,6 +4,10 @@ Slots: each tile instance has a row of its own, ``gather`` sums a Gaussian's row
 kernel adds into the Gaussian's row at once; no rows per instance, no second kernel, another sum in every run.
 """
 
+import functools
+import inspect
+import linecache
+
 import torch
 import warp as wp
 from common import milliseconds
@@ -11,7 +15,8 @@ from made_up import cameras, make_gaussians
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels.cuda.adjoint import make_reverse_block
+from warp_splat.kernels.cuda import adjoint
+from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.cuda import THREADS, spread_upstream
 from warp_splat.raster.data import Gaussians, Pixels, variant_of
 from warp_splat.raster.drivers import CUDA
@@ -50,9 +55,18 @@ def multiply_add(first: int, rounds: int, factor: float, values_out: wp.array[wp
     values_out[i] = wp.vec4(a, b, c, d)
 
 
-@wp.func
-def add(rows: wp.array2d[float], instance: int, splat: int, column: int, value: float):
-    wp.atomic_add(rows, splat, column, value)
+@functools.cache
+def make_adding_block(variant: BlendVariant) -> wp.Kernel:
+    """The package's adjoint with another last line: what it wrote to a slot is added to the Gaussian's row."""
+    source = inspect.getsource(adjoint.make_reverse_block)
+    changed = source.replace(
+        "slots_out[k, grad] = row[grad]", "wp.atomic_add(slots_out, bins.instances[k], grad, row[grad])"
+    )
+    assert changed != source
+    path, names = "<adjoint that adds>", dict(vars(adjoint))
+    linecache.cache[path] = (len(changed), None, changed.splitlines(keepends=True), path)  # where Warp finds it
+    exec(compile(changed, path, "exec"), names)
+    return names["make_reverse_block"]("manual", variant)
 
 
 class Blends:
@@ -80,22 +94,21 @@ class Blends:
         found = spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
         (self.up, self.adj_final), _, _, self.steps = found
 
-    def reverse(self, rows: torch.Tensor, *write: wp.Function) -> None:
+    def reverse(self, kernel: wp.Kernel, rows: torch.Tensor) -> None:
         states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
         upstream = [view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
         inputs = [self.bins.view(), self.options.alpha_min, *states, *upstream]
-        kernel = make_reverse_block("manual", variant_of(self.options), *write)
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
 
     def into_slots(self) -> None:
-        self.reverse(self.slots)
+        self.reverse(adjoint.make_reverse_block("manual", variant_of(self.options)), self.slots)
 
     def gather(self) -> list[torch.Tensor]:
         return CUDA.gather(self.bins, self.slots)[:4]  # all but those of the depths
 
     def by_atomics(self) -> torch.Tensor:
         self.rows.zero_()
-        self.reverse(self.rows, add)
+        self.reverse(make_adding_block(variant_of(self.options)), self.rows)
         return self.rows
 
     def by_gaussian(self, rows: torch.Tensor) -> torch.Tensor:

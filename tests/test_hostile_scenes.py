@@ -188,7 +188,7 @@ def test_all_that_a_library_complains_of_is_cut_to_a_sentence(tmp_path):
     (path,) = with_image(tmp_path, "a.exr")
     data = path.read_bytes()
     path.write_bytes(data.replace(b"screenWindowCenter\0", b"screenWindowCenter\0screenWindowCenter\0"))
-    with pytest.raises(InputError, match=r"a\.exr: .* \.\.\.\); replace this file\.$"):
+    with pytest.raises(InputError, match=r"a\.exr: .* \.\.\.\); replace it\.$"):
         load(tmp_path)
 
 

@@ -170,8 +170,8 @@ BAD_PHOTOS = {
     "empty": (nothing, ["found none", "check the path"]),
     "heic": (heic, ["IMG_1.HEIC", "convert"]),
     "video inside": (video_inside, ["name the video itself", "a.mp4"]),
-    "two": (two_photos, ["at least 3 photographs", "found 2"]),
-    "broken": (broken_photos, ["at least 3 photographs", "found 0"]),
+    "two": (two_photos, ["at least 3 readable photographs", "found 2"]),
+    "broken": (broken_photos, ["at least 3 readable photographs", "found 0"]),
     "without texture": (flat_photos, ["0 of 4 photographs could be registered", "overlap"]),
 }
 

@@ -220,6 +220,8 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """Of a matrix that is almost a rotation times a factor (Higham 1986): LAPACK's last bits differ by processor."""
+    if np.abs((matrix[:, None] * matrix).sum(2) - np.eye(3)).max() <= 1e-12:  # it is one
+        return matrix
     matrix = matrix / np.sqrt((matrix * matrix).sum() / 3.0)
     for _ in range(4):  # each doubles the digits, of which TOLERANCE leaves three
         cofactors = np.cross(matrix[[1, 2, 0]], matrix[[2, 0, 1]])

@@ -60,11 +60,11 @@ def save_model(trainer: Trainer, run: Run) -> Path:
     path = model_folder.ply_path(run.folder, run.iteration)
     antialiased = trainer.config.model.antialiasing
     try:
-        trainer.model.save(path, antialiased)
+        trainer.model.arranged().save(path, antialiased)
     except InputError as error:
         warn(error)
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
-        trainer.model.save(path, antialiased)
+        trainer.model.arranged().save(path, antialiased)
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     return path
 
@@ -142,6 +142,7 @@ def sha256_of(run: Run) -> str:
 def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     """Pictures, curves and numbers of the saved model, and where they lie."""
     wall = time.perf_counter() - run.start
+    trainer.model = trainer.model.arranged()  # as in the file: at one depth, the first is drawn in front
     split, views = trainer.scene.evaluated
     extra = {
         "split": split,

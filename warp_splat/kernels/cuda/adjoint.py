@@ -111,14 +111,8 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
     return upstream
 
 
-@wp.func
-def put(slots: wp.array2d[float], instance: int, splat: int, column: int, value: float):
-    """Write a gradient to its place, which is nobody else's."""
-    slots[instance, column] = value
-
-
 @functools.cache
-def make_reverse_block(mode: str, variant: BlendVariant, write: wp.Function = put) -> wp.Kernel:
+def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The reverse loop by hand, its step by hand (``manual``) or by Warp (``stepwise``)."""
     GRADS = variant.columns
     adj_step = make_manual(variant.falloff, float)
@@ -192,6 +186,6 @@ def make_reverse_block(mode: str, variant: BlendVariant, write: wp.Function = pu
                         row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
                     k = start + last - j
                     for grad in range(GRADS):
-                        write(slots_out, k, bins.instances[k], grad, row[grad])
+                        slots_out[k, grad] = row[grad]
 
     return adj_blend
