@@ -92,7 +92,10 @@ def test_help_of_each_command_is_short_at_its_head(command, capsys):
         ("train --opacity_lr inf", "--opacity_lr: expected a finite number, at least 0, got inf."),
         ("train --save_iterations 5 0", "--save_iterations: expected numbers of steps, at least 1, got 0."),
         ("train --iterations 0", "--iterations: expected at least 1, got 0."),
-        ("train --parts random_background,sky", "--parts: expected auto, or some of random_background, floaters between commas"),
+        (
+            "train --parts random_background,sky",
+            "--parts: expected auto, or some of random_background, floaters between commas",
+        ),
         ("view model --port 65536", "--port: expected 1 to 65535, got 65536."),
         ("render -m model --threads -1", "--threads: expected at least 0, got -1."),
         ("sfm photos scene --frames 2", "--frames: expected at least 3, got 2."),
