@@ -55,6 +55,30 @@ def test_colmap_cameras_points_and_pixels(tmp_path, binary):
     assert (scene.points.dtype, scene.colors.dtype) == (np.float32, np.uint8)
 
 
+def test_tracks_are_free_of_the_lens(tmp_path):
+    """Keypoints where a lens with radial distortion draws the points; what was not triangulated is no track."""
+    root = write_colmap(tmp_path, ["a.png"], camera=f"SIMPLE_RADIAL {WIDTH} {HEIGHT} 40 22.5 17.25 0.1")
+    rotation, translation = pose(0)
+    x, y, z = rotation @ POINTS[:3].T + translation[:, None]
+    slopes = np.stack([x / z, y / z], axis=1)
+    keypoints = 40 * slopes * (1 + 0.1 * (slopes**2).sum(1, keepdims=True)) + [22.5, 17.25]
+    path = root / "sparse" / "0" / "images.txt"
+    line = " ".join(f"{u!r} {v!r} {i}" for (u, v), i in zip(keypoints.tolist(), (1, 2, -1), strict=True))
+    path.write_text(path.read_text().rstrip("\n") + f"\n{line}\n")
+    path = path.with_name("points3D.txt")
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(f"{row} 1 {i}" if i < 2 else row for i, row in enumerate(rows)) + "\n")
+    found = load(root)[0].tracks["a.png"]
+    assert found.ids.tolist() == [1, 2]
+    np.testing.assert_allclose(found.points, POINTS[:2], atol=1e-12)
+    np.testing.assert_allclose(found.slopes, slopes[:2], atol=1e-9)
+
+
+def test_scenes_without_observations_have_no_tracks(tmp_path):
+    assert load(write_colmap(tmp_path / "colmap"))[0].tracks == {}
+    assert load(write_blender(tmp_path / "blender"), eval=True)[0].tracks == {}
+
+
 def test_simple_pinhole_and_model_directly_in_sparse(tmp_path):
     write_model(tmp_path / "sparse", ["a.png"], camera=f"SIMPLE_PINHOLE {WIDTH} {HEIGHT} 41 20 15")
     write_image(tmp_path / "images" / "a.png", texture())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,7 +65,8 @@ def load_scene(
     elif not test:
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
-    from warp_splat.scene.images import load_views  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.colmap import read_tracks  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.images import load_views  # noqa: PLC0415
     from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
 
     file, drawn = None, not (start or len(points))
@@ -80,7 +82,8 @@ def load_scene(
     if views[0].linear and not start:
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
     require_one_kind([(view.name, view.linear) for view in train_views + test_views], source)
-    return Scene(train_views, test_views, points, colors, file, drawn)
+    tracks = partial(read_tracks, Path(source)) if takes_colmap(Path(source)) else dict
+    return Scene(train_views, test_views, points, colors, file, drawn, tracks)
 
 
 def _drop_masked(views: list[View], source: str | Path, report: Callable[[str], object]) -> list[View]:

@@ -15,6 +15,7 @@ from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import Lens, make_photo, make_sampling
 from warp_splat.scene.photos import ImageFinder
+from warp_splat.scene.types import Sightings
 
 UINT32, UINT32_PAIR, UINT64 = struct.Struct("<I"), struct.Struct("<II"), struct.Struct("<Q")
 SENSOR, POSE = 8, 56  # bytes: its kind and number; quaternion and translation
@@ -45,6 +46,26 @@ def read_colmap(
         raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run its mapper again.")
     points, colors = _points(model, report)
     return _photos(where, registered, source / folder, report), points, colors
+
+
+def read_tracks(source: Path) -> dict[str, Sightings]:
+    """By image name, what the largest model under ``source``/sparse observed of its points; empty images are left out.
+
+    Raises:
+        InputError: if the model cannot be read.
+    """
+    _, model = _largest_model(source / "sparse", lambda line: None)
+    places, tracks = {i: point.xyz for i, point in model.points3D.items()}, {}
+    for image in (model.image(i) for i in model.reg_image_ids()):
+        seen = [point for point in image.get_observation_points2D() if point.point3D_id in places]
+        if not seen:
+            continue
+        ids = np.array([point.point3D_id for point in seen], np.int64)
+        slopes = np.array(image.camera.cam_from_img(np.array([point.xy for point in seen], np.float64)))
+        found = Sightings(ids, np.array([places[i] for i in ids.tolist()]), slopes)
+        finite = np.isfinite(slopes).all(1) & np.isfinite(found.points).all(1)
+        tracks[image.name] = Sightings(*(column[finite] for column in found))
+    return tracks
 
 
 def find_models(sparse: Path) -> list[Path]:

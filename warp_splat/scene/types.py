@@ -1,7 +1,9 @@
 """What a loaded scene is: cameras with their photographs, and what training starts from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,6 +48,14 @@ class View:
         return np.rint(255 * to_srgb(self.image.clip(0, 1), np.where)).astype(np.uint8) if self.linear else self.image
 
 
+class Sightings(NamedTuple):
+    """The points that structure from motion triangulated with a photograph, and where it saw them there."""
+
+    ids: np.ndarray  # [M] int64, of the points: the same in every photograph
+    points: np.ndarray  # [M, 3] float64, world coordinates
+    slopes: np.ndarray  # [M, 2] float64, x / z and y / z in the camera, of the keypoints without the lens's distortion
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Views to train on, views held out, and the points to start from."""
@@ -56,6 +66,12 @@ class Scene:
     colors: np.ndarray  # [P, 3] uint8
     start: SplatFile | None = None  # Gaussians to start from instead; the points are their centers
     random_points: bool = False  # drawn, since there were none
+    find_tracks: Callable[[], dict[str, Sightings]] = dict  # by the names of views
+
+    @cached_property
+    def tracks(self) -> dict[str, Sightings]:
+        """What each view saw of the points, by its name; empty if the scene does not say. Read when first asked for."""
+        return self.find_tracks()
 
     @property
     def linear(self) -> bool:
