@@ -16,7 +16,7 @@ from made_up import blend_scene
 
 from warp_splat.compare.adjoints import peak_of
 from warp_splat.config import ADJOINTS
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 
 MODES = (*ADJOINTS, "generated")
 
@@ -47,7 +47,7 @@ def main() -> None:
 
     def with_threads(count: int, run):
         def timed():
-            launch.set_threads(count)
+            pool.set_threads(count)
             run()
 
         return timed

@@ -21,7 +21,7 @@ from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.bin import balanced_slices
 from warp_splat.raster.blend import blend as blend_splats
 from warp_splat.raster.data import Bins, Splats2D
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 
 
 class Lanes:
@@ -109,7 +109,7 @@ def main() -> None:
 
     def with_threads(count: int, run):
         def timed():
-            launch.set_threads(count)
+            pool.set_threads(count)
             run()
 
         return timed

@@ -22,7 +22,7 @@ from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
 from warp_splat.compare import oracle, truth
 from warp_splat.config import ADJOINTS, PROJECTIONS
 from warp_splat.evaluation.report import BLUE, ORANGE, new_panels, plain_axes, save_figure
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, timers
 from warp_splat.training.trainer import Trainer
 
 SEEDS, STEPS = 10, 400
@@ -140,7 +140,7 @@ def measure_price() -> tuple[float, float]:
     for _ in range(ROUNDS):
         for change, seconds in projection.items():
             clock = patch.object(launch, "_now", time.process_time)
-            with patch.object(Trainer, "_through", change), clock, launch.profile() as stages:
+            with patch.object(Trainer, "_through", change), clock, timers.profile() as stages:
                 start = time.process_time()
                 step()
                 whole.append(time.process_time() - start)

@@ -15,7 +15,7 @@ from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 from warp_splat.rendering.camera_paths import ORBIT_SIZE
 from warp_splat.rendering.command import make_picture
-from warp_splat.runtime import launch
+from warp_splat.runtime import timers
 
 STAGES = (
     *("project", "bin", "blend", "loss", "adjoint of loss", "adjoint of blend", "adjoint of project"),
@@ -41,7 +41,7 @@ def measure_step(count: int, width: int, height: int, device: str, steps: int) -
     whole = _whole_step(step, device, steps)
     records = []
     for _ in range(max(steps // 3, 3)):
-        with launch.profile() as stages:
+        with timers.profile() as stages:
             step()
         records.append(dict(stages))
     medians = [1e3 * statistics.median(record.get(stage, 0.0) for record in records) for stage in STAGES]

@@ -24,7 +24,7 @@ import warp as wp
 
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.simd import LANES, vec16
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 from warp_splat.runtime.launch import view
 
 SCALED = 2**28  # bytes, many times any cache
@@ -64,7 +64,7 @@ class Limits(NamedTuple):
 
 def measure_limits(threads: int) -> Limits:
     """With ``threads`` threads, which stay set."""
-    launch.set_threads(threads)
+    pool.set_threads(threads)
     return Limits(_bandwidth(threads), _rate(threads))
 
 
@@ -78,7 +78,7 @@ def _rate(threads: int) -> float:
     count = 16 * threads
     values = torch.zeros(count, CHAINS, LANES)
     run = lambda: launch.launch(  # noqa: E731
-        multiply_add, count, [ROUNDS, 0.5], [view(values, vec16)], bounds=launch.even_slices(count, 1)
+        multiply_add, count, [ROUNDS, 0.5], [view(values, vec16)], bounds=pool.even_slices(count, 1)
     )
     return count * CHAINS * UNROLLED * ROUNDS / _least(run)
 

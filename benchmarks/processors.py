@@ -36,13 +36,13 @@ def work(count: int) -> None:
     from made_up import VIEWS, steps_of  # noqa: PLC0415 - the environment comes first
     from step import STAGES, synthetic  # noqa: PLC0415
 
-    from warp_splat.runtime import launch  # noqa: PLC0415
+    from warp_splat.runtime import launch, pool, timers  # noqa: PLC0415
 
     launch.prepare("cpu", 0)
     step = steps_of(synthetic(count, *SIZE))
     for line in sys.stdin:
-        launch.set_threads(int(line))
-        with launch.profile() as stages, launch.stage("whole step"):
+        pool.set_threads(int(line))
+        with timers.profile() as stages, timers.stage("whole step"):
             for _ in range(VIEWS):
                 step()
         seconds = {stage: stages.get(stage, 0.0) / VIEWS for stage in (*STAGES, "whole step")}

@@ -18,7 +18,7 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import focus_orbit
 from warp_splat.rendering.command import make_picture
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 from warp_splat.scene import load_scene
 from warp_splat.text import format_table
 
@@ -83,7 +83,7 @@ def main() -> None:
             "cameras look at, as 8-bit pictures; errors against the first row, in levels of 255.",
             "The public functions, which check the Gaussians first:",
             format_table(("function", "ms per frame"), calls),
-            f"{launch.get_threads()} threads.",
+            f"{pool.get_threads()} threads.",
         )
     )
     data = {"headers": HEADERS, "rows": rows, "calls": calls, "machine": machine()}

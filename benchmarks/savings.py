@@ -29,7 +29,7 @@ from warp_splat.raster.api import render
 from warp_splat.raster.data import Bins, Gaussians
 from warp_splat.raster.drivers import CPU, using
 from warp_splat.raster.project import project
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 from warp_splat.scene.images import read_pixels
 from warp_splat.training.trainer import Trainer
 
@@ -233,7 +233,7 @@ def main() -> None:
     rows += [measure_projection(trainer), measure_decoding(trainer)]
     camera = trainer.scene.train[0].camera
     note = (
-        f"{len(trainer.model)} Gaussians at {camera.width} x {camera.height} px, {launch.get_threads()} threads; "
+        f"{len(trainer.model)} Gaussians at {camera.width} x {camera.height} px, {pool.get_threads()} threads; "
         "times of a whole training step, if nothing else is said. The SH degree is an argument of the kernels: when it "
         "rises, nothing is compiled."
     )

@@ -25,7 +25,7 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, new_figure, plain_axes, save_figure
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import project
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, timers
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.text import format_table
 from warp_splat.training.memory import pixel_floats, step_memory
@@ -90,7 +90,7 @@ def measure(
         take_step(trainer, iteration)
     change_set(trainer)
     while len(steps) < repeats[0] or (len(steps) < repeats[1] and sum(steps) < SECONDS):
-        with launch.profile() as profile:
+        with timers.profile() as profile:
             start = time.perf_counter()
             take_step(trainer, 13 + len(steps))
             steps.append(time.perf_counter() - start)

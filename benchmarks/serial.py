@@ -27,7 +27,7 @@ from work import Counts, count, mean, work_of
 
 from warp_splat.config import CORES, RasterOptions
 from warp_splat.raster.data import Gaussians
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool, timers
 from warp_splat.training.trainer import Trainer
 
 CORES_PREDICTED = (4, 8, 16, 32)
@@ -38,7 +38,7 @@ Spans = list[tuple[float, float]]
 
 
 class Clock(defaultdict):
-    """Seconds of each stage, as ``launch.stage`` adds them, and of those the seconds in which threads shared work."""
+    """Seconds of each stage, as ``timers.stage`` adds them, and of those the seconds in which threads shared work."""
 
     def __init__(self):
         super().__init__(float)
@@ -79,9 +79,9 @@ def timed(clock: Clock, run: Callable[[], None]) -> Callable[[], None]:
 
 def measure(step: Callable[[], None], threads: int) -> tuple[dict[str, float], dict[str, float]]:
     """Seconds of each stage and of the whole step, and of those in which no work was shared; means over VIEWS steps."""
-    clock, job = Clock(), launch._Job
-    launch.set_threads(threads)
-    launch._seconds, launch._Job = clock, lambda slices: job([timed(clock, run) for run in slices])
+    clock, job = Clock(), pool._Job
+    pool.set_threads(threads)
+    timers._seconds, pool._Job = clock, lambda slices: job([timed(clock, run) for run in slices])
     whole = busy = 0.0
     try:
         for _ in range(VIEWS):
@@ -91,7 +91,7 @@ def measure(step: Callable[[], None], threads: int) -> tuple[dict[str, float], d
             end = time.perf_counter()
             whole, busy = whole + end - start, busy + shared(clock.spans, start, end)
     finally:
-        launch._seconds, launch._Job = None, job
+        timers._seconds, pool._Job = None, job
     seconds = {stage: clock.get(stage, 0.0) / VIEWS for stage in STAGES}
     serial = {stage: seconds[stage] - clock.busy[stage] / VIEWS for stage in STAGES}
     for table, total in ((seconds, whole / VIEWS), (serial, (whole - busy) / VIEWS)):

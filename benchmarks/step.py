@@ -29,7 +29,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.data import Gaussians
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool, timers
 from warp_splat.scene import load_scene
 from warp_splat.training.trainer import Trainer
 
@@ -75,8 +75,8 @@ def time_steps(trainer: Trainer, rounds: int) -> dict[int, dict[str, float]]:
     found: dict[int, list[dict[str, float]]] = {threads: [] for threads in THREADS}
     for number in range(-1, rounds):
         for threads in THREADS:
-            launch.set_threads(threads)
-            with launch.profile() as stages:
+            pool.set_threads(threads)
+            with timers.profile() as stages:
                 start = time.perf_counter()
                 for _ in range(VIEWS):
                     step()

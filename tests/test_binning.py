@@ -11,7 +11,7 @@ from warp_splat.raster import api, bin, cpu
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.runtime.launch import get_threads
+from warp_splat.runtime.pool import get_threads
 
 SIZE = (70, 53)
 PLAIN = RasterOptions()

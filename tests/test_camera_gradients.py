@@ -17,7 +17,7 @@ from warp_splat.config import ADJOINTS
 from warp_splat.raster import project
 from warp_splat.raster.differences import INPUTS
 from warp_splat.raster.drivers import CUDA, using
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -172,14 +172,14 @@ def test_nothing_else_changes(name):
 
 def test_any_number_of_threads(monkeypatch):
     monkeypatch.setattr(launch, "SMALLEST_SLICE", 32)
-    scene, before = scenes.cloud(0, 1003, scenes.make_camera(64, 48), degree=1), launch.get_threads()
+    scene, before = scenes.cloud(0, 1003, scenes.make_camera(64, 48), degree=1), pool.get_threads()
     results = []
     for threads in (1, 2, 3):
-        launch.set_threads(threads)
+        pool.set_threads(threads)
         parameters = CameraParameters(scene.camera)
         gradients_of(scene, parameters)
         results.append(torch.cat([parameters.twist.grad, parameters.intrinsics.grad]))
-    launch.set_threads(before)
+    pool.set_threads(before)
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
 
 

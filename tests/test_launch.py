@@ -8,7 +8,7 @@ import pytest
 import torch
 import warp as wp
 
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 
 DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
@@ -52,18 +52,18 @@ def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
 
 def test_helpers_keep_nothing_alive():
     """What they worked on last goes when the caller lets it go, though they know of the next job only when it comes."""
-    threads = launch.get_threads()
-    launch.set_threads(4)
+    threads = pool.get_threads()
+    pool.set_threads(4)
     try:
         for _ in range(20):
             tensor = torch.zeros(64)
-            launch.in_slices(lambda low, high, tensor=tensor: tensor[low:high].add_(1.0), list(range(65)))
+            pool.in_slices(lambda low, high, tensor=tensor: tensor[low:high].add_(1.0), list(range(65)))
             assert (tensor == 1.0).all()
             alive = weakref.ref(tensor)
             del tensor
             assert alive() is None
     finally:
-        launch.set_threads(threads)
+        pool.set_threads(threads)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from warp_splat import InputError, set_threads
-from warp_splat.runtime.launch import get_threads, profile
+from warp_splat.runtime.pool import get_threads
+from warp_splat.runtime.timers import profile
 from warp_splat.training import loss as losses
 from warp_splat.training.loss import LossByConvolution, image_loss
 

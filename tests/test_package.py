@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import warp_splat
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 
 ROOT = Path(__file__).parents[1]
 NAMES = warp_splat.__all__
@@ -85,7 +85,7 @@ def test_a_forked_child_renders_too():
 
 def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
     """An error in one slice reaches the caller after the other slices have ended; what the caller held is free then."""
-    threads = launch.get_threads()
+    threads = pool.get_threads()
     warp_splat.set_threads(2)
     image()
     running, held = [], []
@@ -113,7 +113,7 @@ def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
 
 def test_an_interrupted_launch_waits_for_its_helpers():
     """Who is interrupted frees the tensors that helpers still write into."""
-    threads = launch.get_threads()
+    threads = pool.get_threads()
     warp_splat.set_threads(2)
     image()  # a helper is there
     begun, ended = threading.Event(), []
@@ -130,7 +130,7 @@ def test_an_interrupted_launch_waits_for_its_helpers():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background, shells have it ignored
     try:
         with pytest.raises(KeyboardInterrupt):
-            launch._Job([partial(run, 0, 1), partial(run, 1, 2)]).share(helpers=1)
+            pool._Job([partial(run, 0, 1), partial(run, 1, 2)]).share(helpers=1)
     finally:
         signal.signal(signal.SIGINT, before)
         warp_splat.set_threads(threads)

@@ -13,7 +13,7 @@ from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS, ALPHA_MIN, T_MIN
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "benchmarks"))
@@ -30,10 +30,10 @@ import work  # noqa: E402
 
 @pytest.fixture
 def two_threads():
-    before = launch.get_threads()
-    launch.set_threads(2)
+    before = pool.get_threads()
+    pool.set_threads(2)
     yield
-    launch.set_threads(before)
+    pool.set_threads(before)
 
 
 def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
@@ -154,8 +154,8 @@ def test_serial_time_is_what_slices_do_not_share(two_threads):
     assert (
         serial.shared([(0.0, 2.0), (1.0, 4.0)], 1.5, 3.0) == pytest.approx(0.5) and serial.shared([], 0.0, 1.0) == 0.0
     )
-    job = launch._Job
+    job = pool._Job
     seconds, alone = serial.measure(made_up.steps_of(made_up.make_trainer(3000, 64, 48, "cpu")), 2)
-    assert launch._Job is job and all(
+    assert pool._Job is job and all(
         0.0 <= alone[stage] <= seconds[stage] for stage in (*gpu_steps.STAGES, "whole step")
     )

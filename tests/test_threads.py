@@ -14,7 +14,7 @@ from warp_splat import Camera, rasterize
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster import bin, project
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.growth.reference import Reference
 from warp_splat.training.optimizer import EPS, Optimizer
@@ -37,12 +37,12 @@ def double(first: int, values: wp.array[float], doubles_out: wp.array[float]):
 @pytest.fixture(params=[1, 2, 3])
 def threads(request, monkeypatch):
     """So many of ours, and one of torch's: with more it shares its work by itself."""
-    before, of_torch = launch.get_threads(), torch.get_num_threads()
-    monkeypatch.setattr(launch, "SMALLEST_OF_TORCH", 1024)
-    launch.set_threads(request.param)
+    before, of_torch = pool.get_threads(), torch.get_num_threads()
+    monkeypatch.setattr(pool, "SMALLEST_OF_TORCH", 1024)
+    pool.set_threads(request.param)
     torch.set_num_threads(1)
     yield request.param
-    launch.set_threads(before)
+    pool.set_threads(before)
     torch.set_num_threads(of_torch)
 
 
@@ -55,13 +55,13 @@ def model():
 
 def test_slices_cover_everything_in_whole_widths(threads):
     for count in (0, 1, 63, 64, 65, 2047, 2048, 2049, COUNT, 10**6):
-        bounds = launch.torch_slices(count)
+        bounds = pool.torch_slices(count)
         assert bounds[0] == 0 and bounds[-1] == count and bounds == sorted(bounds) and len(bounds) <= threads + 1
-        assert all(bound % launch.WIDTH == 0 for bound in bounds[:-1])
-    assert len(launch.torch_slices(10**6)) == threads + 1
-    assert launch.torch_slices(10**6, "cuda") == [0, 10**6]
+        assert all(bound % pool.WIDTH == 0 for bound in bounds[:-1])
+    assert len(pool.torch_slices(10**6)) == threads + 1
+    assert pool.torch_slices(10**6, "cuda") == [0, 10**6]
     torch.set_num_threads(2)
-    assert launch.torch_slices(10**6) == [0, 10**6]
+    assert pool.torch_slices(10**6) == [0, 10**6]
 
 
 def test_steps_are_those_of_adam_in_torch(threads, model):
@@ -136,7 +136,7 @@ def test_rows_are_taken_and_put(threads):
 def test_what_runs_beside_runs_once(threads):
     done = []
     for bounds in ([0, 0], [0, 5], [0, 1, 2, 3, 4, 5]):
-        launch.in_slices(lambda low, high: done.extend(range(low, high)), bounds, lambda: done.append("beside"))
+        pool.in_slices(lambda low, high: done.extend(range(low, high)), bounds, lambda: done.append("beside"))
     assert done.count("beside") == 3 and all(done.count(number) == 2 for number in range(5))
 
 
@@ -192,7 +192,7 @@ def state_after_steps() -> str:
 
 def test_a_training_is_the_same_on_any_number_of_threads(threads):
     found = state_after_steps()
-    launch.set_threads(1)
+    pool.set_threads(1)
     assert found == state_after_steps()
 
 
@@ -201,4 +201,4 @@ def test_an_error_beside_reaches_the_caller(threads):
         raise ValueError("beside")
 
     with pytest.raises(ValueError, match="beside"):
-        launch.in_slices(lambda low, high: None, [0, 1, 2, 3], fail)
+        pool.in_slices(lambda low, high: None, [0, 1, 2, 3], fail)

@@ -16,11 +16,11 @@ _HOMES = {
     "RasterOptions": "config",
     "RenderOutput": "raster.api",
     "check_gradients": "raster.gradcheck",
-    "get_threads": "runtime.launch",
+    "get_threads": "runtime.pool",
     "load_scene": "scene",
     "rasterize": "raster.api",
     "rasterize_views": "raster.api",
-    "set_threads": "runtime.launch",
+    "set_threads": "runtime.pool",
 }
 __all__ = [
     "Camera",
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
     from warp_splat.raster.camera_parameters import CameraParameters
     from warp_splat.raster.gradcheck import check_gradients
-    from warp_splat.runtime.launch import get_threads, set_threads
+    from warp_splat.runtime.pool import get_threads, set_threads
     from warp_splat.scene import load_scene
 
 

@@ -23,7 +23,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
-from warp_splat.runtime import launch
+from warp_splat.runtime import timers
 
 ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
 REPEATS = 5
@@ -115,7 +115,7 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
     stages_of: dict[Variant, list[dict[str, float]]] = {variant: [] for variant in runnable}
     while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
         for variant in runnable:
-            with launch.profile() as stages:
+            with timers.profile() as stages:
                 _differentiate(workload, variant)
             stages_of[variant].append(dict(stages))
         rounds += 1

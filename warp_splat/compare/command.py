@@ -18,7 +18,7 @@ from warp_splat.evaluation.report import machine
 from warp_splat.formats.atomic import atomic_write, write_csv, write_json
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 from warp_splat.scene.types import Scene
 
 DIRECTIONS = 4  # per parameter
@@ -63,7 +63,7 @@ def run(config: CompareConfig) -> int:
         _compare_pixel_loops(config, scenes, device, out, say)
         trained.run_trainings(out, config.modes, scenes, config.full, say, device.type)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
-    say(f"\nMeasured on {card}{machine()}, {launch.get_threads()} threads.")
+    say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
     with atomic_write(out / f"{name}.txt") as path:
         path.write_text("\n".join(log) + "\n", encoding="utf-8")
     print(f"Tables and plots: {out}")

@@ -20,7 +20,7 @@ from warp_splat.raster.checks import check_background, check_camera, check_gauss
 from warp_splat.raster.data import Dropped, Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
-from warp_splat.runtime.launch import stage
+from warp_splat.runtime.timers import stage
 
 
 @dataclass

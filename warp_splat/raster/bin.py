@@ -14,16 +14,8 @@ from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D, falloff_of
-from warp_splat.runtime.launch import (
-    available_memory,
-    empty,
-    even_slices,
-    get_threads,
-    in_slices,
-    launch,
-    torch_slices,
-    view,
-)
+from warp_splat.runtime.launch import available_memory, empty, launch, view
+from warp_splat.runtime.pool import even_slices, get_threads, in_slices, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients

@@ -10,7 +10,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.runtime.launch import stage
+from warp_splat.runtime.timers import stage
 
 
 def blend(

@@ -22,7 +22,8 @@ from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
 from warp_splat.raster.data import Bins, Pixels, limits_of, variant_of
-from warp_splat.runtime.launch import empty, in_slices, launch, view
+from warp_splat.runtime.launch import empty, launch, view
+from warp_splat.runtime.pool import in_slices
 
 #: Gaussians whose slots a thread sums at a time. Fresh pages for the sums of all would cost 15 to 50 ms at 1M
 #: Gaussians.

@@ -23,16 +23,9 @@ from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.runtime.launch import (
-    SMALLEST_SLICE,
-    even_slices,
-    in_slices,
-    launch,
-    pack_struct,
-    stage,
-    torch_slices,
-    view,
-)
+from warp_splat.runtime.launch import launch, pack_struct, view
+from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, torch_slices
+from warp_splat.runtime.timers import stage
 
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camera | None = None) -> CameraView:

@@ -18,7 +18,7 @@ import torch.distributed as dist
 
 from warp_splat.errors import InputError
 from warp_splat.runtime.devices import is_out_of_memory
-from warp_splat.runtime.launch import stage
+from warp_splat.runtime.timers import stage
 
 PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
 

@@ -1,157 +1,28 @@
-"""The only place that calls ``wp.launch``: threads, slices, streams, timers, and views of torch tensors.
+"""The only place that calls ``wp.launch``: streams, memory, and views of torch tensors.
 
 On the CPU, a Warp launch runs on the thread that makes it and releases the interpreter's lock. Every kernel here takes
-the first index of its slice, so that a pool of threads can share a launch. A kernel writes each element from one
-index only, so the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on torch's
-current stream: kernels of Warp and of torch follow each other in the order of the calls.
+the first index of its slice, so that the threads of :mod:`.pool` can share a launch. A kernel writes each element
+from one index only, so the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on
+torch's current stream: kernels of Warp and of torch follow each other in the order of the calls.
 
 All memory is torch's, on either device: its caching allocator gives what a stage frees to the next.
 """
 
 from __future__ import annotations
 
-import atexit
 import ctypes
 import functools
-import itertools
-import os
-import queue
-import threading
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
-from numbers import Integral
+from collections.abc import Callable, Sequence
 
 import psutil
 import torch
 import warp as wp
 
-from warp_splat.config import CORES
-from warp_splat.errors import InputError
 from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
+from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_threads
 
 BLOCK = 256  # threads of a block: one per pixel of a tile
-MOST_THREADS = 1024
-SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
-SMALLEST_OF_TORCH = 2**16  # likewise, of rows for torch, which takes less time and more of the interpreter's lock
-WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
-
-_threads = CORES
-_helpers: list[threading.Thread] = []
-_jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-_seconds: dict[str, float] | None = None
-
-
-class _Job:
-    """Slices of one launch, or of other work, shared by the threads: whoever is free takes the next one.
-
-    A launch takes tenths of a millisecond, so what a thread costs counts. The caller waits for helpers that are at
-    work, but not for those that have not woken yet. Tried:
-
-    - 0.1 ms more per launch, 2 ms a step: an executor's futures
-    - no difference: arguments packed once for all slices
-    """
-
-    def __init__(self, slices: list[Callable[[], None]]):
-        self.slices = slices[::-1]
-        self.lock, self.idle = threading.Lock(), threading.Event()
-        self.idle.set()
-        self.helping = 0
-        self.error: BaseException | None = None
-
-    def share(self, helpers: int) -> None:
-        """The caller's part: call ``helpers``, run slices until there are no more, wait for those that are at work.
-
-        An error or Ctrl-C is raised only then: nobody may still write into tensors that the caller is about to free.
-        """
-        error = None
-        while True:
-            try:
-                for _ in range(helpers):
-                    _jobs.put(self)
-                self._run_slices()
-                self.idle.wait()
-                break
-            except BaseException as raised:  # Ctrl-C comes at any of these lines, mostly while waiting
-                error, helpers = raised, 0
-                self.slices.clear()
-        if error or self.error:
-            try:
-                raise error or self.error
-            finally:  # or its traceback, which knows this frame, would keep the callers' tensors in a cycle
-                error = self.error = None
-
-    def _run_slices(self) -> None:
-        while True:
-            try:
-                run = self.slices.pop()  # one step, hence safe without the lock
-            except IndexError:
-                return
-            run()
-
-    def help(self) -> None:
-        """A helper's part."""
-        with self.lock:
-            if not self.slices:
-                return
-            self.helping += 1
-            self.idle.clear()
-        try:
-            self._run_slices()
-        except BaseException as error:
-            self.error = error
-        finally:
-            with self.lock:
-                self.helping -= 1
-                if not self.helping:
-                    self.idle.set()
-
-
-@torch.no_grad()
-def _help() -> None:
-    """What a helper thread does: job after job."""
-    while (job := _jobs.get()) is not None:
-        job.help()
-
-
-@atexit.register
-def _end_helpers() -> None:
-    """Before the interpreter ends: a thread that wakes in its last moments aborts the process."""
-    for _ in _helpers:
-        _jobs.put(None)
-    for helper in _helpers:
-        helper.join(1.0)
-
-
-def _forget_helpers() -> None:
-    """A forked child inherits the list but not the threads."""
-    global _jobs
-    _helpers.clear()
-    _jobs = queue.SimpleQueue()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_helpers)
-
-
-def get_threads() -> int:
-    """Number of threads that work on the CPU may use."""
-    return _threads
-
-
-def set_threads(count: int) -> None:
-    """Use ``count`` threads (1 to 1024) on the CPU. Results do not depend on it.
-
-    Raises:
-        InputError: if ``count`` is not a whole number, or out of that range.
-    """
-    global _threads
-    if isinstance(count, bool) or not isinstance(count, Integral) or not 1 <= count <= MOST_THREADS:
-        raise InputError(f"threads: expected a whole number, 1 to {MOST_THREADS}, got {count!r}.")
-    _threads = int(count)
 
 
 def prepare(device: str, threads: int) -> torch.device:
@@ -199,22 +70,6 @@ def available_memory(device: torch.device) -> int:
         return psutil.virtual_memory().available
     reserve = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return torch.cuda.mem_get_info(device)[0] + reserve
-
-
-def even_slices(dim: int, smallest: int = SMALLEST_SLICE) -> list[int]:
-    """Bounds of one slice per thread of ``dim`` equal pieces of work, none much below ``smallest``."""
-    parts = max(1, min(_threads, dim // smallest))
-    return [dim * part // parts for part in range(parts + 1)]
-
-
-def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
-    """:func:`even_slices` of work that torch does; a single one where it has threads of its own, or works on a GPU.
-
-    In multiples of WIDTH: what is left over at the end of a slice, torch may round in another way.
-    """
-    if torch.get_num_threads() > 1 or torch.device(device).type == "cuda":
-        return [0, dim]
-    return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_OF_TORCH // WIDTH)]
 
 
 def launch(
@@ -285,28 +140,6 @@ def lanes_of(dtype: type, *tensors: torch.Tensor) -> list:
     return [view(tensor.view(-1, size) if size > 1 else tensor.view(-1), dtype) for tensor in tensors]
 
 
-def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callable[[], None] | None = None) -> None:
-    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU, and ``beside`` first.
-
-    Slices must write different elements. Helpers record no gradients.
-    """
-    if torch.is_inference_mode_enabled():  # which is each thread's own
-        run = torch.inference_mode()(run)
-    # each with its function: a helper that sleeps or comes late knows its job, which must not keep tensors alive
-    slices = [partial(run, low, high) for low, high in itertools.pairwise(bounds) if high > low]
-    if beside:
-        slices.insert(0, beside)
-    helpers = min(_threads, len(slices)) - 1
-    if helpers <= 0:
-        for call in slices:
-            call()
-        return
-    while len(_helpers) < helpers:
-        _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
-        _helpers[-1].start()
-    _Job(slices).share(helpers)
-
-
 def load(kernel: wp.Kernel, device: torch.device) -> None:
     """Compile and load ``kernel``, and what else is in its module."""
     wp.load_module(kernel.module, device=wp.device_from_torch(device))
@@ -364,36 +197,3 @@ def empty(count: int, dtype, device: torch.device | str) -> wp.array:
     )
     array._tensor = memory  # pyright: ignore[reportAttributeAccessIssue] - as wp.from_torch does
     return array
-
-
-@contextmanager
-def stage(name: str) -> Iterator[None]:
-    """Name the block for whoever reads its errors; add its time to stage ``name``, if :func:`profile` is on."""
-    start, table = _now(), _seconds
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:  # of what ran out of memory, one wants to know where
-        error.add_note(f"in stage '{name}'")
-        raise
-    finally:
-        if table is not None:
-            table[name] += _now() - start
-
-
-def _now() -> float:
-    """Seconds on the clock of :func:`profile`; while that is on, once the GPU has done what it was given."""
-    if _seconds is not None and torch.cuda.is_initialized():
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
-@contextmanager
-def profile(active: bool = True) -> Iterator[dict[str, float]]:
-    """Collect the seconds spent in each :func:`stage` while the block runs (unless not ``active``)."""
-    global _seconds
-    before, collected = _seconds, defaultdict(float)
-    _seconds = collected if active else None
-    try:
-        yield collected
-    finally:
-        _seconds = before

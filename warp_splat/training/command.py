@@ -16,7 +16,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import Checkpoint, load_checkpoint
 from warp_splat.formats.png import save_png
-from warp_splat.runtime import launch
+from warp_splat.runtime import pool, timers
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
@@ -81,7 +81,7 @@ def _tell(trainer: Trainer, run: Run, say: Say) -> None:
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
     say(
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
-        f"{len(scene.points)} points; {together}{launch.get_threads()} threads; output in {run.folder}"
+        f"{len(scene.points)} points; {together}{pool.get_threads()} threads; output in {run.folder}"
     )
     for sentence in trainer.told:
         say(sentence)
@@ -180,7 +180,7 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
     often = {"mininterval": pause, "maxinterval": pause, "miniters": 0}
     bar = tqdm(total=end, initial=run.iteration, disable=report.quiet, unit="it", **often)
     trainer.check_identical(run.iteration)
-    with bar, launch.profile(report.profile > 0) as stages:
+    with bar, timers.profile(report.profile > 0) as stages:
         for iteration in range(run.iteration + processes.count, end + 1, processes.count):
             if processes.reaches(iteration, [profiled + 1]):
                 stages.clear()
@@ -220,7 +220,7 @@ def _keeping_is_due(report: ReportOptions, run: Run) -> bool:
     return 0 < 60 * report.checkpoint_interval <= time.perf_counter() - run.kept_at
 
 
-@launch.profile(False)
+@timers.profile(False)
 def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
     trainer.check_identical(run.iteration)

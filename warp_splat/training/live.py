@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from tqdm import tqdm
 
-from warp_splat.runtime import launch
+from warp_splat.runtime import timers
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.training.record import Run
 from warp_splat.training.trainer import Trainer
@@ -41,7 +41,7 @@ class TrainingViewer:
         self._button.label = "Continue" if self.paused else "Pause"
         self.viewer.wake()
 
-    @launch.profile(False)
+    @timers.profile(False)
     def between_steps(self, interrupted: list[int]) -> None:
         """Draw what is due; return when training may go on, or must end."""
         if not self.viewer.watchers and not self.paused:
@@ -62,7 +62,7 @@ class TrainingViewer:
             if not drawn:
                 self.viewer.wait(IDLE)
 
-    @launch.profile(False)
+    @timers.profile(False)
     def show_end(self) -> None:
         """Show the model as it was saved, once to everybody; evaluating it takes a while."""
         self._button.disabled = True
@@ -72,7 +72,7 @@ class TrainingViewer:
         for _ in list(self.viewer.watchers):
             self.viewer.draw()
 
-    @launch.profile(False)
+    @timers.profile(False)
     def linger(self) -> None:
         """After the training, stay until the last browser has left, or Ctrl-C."""
         if self.viewer.deserted:

@@ -16,7 +16,9 @@ from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.raster.drivers import DRIVERS, driver_of
-from warp_splat.runtime.launch import even_slices, launch, pack_struct, stage, view
+from warp_splat.runtime.launch import launch, pack_struct, view
+from warp_splat.runtime.pool import even_slices
+from warp_splat.runtime.timers import stage
 
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
 FAR_APART = 10.0  # in units of an image's usual range

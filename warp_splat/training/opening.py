@@ -16,7 +16,7 @@ from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, rem
 from warp_splat.formats.ply import save_points
 from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
-from warp_splat.runtime import launch
+from warp_splat.runtime import launch, pool
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
@@ -41,7 +41,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     """
     data, machine, iterations = config.data, config.machine, config.learn.iterations
     quiet = config.report.quiet or processes.rank > 0
-    threads = machine.threads or max(1, launch.get_threads() // processes.local_count)
+    threads = machine.threads or max(1, pool.get_threads() // processes.local_count)
     choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
     if config.report.tensorboard:
         writer_class()

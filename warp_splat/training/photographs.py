@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional
 
 from warp_splat.camera import Camera
-from warp_splat.runtime.launch import stage
+from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import View
 from warp_splat.training.options import TrainConfig
 

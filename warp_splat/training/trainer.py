@@ -21,7 +21,8 @@ from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
-from warp_splat.runtime.launch import load, stage
+from warp_splat.runtime.launch import load
+from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.loss import image_loss
