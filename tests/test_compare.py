@@ -106,11 +106,15 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
         "stepwise",
         "generated",
         "plain",
+        "tape",
         "cap 128",
         "central differences",
     }
     by_name = {(row["scene"], row["variant"], row["parameter"]): row for row in rows}
     assert by_name["degree1", "stepwise", "means"]["relative_error"] < 2e-4
+    for parameter in ("means", "sh", "background"):
+        errors = {name: by_name["degree1", name, parameter]["relative_error"] for name in ("manual", "tape")}
+        assert errors["tape"] == errors["manual"], parameter
     assert by_name["degree1", "stepwise", "means"]["cosine"] == pytest.approx(1, abs=1e-6)
     assert by_name["degree1", "central differences", "opacities"]["relative_error"] < 0.05
     assert by_name["degree1", "central differences", "opacities"]["note"].endswith("extrapolated")

@@ -13,7 +13,7 @@ LAYERS = [
     {"kernels", "runtime", "camera", "color"},
     {"raster"},
     {"formats"},
-    {"scene", "evaluation", "gaussians"},
+    {"scene", "evaluation", "gaussians", "tape"},
     {"rendering", "sfm", "viewer"},
     {"training"},
     {"compare", "inspect", "export_html"},

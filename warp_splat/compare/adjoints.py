@@ -3,7 +3,7 @@
 All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
 instance (:mod:`warp_splat.raster.cpu` says where they differ). Beside the modes of ``rasterize`` stand
 ``generated`` (``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong),
-the thesis's loop cap, and central differences.
+``tape`` (``manual`` between Warp's arrays, with what that adds), the thesis's loop cap, and central differences.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warp_splat.compare.on_tape import differentiate_on_tape, gradients_on_tape
 from warp_splat.compare.trained import CAPS
 from warp_splat.compare.truth import Error, Truth, compute_truth, errors_of, gradients_of
 from warp_splat.compare.workloads import Workload
@@ -29,6 +30,7 @@ ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
 REPEATS = 5
 BUDGET = 12.0  # s for the repeats of a workload; slow ones get fewer
 DIFFERENCES = 12  # parameters at which central differences are computed
+TAPE = "tape"  # variant on Warp's tape
 STEP = 3e-3  # of central differences, relative to the opacity or what is left to 1
 
 
@@ -54,8 +56,8 @@ class Measurement:
     gaussians: int
     errors: dict[str, Error] = field(default_factory=dict)  # by parameter
     image_error: float | None = None  # largest
-    forward: list[float] = field(default_factory=list)  # s, of the pixel loop
-    backward: list[float] = field(default_factory=list)  # s, of its adjoint
+    forward: list[float] = field(default_factory=list)  # s, of the pixel loop, and of what a tape adds
+    backward: list[float] = field(default_factory=list)  # s, of their adjoints
     stages: dict[str, float] = field(default_factory=dict)  # s of all stages of rendering and differentiating
     memory: int | None = None  # bytes at the peak of a forward and backward pass, by torch's allocator
     note: str = ""
@@ -73,6 +75,7 @@ def variants_of(modes: Sequence[str], device: torch.device) -> list[Variant]:
     """The modes asked for and what only the comparison has, as far as ``device`` has it."""
     of_the_cpu = ON_CPU if device.type == "cpu" else ()
     found = [Variant(mode, mode) for mode in dict.fromkeys(("manual", *modes, *of_the_cpu))]
+    found.append(Variant(TAPE, "manual"))
     return found + [Variant(f"cap {cap}", "manual", {"max_steps": cap}) for cap in CAPS]
 
 
@@ -96,7 +99,10 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     result = Measurement(workload.name, variant.name, len(workload.gaussians.means))
     options = variant.options(workload)
     try:
-        image, gradients = gradients_of(workload, truth, variant.adjoint, options)
+        if variant.name == TAPE:
+            image, gradients = gradients_on_tape(workload, truth)
+        else:
+            image, gradients = gradients_of(workload, truth, variant.adjoint, options)
     except InputError as error:  # stored refuses what does not fit
         result.extrapolated = True
         result.note = str(error)
@@ -104,7 +110,8 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     result.errors = errors_of(gradients, truth)
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
-    result.memory = peak_of(lambda: _differentiate(workload, variant), workload.device)
+    if variant.name != TAPE:  # whose arrays are Warp's
+        result.memory = peak_of(lambda: _differentiate(workload, variant), workload.device)
     return result
 
 
@@ -121,13 +128,16 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
         rounds += 1
     for variant, result in runnable.items():
         measured = stages_of[variant]
-        result.forward = [stages["blend"] for stages in measured]
-        result.backward = [stages["adjoint of blend"] for stages in measured]
+        result.forward = [stages["blend"] + stages.get("tape", 0.0) for stages in measured]
+        result.backward = [stages["adjoint of blend"] + stages.get("adjoint of tape", 0.0) for stages in measured]
         result.stages = {name: float(np.median([stages[name] for stages in measured])) for name in measured[0]}
 
 
 def _differentiate(workload: Workload, variant: Variant) -> None:
     """A forward and a backward pass over the whole image."""
+    if variant.name == TAPE:
+        differentiate_on_tape(workload)
+        return
     leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
     out = render(leaves, workload.camera, workload.background, variant.options(workload), variant.adjoint)
     out.image.backward(torch.ones_like(out.image))

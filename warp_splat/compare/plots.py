@@ -22,6 +22,7 @@ STYLES = {
     "stored": ("#CC79A7", "D"),
     "generated": ("#E69F00", "v"),
     "plain": (report.INK, "x"),
+    "tape": (report.INK, "+"),
     "cap 2048": ("#56B4E9", "1"),
     "cap 512": ("#56B4E9", "2"),
     "cap 128": ("#56B4E9", "3"),

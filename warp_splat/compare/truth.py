@@ -78,8 +78,8 @@ def gradients_of(
 
 
 def errors_of(found: dict[str, torch.Tensor], truth: Truth) -> dict[str, Error]:
-    """The error of each parameter's gradient."""
-    return {name: error_of(found[name], exact) for name, exact in truth.gradients.items()}
+    """The error of each gradient that was found."""
+    return {name: error_of(found[name], exact) for name, exact in truth.gradients.items() if name in found}
 
 
 def error_of(found: torch.Tensor, exact: torch.Tensor) -> Error:

@@ -5,6 +5,8 @@ the first index of its slice, so that the threads of :mod:`.pool` can share a la
 from one index only, so the result does not depend on the slices, bit for bit. On a GPU a launch is one slice, on
 torch's current stream: kernels of Warp and of torch follow each other in the order of the calls.
 
+No launch is recorded: tapes are the process's, and a user's would try to differentiate the package's own kernels.
+
 All memory is torch's, on either device: its caching allocator gives what a stage frees to the next.
 """
 
@@ -104,11 +106,11 @@ def launch(
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
     if on_gpu:
-        wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, stream=_stream(device), **adjoint)
+        wp.launch(kernel, dim, [0, *inputs], outputs, stream=_stream(device), record_tape=False, **adjoint)
         return
 
     def run(low: int, high: int) -> None:
-        wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, device="cpu", **adjoint)
+        wp.launch(kernel, high - low, [low, *inputs], outputs, device="cpu", record_tape=False, **adjoint)
 
     if len(bounds) > 2:
         wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
@@ -159,7 +161,8 @@ def launch_blocks(
     where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
     if adjoint:
         where["adjoint"] = True
-    wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, block_dim=BLOCK, **where, **adjoint)
+    where |= {"block_dim": BLOCK, "record_tape": False}
+    wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **where, **adjoint)
 
 
 def _stream(device: torch.device | str) -> wp.Stream:

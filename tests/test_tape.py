@@ -1,0 +1,209 @@
+"""The renderer on Warp's tape: the bits of torch, between kernels of the user's own, and nothing else recorded."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scenes import SCENES, cloud, make_camera
+
+import warp_splat
+from warp_splat import CameraParameters, InputError, RasterOptions, set_threads, tape
+from warp_splat.config import ADJOINTS
+from warp_splat.raster.drivers import CUDA, using
+
+PAGE = Path(__file__).parents[1] / "docs" / "tape.md"
+KINDS = {"means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": wp.float32, "sh": wp.vec3}
+TWIST = [0.01, -0.02, 0.015, 0.05, -0.03, 0.02]
+
+
+@wp.kernel
+def twice(x: wp.array[wp.vec3], y: wp.array[wp.vec3]):
+    y[wp.tid()] = 2.0 * x[wp.tid()]
+
+
+@wp.kernel
+def weigh(image: wp.array2d[wp.vec3], alpha: wp.array2d[float], weights: wp.array2d[wp.vec4], loss: wp.array[float]):
+    y, x = wp.tid()
+    w = weights[y, x]
+    lit = wp.dot(image[y, x], wp.vec3(w[0], w[1], w[2]))
+    wp.atomic_add(loss, 0, lit + alpha[y, x] * w[3])
+
+
+def scene_of(device, name="degree1"):
+    """A scene, numbers of its camera, and what the loss weighs its pixels with."""
+    scene = SCENES[name]().to(device)
+    camera = scene.camera
+    weights = torch.randn(camera.height, camera.width, 4, generator=torch.Generator().manual_seed(0)).to(device)
+    return scene, [camera.fx, camera.fy, camera.cx, camera.cy], weights
+
+
+def by_torch(device, mode="manual", options=None):
+    """Gradients of halved means, of the others, of background and camera."""
+    scene, intrinsics, weights = scene_of(device)
+    leaves = [tensor.clone().requires_grad_() for tensor in (scene.means / 2, *scene.parameters()[1:])]
+    background = scene.background.clone().requires_grad_()
+    learned = [torch.tensor(values, dtype=torch.float64, requires_grad=True) for values in (TWIST, intrinsics)]
+    camera = CameraParameters(scene.camera, *learned)
+    out = warp_splat.rasterize(2.0 * leaves[0], *leaves[1:], camera, background, mode, options)
+    torch.autograd.backward([out.image, out.alpha], [weights[..., :3].contiguous(), weights[..., 3].contiguous()])
+    return out, [leaf.grad for leaf in (*leaves, background, *learned)]
+
+
+def on_tape(device, mode="manual", options=None, requires_grad=True):
+    """The tape, its loss, and the arrays of :func:`by_torch`."""
+    scene, intrinsics, weights = scene_of(device)
+    given = {name: getattr(scene, name) for name in KINDS} | {"means": scene.means / 2}
+    arrays = [wp.from_torch(given[name].clone(), KINDS[name], requires_grad=requires_grad) for name in KINDS]
+    arrays.append(wp.from_torch(scene.background.clone(), requires_grad=requires_grad))
+    arrays += [wp.array(values, dtype=wp.float64, requires_grad=requires_grad) for values in (TWIST, intrinsics)]
+    loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
+    with wp.Tape() as recorded:
+        means = wp.empty_like(arrays[0], requires_grad=True)
+        wp.launch(twice, len(means), [arrays[0], means], device=device)
+        out = tape.rasterize(
+            means, *arrays[1:5], scene.camera, arrays[5], mode, options, twist=arrays[6], intrinsics=arrays[7]
+        )
+        weights = wp.from_torch(weights, wp.vec4)
+        wp.launch(weigh, out.image.shape, [out.image, out.alpha, weights, loss], device=device)
+    assert len(recorded.launches) == 3
+    return recorded, loss, arrays, out
+
+
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_the_bits_are_those_of_torch(mode, device):
+    options = RasterOptions(depth=True, antialiasing=True)
+    expected, gradients = by_torch(device, mode, options)
+    recorded, loss, arrays, out = on_tape(device, mode, options)
+    assert torch.equal(wp.to_torch(out.image), expected.image) and torch.equal(wp.to_torch(out.alpha), expected.alpha)
+    assert torch.equal(wp.to_torch(out.depth), expected.depth) and torch.equal(wp.to_torch(out.radii), expected.radii)
+    recorded.backward(loss)
+    assert all(torch.equal(wp.to_torch(array.grad), grad) for array, grad in zip(arrays, gradients, strict=True))
+
+
+def test_cuda_kernels_give_the_bits_of_torch_as_well():
+    with using(CUDA):
+        _, gradients = by_torch("cpu")
+        recorded, loss, arrays, _ = on_tape("cpu")
+        recorded.backward(loss)
+    assert all(torch.equal(wp.to_torch(array.grad), grad) for array, grad in zip(arrays, gradients, strict=True))
+
+
+def test_two_ways_back_add_up_unless_the_tape_is_zeroed(device):
+    recorded, loss, arrays, out = on_tape(device)
+    recorded.backward(loss)
+    once = [array.grad.numpy().copy() for array in arrays]
+    assert not out.image.grad.numpy().any(), "read and zeroed, as Warp's kernels do"
+    recorded.zero()
+    assert not any(array.grad.numpy().any() for array in arrays)
+    recorded.backward(loss)
+    assert all(np.array_equal(array.grad.numpy(), grad) for array, grad in zip(arrays, once, strict=True))
+    recorded.backward(loss)
+    assert all(np.array_equal(array.grad.numpy(), 2 * grad) for array, grad in zip(arrays, once, strict=True))
+
+
+def test_gradients_of_the_pixels_are_kept_where_that_is_asked_for(device):
+    recorded, loss, _, out = on_tape(device)
+    out.image.retain_grad = True
+    recorded.backward(loss)
+    assert out.image.grad.numpy().any() and not out.alpha.grad.numpy().any()
+
+
+@pytest.mark.parametrize("wanted", range(5))
+def test_arrays_that_want_no_gradient(wanted, device):
+    scene, _, _ = scene_of(device)
+    arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]
+    arrays[wanted].requires_grad = True
+    with wp.Tape() as recorded:
+        out = tape.rasterize(*arrays, scene.camera)
+    recorded.backward(grads={out.image: wp.full_like(out.image, wp.vec3(1.0))})
+    assert [array.grad is not None and bool(array.grad.numpy().any()) for array in arrays] == [
+        index == wanted for index in range(5)
+    ]
+
+
+def test_without_gradients_or_a_tape_nothing_is_recorded(device):
+    scene, _, _ = scene_of(device)
+    arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]
+    with wp.Tape() as recorded:
+        still = tape.rasterize(*arrays, scene.camera)
+    arrays[0].requires_grad = True
+    out = tape.rasterize(*arrays, scene.camera)
+    assert not recorded.launches and out.image.grad is None
+    assert np.array_equal(out.image.numpy(), still.image.numpy())
+
+
+def test_warps_quaternions_have_w_last(device):
+    scene, _, _ = scene_of(device)
+    gradients = []
+    for turn, kind in ((0, wp.vec4), (-1, wp.quat)):
+        quats = wp.from_torch(scene.quats.roll(turn, 1), kind, requires_grad=True)
+        others = [wp.from_torch(getattr(scene, name), KINDS[name]) for name in ("means", "scales", "opacities", "sh")]
+        with wp.Tape() as recorded:
+            out = tape.rasterize(others[0], quats, *others[1:], scene.camera)
+        recorded.backward(grads={out.image: wp.full_like(out.image, wp.vec3(1.0))})
+        gradients.append(wp.to_torch(quats.grad).roll(-turn, 1))
+    assert gradients[0].any() and torch.equal(*gradients)
+
+
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mode, device, capfd):
+    """Whatever threads take part: 6,000 Gaussians are enough to share every launch."""
+    scene = cloud(3, 6000, make_camera(200, 150), degree=1).to(device)
+    leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
+    set_threads(3)
+    try:
+        with wp.Tape() as recorded:
+            out = warp_splat.rasterize(*leaves, scene.camera, adjoint=mode)
+            out.image.sum().backward()
+    finally:
+        set_threads(2)
+    assert not recorded.launches and leaves[0].grad.any()
+    recorded.backward()
+    assert "Warp" not in "".join(capfd.readouterr()).replace("Warp CUDA warning", "")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "found"),
+    [
+        ("means", wp.to_torch, "expected a Warp array, got Tensor; warp_splat.rasterize takes"),
+        ("means", lambda a: wp.array(a.numpy(), dtype=wp.vec3d), "expected an array of float32, got one of vec3d"),
+        ("quats", lambda a: a[:3], r"quats: expected shape \[120, 4\], got \[3, 4\]"),
+        ("quats", lambda a: wp.array(a.numpy()[:, :3], dtype=wp.vec3), r"quats: .* got \[120, 3\]"),
+        ("sh", lambda a: (a, None), r"sh\[1\]: expected a Warp array, got NoneType"),
+        ("twist", lambda _: wp.zeros(5, dtype=float), "twist: expected a tensor of 6 real numbers"),
+        ("twist", lambda _: wp.zeros(6, dtype=int), "twist: expected an array of float32 or float64, got one of int"),
+    ],
+)
+def test_bad_input(name, change, found):
+    scene, _, _ = scene_of("cpu")
+    arrays = {key: wp.from_torch(getattr(scene, key), kind) for key, kind in KINDS.items()}
+    with pytest.raises(InputError, match=found):
+        tape.rasterize(**arrays | {name: change(arrays.get(name))}, camera=scene.camera)
+
+
+def test_no_gaussian_at_all(device):
+    scene = SCENES["empty"]().to(device)
+    arrays = [wp.zeros(getattr(scene, name).shape[:2], dtype=KINDS[name], device=device) for name in ("sh",)]
+    arrays = [wp.zeros(0, dtype=KINDS[name], device=device, requires_grad=True) for name in list(KINDS)[:4]] + arrays
+    with wp.Tape() as recorded:
+        out = tape.rasterize(*arrays, scene.camera)
+    recorded.backward(grads={out.image: wp.full_like(out.image, wp.vec3(1.0))})
+    assert not out.image.numpy().any()
+
+
+def test_a_body_in_flight_is_fitted_to_pictures(tmp_path, monkeypatch):
+    """The page's example: two kernels, the renderer and a third kernel, eighty times on a tape."""
+    monkeypatch.syspath_prepend(tmp_path)
+    names = {}
+    for text in re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL):
+        if file := re.match(r"# (\w+\.py)\n", text):
+            (tmp_path / file[1]).write_text(text)
+        else:
+            exec(text, names)
+    sys.modules.pop("flight")
+    assert np.allclose(names["throw"].numpy(), names["THROW"], atol=2e-3)
+    assert np.allclose(names["spin"].numpy(), names["SPIN"], atol=2e-3)

@@ -1,0 +1,167 @@
+"""The renderer between Warp kernels of yours, on one tape: arrays in, arrays out, and no torch to write.
+
+Warp could not derive the loop over a tile's list (docs/adjoints.md). So the launches inside record nothing, and the
+renderer stands on the tape as one function with its own adjoint, whichever of the four is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.raster import api
+from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.data import Dropped
+from warp_splat.runtime.launch import stage
+
+
+@dataclass
+class TapeOutput:
+    """What :func:`rasterize` returns; H x W pixels, N Gaussians. Where an input has a gradient, pixels have one."""
+
+    image: wp.array  # [H, W] vec3
+    alpha: wp.array  # [H, W] float, 1 - transmittance
+    depth: wp.array | None  # [H, W] float, world units, expected z (0 where alpha is 0), if asked for
+    radii: wp.array  # [N] int, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
+    invalid: int  # Gaussians left out because a quaternion was zero
+    dropped: Dropped  # what the adjoint refused to spread
+
+
+def rasterize(
+    means: wp.array,
+    quats: wp.array,
+    scales: wp.array,
+    opacities: wp.array,
+    sh: wp.array | tuple[wp.array, wp.array],
+    camera: Camera,
+    background: wp.array | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    adjoint: str = "manual",
+    options: RasterOptions | None = None,
+    twist: wp.array | None = None,
+    intrinsics: wp.array | None = None,
+) -> TapeOutput:
+    """:func:`warp_splat.rasterize` of Warp's arrays; inside ``with wp.Tape()`` it is recorded, with its adjoint.
+
+    ``tape.backward`` adds to ``.grad`` of every array with ``requires_grad``, the bits that torch would get. Like a
+    kernel's own adjoint, it reads the values as they then are, and zeroes the gradients of the pixels that it has read.
+    What the adjoint needs is kept as long as the tape.
+
+    Args:
+        means: centers, [N] vec3 or [N, 3], float32 as all but the last two.
+        quats: rotations, [N] quat (Warp's order, w last), or [N] vec4 or [N, 4] (w first).
+        scales: standard deviations along the axes, [N] vec3 or [N, 3].
+        opacities: [N].
+        sh: [N, K] vec3 or [N, K, 3]; or the pair of [N, 1] and [N, K-1].
+        camera: where ``twist`` and ``intrinsics`` start.
+        background: RGB; an array of 3 numbers may want a gradient.
+        adjoint: "manual", "stepwise", "reversible" or "stored".
+        options: what to compute.
+        twist: see :class:`warp_splat.CameraParameters`, 6 numbers, float32 or float64.
+        intrinsics: likewise, fx, fy, cx, cy.
+
+    Returns:
+        A :class:`TapeOutput`.
+
+    Raises:
+        InputError: as :func:`warp_splat.rasterize` does, and if an argument is no Warp array.
+    """
+    given: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    pair = isinstance(sh, (tuple, list)) and len(sh) == 2
+    given |= {"sh[0]": sh[0], "sh[1]": sh[1]} if pair else {"sh": sh}
+    given |= {"background": background} if isinstance(background, wp.array) else {}
+    given |= {name: array for name, array in (("twist", twist), ("intrinsics", intrinsics)) if array is not None}
+    named = {name: _checked(name, array) for name, array in given.items()}
+    tape = wp._src.context.runtime.tape  # pyright: ignore[reportAttributeAccessIssue] - the only way to ask for it
+    recorded = tape is not None and any(array.requires_grad for array in named.values())
+    with _torch_on(means.device, recorded):
+        with stage("tape"):
+            leaves = {name: wp.to_torch(array, requires_grad=False) for name, array in named.items()}
+            for name, leaf in leaves.items():
+                leaf.requires_grad_(recorded and named[name].requires_grad)
+        found = _render(leaves, named, camera, background, adjoint, options)
+        shown = {"image": found.image, "alpha": found.alpha} | ({} if found.depth is None else {"depth": found.depth})
+        with stage("tape"):
+            pixels = {name: _array(tensor, recorded) for name, tensor in shown.items()}
+            if recorded:
+                wanted = [name for name in named if named[name].requires_grad]
+                inputs, outputs = [named[name] for name in wanted], list(pixels.values())
+                backward = _adjoint(inputs, [leaves[name] for name in wanted], outputs, list(shown.values()))
+                tape.record_func(backward, [array for array in (*inputs, *outputs) if array.size])
+    radii = wp.from_torch(found.radii)
+    return TapeOutput(
+        pixels["image"], pixels["alpha"], pixels.get("depth"), radii, invalid=found.invalid, dropped=found.dropped
+    )
+
+
+def _checked(name: str, array: Any) -> wp.array:
+    """``array``. Raises InputError if it is none of Warp's of real numbers; shapes are checked later."""
+    kinds = (wp.float32, wp.float64) if name in ("twist", "intrinsics") else (wp.float32,)
+    if not isinstance(array, wp.array):
+        raise InputError(
+            f"{name}: expected a Warp array, got {type(array).__name__}; warp_splat.rasterize takes torch tensors."
+        )
+    scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+    if scalar not in kinds:
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise InputError(f"{name}: expected an array of {wanted}, got one of {array.dtype.__name__}.")
+    return array
+
+
+def _render(leaves: dict[str, torch.Tensor], named: dict[str, wp.array], camera, background, adjoint, options):
+    """:func:`warp_splat.rasterize` of the tensors behind the arrays."""
+    quats = leaves["quats"]
+    if issubclass(named["quats"].dtype, wp.quatf):
+        quats = quats.roll(1, 1)  # w first
+    sh = leaves["sh"] if "sh" in leaves else (leaves["sh[0]"], leaves["sh[1]"])
+    if "background" in leaves:
+        background = leaves["background"].flatten()
+    learned = {name: leaves[name].flatten() for name in ("twist", "intrinsics") if name in leaves}
+    if learned:
+        camera = CameraParameters(camera, **learned)
+    return api.rasterize(
+        leaves["means"], quats, leaves["scales"], leaves["opacities"], sh, camera, background, adjoint, options
+    )
+
+
+def _adjoint(
+    inputs: list[wp.array], leaves: list[torch.Tensor], outputs: list[wp.array], shown: list[torch.Tensor]
+) -> Callable[[], None]:
+    """What the tape calls on its way back."""
+
+    def backward() -> None:
+        with _torch_on(inputs[0].device, True):
+            upstream = [wp.to_torch(array.grad, requires_grad=False) for array in outputs]
+            grads = torch.autograd.grad(shown, leaves, upstream, retain_graph=True, allow_unused=True)
+            with stage("adjoint of tape"):
+                for array, grad in zip(outputs, upstream, strict=True):
+                    if not array.retain_grad:  # so do Warp's kernels with what they have read
+                        grad.zero_()
+                for array, grad in zip(inputs, grads, strict=True):
+                    if grad is not None:
+                        wp.to_torch(array.grad, requires_grad=False).add_(grad)
+
+    return backward
+
+
+def _array(tensor: torch.Tensor, requires_grad: bool) -> wp.array:
+    """An image of ``tensor``, [H, W, 3] or [H, W], in the same memory."""
+    return wp.from_torch(tensor.detach(), wp.vec3 if tensor.dim() == 3 else wp.float32, requires_grad=requires_grad)
+
+
+@contextmanager
+def _torch_on(device: wp.Device, differentiated: bool) -> Iterator[None]:
+    """Torch works where and when Warp's own kernels would, whatever the caller has set."""
+    with torch.inference_mode(False), torch.set_grad_enabled(differentiated):
+        if not device.is_cuda:
+            yield
+            return
+        with torch.cuda.stream(wp.stream_to_torch(device)):
+            yield
