@@ -44,6 +44,7 @@ def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
     launch.launch_blocks(add_index, 12, ["in"], ["out"], torch.device("cuda", 1))
     launch.launch(add_index, 0, ["in"], ["out"], device="cuda")
     launch.launch_blocks(add_index, 0, ["in"], ["out"], "cuda")
+    assert not any(options.pop("record_tape") for options in calls)
     whole, adjoint, blocks = calls
     assert whole == {"dim": 9000, "inputs": [0, "in"], "outputs": ["out"], "stream": "stream of cuda:1"}
     assert adjoint["adjoint"] and adjoint["adj_inputs"] == [None, "grad"] and adjoint["adj_outputs"] == ["up"]

@@ -26,6 +26,7 @@ SAME_MEANING = {
     "command",  # what runs a command, in the folder of each
     "blend",  # its kernels, its drivers, its torch function
     "project",  # likewise
+    "rasterize",  # of torch, on a tape
 }
 
 

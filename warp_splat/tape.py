@@ -20,7 +20,7 @@ from warp_splat.errors import InputError
 from warp_splat.raster import api
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped
-from warp_splat.runtime.launch import stage
+from warp_splat.runtime.timers import stage
 
 
 @dataclass

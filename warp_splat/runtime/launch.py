@@ -106,11 +106,13 @@ def launch(
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
     if on_gpu:
-        wp.launch(kernel, dim, [0, *inputs], outputs, stream=_stream(device), record_tape=False, **adjoint)
+        where = {"stream": _stream(device), "record_tape": False}
+        wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, **where, **adjoint)
         return
 
     def run(low: int, high: int) -> None:
-        wp.launch(kernel, high - low, [low, *inputs], outputs, device="cpu", record_tape=False, **adjoint)
+        where = {"device": "cpu", "record_tape": False}
+        wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, **where, **adjoint)
 
     if len(bounds) > 2:
         wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
