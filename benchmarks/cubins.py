@@ -49,7 +49,7 @@ def modules() -> dict[str, wp.Module]:
         "quarantine": quarantine.module,
         "adam": make_adam(1, True).module,
         "pack": tiles.make_pack().module,
-        "tiles": tiles.find_spans.module,
+        "tiles": tiles.list_tiles.module,
     }
     for depth in (False, True):
         suffix, variant = ", depth" if depth else "", BlendVariant(3 + depth)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from warp_splat import Camera, InputError, RasterOptions, set_threads
-from warp_splat.raster import api, bin, cpu
+from warp_splat.raster import api, bin, cpu, depth_order
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU, CUDA, using
@@ -114,7 +114,24 @@ def test_without_gaussians_or_instances_sums_are_zero():
         assert not torch.cat([grad.view(-1) for grad in CPU.gather(bins, torch.empty(0, 9))]).any()
 
 
-def test_the_number_of_threads_changes_nothing():
+def test_depths_are_sorted_in_bands(monkeypatch):
+    """Whatever their sign and size, ties by index; and the depths stay as they are."""
+    monkeypatch.setattr(depth_order, "SMALLEST_BAND", 1000)
+    random, threads = np.random.default_rng(0), get_threads()
+    depths = (random.choice([-1.0, 1.0], 7003) * 10.0 ** random.uniform(-30, 30, 7003)).astype(np.float32)
+    depths[random.integers(0, 7003, 3000)] = 2.5
+    before = depths.copy()
+    try:
+        for count in (1, 2, 5):
+            set_threads(count)
+            assert (depth_order.order_by_depth(depths) == np.argsort(depths, kind="stable")).all()
+            assert (depths == before).all()
+    finally:
+        set_threads(threads)
+
+
+def test_the_number_of_threads_changes_nothing(monkeypatch):
+    monkeypatch.setattr(depth_order, "SMALLEST_BAND", 1000)
     threads = get_threads()
     camera, projected = project(5000)
     try:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import torch
 import warp as wp
@@ -12,10 +10,13 @@ from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
+from warp_splat.kernels.cpu import lists
+from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D, falloff_of
+from warp_splat.raster.depth_order import begins_of, in_place, order_by_depth
 from warp_splat.runtime.launch import available_memory, empty, launch, view
-from warp_splat.runtime.pool import even_slices, get_threads, in_slices, torch_slices
+from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, get_threads, in_slices, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
@@ -30,33 +31,29 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions) 
         InputError: if the tile instances are more than the kernels can number, or than fit.
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    radii = splats2d.radii.numpy()
-    invalid = int(np.count_nonzero(radii < 0))
-    drawn = np.flatnonzero(radii > 0).astype(np.int32)
+    drawn, invalid = _drawn(splats2d.radii.numpy())
     count = len(drawn)
-    order, nearness = np.empty(count, dtype=np.int32), _taken(splats2d.depths.detach().numpy(), drawn)
     splats, rows = wp.empty(count, dtype=Splat2D, device="cpu"), np.empty(count, dtype=np.int32)
-    gaussians, square = _array(drawn), int(options.extent == "square")
+    gaussians, square = in_place(drawn), int(options.extent == "square")
     inputs = [gaussians, splats2d.view(), camera.height, options.alpha_min, square]
-    # one thread sorts while others pack
-    pack = tiles.make_pack(falloff_of(options).reach_of)
-    launch(pack, count, inputs, [splats, _array(rows)], beside=partial(order_by_depth, nearness, order))
-    by_depth = _taken(rows, order)
-    row_ends = np.cumsum(by_depth, dtype=np.int64)  # a 32-bit scan wraps without a word
+    launch(tiles.make_pack(falloff_of(options).reach_of), count, inputs, [splats, in_place(rows)])
+    order = order_by_depth(_taken(splats2d.depths.detach().numpy(), drawn))
+    row_ends, begins = _sums(_taken(rows, order))
     _check_count(_last(row_ends), camera, count, splats2d.radii.device)
-    begins = _put(row_ends - by_depth, order)
+    begins = _put(begins, order)
     spans, counts = wp.empty(_last(row_ends), dtype=wp.vec2i, device="cpu"), np.empty(count, dtype=np.int64)
-    inputs = [splats, _array(rows), _array(begins), camera.width, camera.height, tiles_x, square]
-    launch(tiles.find_spans, count, inputs, [spans, _array(counts)])
-    place_ends = np.cumsum(counts)
+    inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, square]
+    groups = -(-count // LANES)
+    bounds = even_slices(groups, SMALLEST_SLICE // LANES)
+    launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=bounds)
+    place_ends, begins = _sums(counts)
     _check_count(_last(place_ends), camera, count, splats2d.radii.device)
-    begins = (place_ends - counts).astype(np.int32)
     instances, places, ends = _sort_by_tile(
         order, _taken(begins, order), row_ends, spans, _last(place_ends), tiles_x * tiles_y
     )
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
-    lists = (instances, places, torch.from_numpy(begins), ranges)
-    return Bins(len(radii), gaussians, splats, *lists, balanced_slices(ends), tiles_x, invalid)
+    found = (instances, places, torch.from_numpy(begins), ranges)
+    return Bins(len(splats2d.radii), gaussians, splats, *found, balanced_slices(ends), tiles_x, invalid)
 
 
 def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> Bins:
@@ -111,32 +108,44 @@ def _sort_by_tile(
     bounds = np.array(even_slices(len(order)), dtype=np.int32)
     bands = len(bounds) - 1
     one_each = list(range(bands + 1))
-    rows = np.concatenate([[0], row_ends])[bounds].astype(np.int32)
-    counts = np.zeros((bands, tile_count), dtype=np.int32)
-    launch(tiles.count_tiles, bands, [_array(rows), spans], [_array(counts)], bounds=one_each)
-    ends = np.cumsum(counts.T.ravel(), dtype=np.int64).reshape(tile_count, bands)
+    rows = np.array([row_ends[bound - 1] if bound else 0 for bound in bounds], dtype=np.int32)
+    changes = np.zeros((bands, tile_count + 1), dtype=np.int32)
+    launch(lists.count_tiles, bands, [in_place(rows), spans], [in_place(changes)], bounds=one_each)
+    counts = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
     _check_longest(int(counts.sum(0).max(initial=0)))
-    cursor = np.ascontiguousarray((ends - counts.T).T, dtype=np.int32)
+    cursor, ends = begins_of(counts), np.cumsum(counts.sum(0, dtype=np.int64))
     instances, places = (torch.empty(count, dtype=torch.int32, device="cpu") for _ in range(2))
-    inputs = [_array(bounds), _array(order), _array(begins), _array(row_ends), spans]
-    outputs = [_array(cursor), view(instances, wp.int32), view(places, wp.int32)]
-    launch(tiles.scatter, bands, inputs, outputs, bounds=one_each)
-    return instances, places, ends[:, -1]
+    inputs = [in_place(bounds), in_place(order), in_place(begins), in_place(row_ends), spans]
+    outputs = [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)]
+    launch(lists.scatter, bands, inputs, outputs, bounds=one_each)
+    return instances, places, ends
 
 
-def order_by_depth(depths: np.ndarray, order: np.ndarray) -> None:
-    """Write the indices of ``depths`` [V] from the least to the largest, ties by index, into ``order`` [V] int32.
+def _drawn(radii: np.ndarray) -> tuple[np.ndarray, int]:
+    """The Gaussians whose ``radii`` are positive, ascending, and how many have negative ones."""
+    parts, invalid = {}, []
 
-    Tried: only the bits in which the depths differ, 25 of 32, or digits of 9 or 11 bits: no faster.
-    """
-    count = len(depths)
-    keys = np.empty(2 * count, dtype=np.float32)  # the sort works in twice the space
-    values = np.empty(2 * count, dtype=np.int32)
-    keys[:count] = depths
-    values[:count] = np.arange(count)
-    if count:
-        wp.utils.radix_sort_pairs(wp.array(keys, dtype=float, copy=False, device="cpu"), _array(values), count)
-    order[:] = values[:count]
+    def run(low: int, high: int) -> None:
+        parts[low] = np.flatnonzero(radii[low:high] > 0).astype(np.int32) + np.int32(low)
+        invalid.append(np.count_nonzero(radii[low:high] < 0))
+
+    in_slices(run, torch_slices(len(radii)))
+    return np.concatenate([np.empty(0, np.int32), *(parts[low] for low in sorted(parts))]), int(sum(invalid))
+
+
+def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where each of the counted ends, in 64 bits, because 32 wrap without a word, and begins, in 32."""
+    bounds = torch_slices(len(counts))
+    ends, begins = np.empty(len(counts), dtype=np.int64), np.empty(len(counts), dtype=np.int32)
+    in_slices(lambda low, high: np.cumsum(counts[low:high], out=ends[low:high]), bounds)
+    before = dict(zip(bounds[1:-1], np.cumsum([ends[bound - 1] for bound in bounds[1:-1]]), strict=True))
+
+    def run(low: int, high: int) -> None:
+        ends[low:high] += before.get(low, 0)
+        np.subtract(ends[low:high], counts[low:high], out=begins[low:high], casting="unsafe")
+
+    in_slices(run, bounds)
+    return ends, begins
 
 
 def _taken(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
@@ -161,12 +170,6 @@ def _put(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
     in_slices(run, torch_slices(len(indices)))
     return found
-
-
-def _array(values: np.ndarray) -> wp.array:
-    """The same memory for a kernel."""
-    dtype = {np.dtype(np.int32): int, np.dtype(np.int64): wp.int64}[values.dtype]
-    return wp.array(values, dtype=dtype, copy=False, device="cpu")
 
 
 def _last(ends: np.ndarray) -> int:

@@ -81,7 +81,6 @@ def launch(
     outputs: Sequence = (),
     *,
     bounds: list[int] | None = None,
-    beside: Callable[[], None] | None = None,
     device: torch.device | str = "cpu",
     **adjoint,
 ) -> None:
@@ -93,14 +92,10 @@ def launch(
         inputs: Warp arrays, :func:`view` results, structs or scalars.
         outputs: likewise.
         bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
-        beside: other work. Where threads share the launch it is done at the same time, otherwise before.
         device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
     on_gpu, bounds = torch.device(device).type == "cuda", bounds or even_slices(dim)
-    if beside and (on_gpu or len(bounds) <= 2):  # nothing to share
-        beside()
-        beside = None
     if dim == 0:
         return
     if adjoint:
@@ -116,7 +111,7 @@ def launch(
 
     if len(bounds) > 2:
         wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
-    in_slices(run, bounds, beside)
+    in_slices(run, bounds)
 
 
 def launch_in_lanes(

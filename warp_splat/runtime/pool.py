@@ -151,8 +151,8 @@ def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
     return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_OF_TORCH // WIDTH)]
 
 
-def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callable[[], None] | None = None) -> None:
-    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU, and ``beside`` first.
+def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
+    """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU.
 
     Slices must write different elements. Helpers record no gradients.
     """
@@ -160,8 +160,6 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int], beside: Callab
         run = torch.inference_mode()(run)
     # each with its function: a helper that sleeps or comes late knows its job, which must not keep tensors alive
     slices = [partial(run, low, high) for low, high in itertools.pairwise(bounds) if high > low]
-    if beside:
-        slices.insert(0, beside)
     helpers = min(_threads, len(slices)) - 1
     if helpers <= 0:
         for call in slices:
