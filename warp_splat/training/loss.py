@@ -15,6 +15,7 @@ from torch.nn import functional
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
 from warp_splat.kernels.simd import LANES, vec16
+from warp_splat.kernels.window import CHANNELS, MOMENTS, RADIUS, RING, ROWS, SLOPES, WEIGHTS, WINDOW
 from warp_splat.raster.drivers import DRIVERS, driver_of
 from warp_splat.runtime.launch import launch, pack_struct, view
 from warp_splat.runtime.pool import even_slices
@@ -72,7 +73,7 @@ def _problem(image, target, lambda_dssim: float, mask) -> str | None:
         return f"lambda_dssim to be a number, 0 to 1, got {lambda_dssim!r}"
     if image.dtype != torch.float32 or target.dtype not in (torch.float32, torch.uint8):
         return f"an image of float32, a target of float32 or uint8, got {image.dtype} and {target.dtype}; convert them"
-    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != ssim.CHANNELS or not image.numel():
+    if image.shape != target.shape or image.dim() != 3 or image.shape[2] != CHANNELS or not image.numel():
         return f"two images [H, W, 3] of one size, 1 x 1 or more, got {list(image.shape)} and {list(target.shape)}"
     wanted, is_tensor = [*image.shape[:2], 1], isinstance(mask, torch.Tensor)
     if mask is None or (is_tensor and mask.dtype == torch.uint8 and list(mask.shape) == wanted):
@@ -105,20 +106,20 @@ def loss_by_convolution(image: torch.Tensor, target: torch.Tensor, lambda_dssim:
 def _blur(planes: torch.Tensor) -> torch.Tensor:
     """Weighted mean over the window around each pixel, [B, 3, H, W], with zeros outside the image."""
     window = _window(planes.device)
-    rows = functional.conv2d(planes, window, padding=(0, ssim.RADIUS), groups=ssim.CHANNELS)
-    return functional.conv2d(rows, window.mT, padding=(ssim.RADIUS, 0), groups=ssim.CHANNELS)
+    rows = functional.conv2d(planes, window, padding=(0, RADIUS), groups=CHANNELS)
+    return functional.conv2d(rows, window.mT, padding=(RADIUS, 0), groups=CHANNELS)
 
 
 @functools.cache  # copied once: a copy from the host would wait for the GPU in every step
 def _window(device: torch.device) -> torch.Tensor:
     """The window's weights for each channel, [3, 1, 1, 11]."""
-    return torch.tensor(list(ssim.WEIGHTS), dtype=torch.float32, device=device).repeat(ssim.CHANNELS, 1, 1, 1)
+    return torch.tensor(list(WEIGHTS), dtype=torch.float32, device=device).repeat(CHANNELS, 1, 1, 1)
 
 
 @functools.lru_cache(16)
 def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
     """The share of the window inside the image around each pixel, [1, H, W]."""
-    return _blur(torch.ones(1, ssim.CHANNELS, height, width, dtype=torch.float32, device=device))[0, :1]
+    return _blur(torch.ones(1, CHANNELS, height, width, dtype=torch.float32, device=device))[0, :1]
 
 
 class LossByConvolution(torch.autograd.Function):
@@ -150,8 +151,8 @@ class ImageLoss(torch.autograd.Function):
                 target = target.clone()
             image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
             bounds, bands = _bands(height)
-            padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, ssim.RING, groups, ssim.MOMENTS)
-            blurred, slopes = _lanes(bands, ssim.ROWS, groups, ssim.MOMENTS), _lanes(height, ssim.SLOPES, groups + 2)
+            padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, RING, groups, MOMENTS)
+            blurred, slopes = _lanes(bands, ROWS, groups, MOMENTS), _lanes(height, SLOPES, groups + 2)
             sums = image.new_empty(height, 2)
             launch(
                 ssim.compare,
@@ -180,7 +181,7 @@ class ImageLoss(torch.autograd.Function):
             image, target, slopes = ctx.saved_tensors
             height, groups = len(image), slopes.shape[2] - 2
             bounds, bands = _bands(height)
-            ring, blurred = (_lanes(bands, rows, groups, ssim.SLOPES) for rows in (ssim.RING, ssim.ROWS))
+            ring, blurred = (_lanes(bands, rows, groups, SLOPES) for rows in (RING, ROWS))
             adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
             weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
             launch(
@@ -195,7 +196,7 @@ class ImageLoss(torch.autograd.Function):
                 [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)],
                 bounds=list(range(bands + 1)),
             )
-            return adj.view(height, -1, ssim.CHANNELS), None, None, None
+            return adj.view(height, -1, CHANNELS), None, None, None
 
 
 def _lanes(*shape: int) -> torch.Tensor:
@@ -208,7 +209,7 @@ def _bands(height: int) -> tuple[torch.Tensor, int]:
     Rows that are blurred together are the same in any number of bands: what is not finite has an influence on both.
     """
     bounds = even_slices(height, SMALLEST_SLICE)
-    bounds[1:-1] = [bound - bound % ssim.ROWS for bound in bounds[1:-1]]
+    bounds[1:-1] = [bound - bound % ROWS for bound in bounds[1:-1]]
     return torch.tensor(bounds, dtype=torch.int32, device="cpu"), len(bounds) - 1
 
 
@@ -243,11 +244,11 @@ def _middle(image: torch.Tensor) -> float:
 @functools.cache
 def _missing(groups: int, length: int) -> torch.Tensor:
     """The share of the window beyond the ends of a row, by place in the row, [G, LANES]."""
-    columns = length // ssim.CHANNELS
-    tap = np.arange(columns)[:, None] + np.arange(ssim.WINDOW) - ssim.RADIUS
-    share = (((tap < 0) | (tap >= columns)) * np.array(list(ssim.WEIGHTS))).sum(1)  # in one order, unlike a product
+    columns = length // CHANNELS
+    tap = np.arange(columns)[:, None] + np.arange(WINDOW) - RADIUS
+    share = (((tap < 0) | (tap >= columns)) * np.array(list(WEIGHTS))).sum(1)  # in one order, unlike a product
     missing = torch.zeros(groups * LANES, dtype=torch.float32, device="cpu")
-    missing[:length] = torch.from_numpy(np.repeat(share, ssim.CHANNELS))
+    missing[:length] = torch.from_numpy(np.repeat(share, CHANNELS))
     return missing.view(groups, LANES)
 
 
