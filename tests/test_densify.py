@@ -25,7 +25,7 @@ def setup(count=6, **options):
     optimizer = Optimizer(model, config.learn, EXTENT)
     background = torch.full((3,), float(config.data.white_background))
     scene: Any = SimpleNamespace(extent=EXTENT)
-    setting = Setting(scene, model, background, ALONE, config.learn.seed, config.grow.max_gaussians)
+    setting = Setting(scene, model, background, ALONE, config.learn.seed, config.grow.max_gaussians, 1)
     return model, optimizer, Reference(config.plugins["reference"], setting, optimizer)
 
 

@@ -112,7 +112,7 @@ def test_activations_in_any_mode_of_torch(threads, model, mode):
 
 def test_statistics_are_those_of_all_rows(threads, model):
     config = TrainConfig()
-    setting = Setting(SimpleNamespace(extent=1.0), model, torch.zeros(3), ALONE, seed=0, max_gaussians=0)
+    setting = Setting(SimpleNamespace(extent=1.0), model, torch.zeros(3), ALONE, seed=0, max_gaussians=0, iterations=1)
     densifier = Reference(config.plugins["reference"], setting, Optimizer(model, config.learn, 1.0))
     grad = torch.randn(COUNT, 2, generator=torch.Generator().manual_seed(3))
     grad[7] = torch.inf

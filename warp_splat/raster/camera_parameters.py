@@ -17,6 +17,7 @@ from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import Types
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.runtime.launch import lanes_of, launch_in_lanes, view
+from warp_splat.runtime.sums import in_pairs
 
 TERMS = 16  # of the power series, for turns of up to half a circle
 
@@ -130,11 +131,7 @@ def _sums(
         return arguments(types, rows), [view(sums[rows.start // lanes :], wp.float32)]
 
     launch_in_lanes(make, lanes, count, with_output, like.device)
-    sums = torch.cat([sums.double(), sums.new_zeros(1, columns)])
-    while len(sums) > 1:
-        sums = torch.cat([sums, sums.new_zeros(len(sums) % 2, columns)])
-        sums = sums[::2] + sums[1::2]
-    return sums[0].cpu().numpy()
+    return in_pairs(sums).cpu().numpy()
 
 
 def _turned(vectors: np.ndarray, axis: np.ndarray, order: int) -> np.ndarray:

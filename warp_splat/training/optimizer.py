@@ -86,8 +86,8 @@ class Optimizer:
             that, and the betas are raised to its power (Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting
             Training"): if gradients of different images are independent, a step then moves the parameters as far,
             and forgets as much, as ``batch`` steps of one image.
-        parts: groups of what parts learn, each with ``name``, ``params`` (one leaf of at least one axis) and ``lr``;
-            they learn in every step. On a CPU, leaves are dense float32.
+        parts: groups of what parts learn, each with ``name``, ``params`` (one leaf of at least one axis) and ``lr``, a
+            number or a function of the iteration; they learn in every step. On a CPU, leaves are dense float32.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Optimizer:
             "opacities": options.opacity_lr,
             "scales": options.scaling_lr,
             "quats": options.rotation_lr,
-            **self._part_rates,
+            **{name: rate(iteration) if callable(rate) else rate for name, rate in self._part_rates.items()},
         }
         cooldown = min(options.cooldown, options.iterations)
         late = power(0.1, max(iteration - options.iterations + cooldown, 0), max(cooldown, 1))

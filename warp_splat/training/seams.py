@@ -15,7 +15,8 @@ A part is made of (options, setting). It has any of these methods; ``tests/test_
 they run in this order:
 
     needed(scene) -> Verdict                of the class: whether ``--parts auto`` takes it; without, it never does
-    parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, with a name that no other has
+    parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, with a name that no other has; lr is a
+                                            number, or a function of the iteration
     camera(camera, step) -> camera          to render with
     background(color, step) -> color        [3], to render on
     image(image, out, step) -> image        [H, W, 3], of what was rendered, which is compared
@@ -65,6 +66,7 @@ class Setting(NamedTuple):
     processes: Processes
     seed: int
     max_gaussians: int  # 0: no limit
+    iterations: int  # of the whole training
 
 
 class Step(NamedTuple):

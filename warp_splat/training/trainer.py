@@ -89,7 +89,7 @@ class Trainer:
         self.model = model.arranged().to(self.device)
         self.background = torch.full((3,), float(config.data.white_background), device=self.device)
         seed, limit, growth = config.learn.seed, config.grow.max_gaussians, config.grow.growth
-        setting = Setting(scene, self.model, self.background, processes, seed, limit)
+        setting = Setting(scene, self.model, self.background, processes, seed, limit, config.learn.iterations)
         self.parts = [PARTS[name].load()(config.plugins[name], setting) for name in used]
         groups = [group for parameters in having(self.parts, "parameters") for group in parameters()]
         self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)

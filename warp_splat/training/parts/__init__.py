@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from warp_splat.scene.types import Scene
     from warp_splat.training.options import TrainConfig
 
+EXPOSURES = ("gain", "affine", "bilateral")
 AUTO = "auto"  # in --parts: those that the scene needs
 
 
@@ -29,9 +30,23 @@ class FloatersOptions:
     opacity_reg: float = learning(0.05, "weight of the mean opacity in the loss of --parts floaters")
 
 
+@dataclass(frozen=True)
+class ExposureOptions:
+    """Exposure and white balance of each photograph."""
+
+    exposure: str = learning(
+        "", "colors of each photograph, learned: asks for the part; of --parts: affine", choices=("", *EXPOSURES)
+    )
+    exposure_lr_init: float = learning(0.01, "rate of exposure at the start, of values from 0 to 1")
+    exposure_lr_final: float = learning(0.0001, "rate of exposure at the end")
+    exposure_reg: float = learning(0.01, "weight of the squared difference of a photograph's map to the identity")
+    vignetting: bool = learning(False, "exposure also learns how all photographs darken towards their corners")
+
+
 #: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
     "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
+    "exposure": Entry(ExposureOptions, "warp_splat.training.parts.exposure.Exposure"),
     "floaters": Entry(FloatersOptions, "warp_splat.training.parts.floaters.Floaters"),
 }
 

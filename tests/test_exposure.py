@@ -1,0 +1,146 @@
+"""Exposure: kernels against float64, the gauge, what it finds of faults that are known, and the same bytes again."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from test_checkpoints import begin, state_of, steps
+from test_train import SCENE
+
+from warp_splat.color import to_srgb
+from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.runtime import launch
+from warp_splat.scene import load_scene
+from warp_splat.scene.gains import gains_of
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import choose
+from warp_splat.training.record import keep, restore
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
+
+from make_faults import make_faulty
+
+SIZE = (21, 37)  # pixels that are no multiple of sixteen
+KINDS = ("gain", "affine", "bilateral")
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory):
+    """The embedded scene with gains and white balances, and what they are."""
+    folder = tmp_path_factory.mktemp("faulty") / "scene"
+    return folder, make_faulty(folder, ["exposure"])["exposure"]
+
+
+def part_of(scene, folder, **options):
+    return begin(scene, folder, **options)[0].parts[-1]
+
+
+def exact(kind, numbers, falloff, pivot, image):
+    """What the part makes of an image, in float64 by torch's own operations; of grids, by weights of all cells."""
+    height, width, _ = image.shape
+    y, x = ((torch.arange(n, dtype=torch.float64) + 0.5 - n / 2) for n in (height, width))
+    square = (y[:, None] ** 2 + x**2) / ((height**2 + width**2) / 4)
+    image = (image + pivot) * (1 + falloff[0] * square + falloff[1] * square**2)[..., None]
+    if kind == "gain":
+        return image * (1 + numbers) - pivot
+    if kind == "affine":
+        return image + image @ numbers[:9].view(3, 3) + numbers[9:] - pivot
+    _, deep, high, wide = numbers.shape
+    z = ((image - pivot).mean(-1) * (deep - 1)).clamp(0, deep - 1)
+    y, x = (((torch.arange(n, dtype=torch.float64) + 0.5) / n * (m - 1)) for n, m in ((height, high), (width, wide)))
+    hats = [(1 - (a[..., None] - torch.arange(n)).abs()).clamp_min(0) for a, n in ((z, deep), (y, high), (x, wide))]
+    sliced = torch.einsum("kdij,hwd,hi,wj->hwk", numbers, *hats)
+    return image + torch.einsum("hwc,hwcd->hwd", image, sliced[..., :9].unflatten(-1, (3, 3))) + sliced[..., 9:] - pivot
+
+
+@pytest.mark.parametrize("driver", [CPU, CUDA], ids=["lanes", "fibers"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_and_gradients_are_those_of_float64(kind, driver, scene, tmp_path):
+    """Of image, map and vignetting."""
+    part = part_of(scene, tmp_path, exposure=kind, vignetting=True)
+    random = torch.Generator().manual_seed(1)
+    image, upstream = (torch.rand(*SIZE, 3, generator=random) for _ in range(2))
+    with torch.no_grad():
+        part.maps[3] = 0.2 * torch.rand(part.maps[3].shape, generator=random) - 0.1
+        part.falloff[:] = torch.tensor([-0.2, 0.05])
+    leaves = [image.requires_grad_(), part.maps, part.falloff]
+    wide = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    made = exact(kind, wide[1][3], wide[2], part.pivot, wide[0])
+    with using(driver):
+        found = part.image(image, None, SimpleNamespace(view=scene.train[3]))
+        gradients = torch.autograd.grad(found, leaves, upstream)
+    torch.testing.assert_close(found.double(), made, rtol=0.0, atol=1e-6)
+    for gradient, right in zip(gradients, torch.autograd.grad(made, wide, upstream.double()), strict=True):
+        assert (gradient - right).norm() < 2e-6 * right.norm()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_at_first_it_is_the_identity_and_its_mean_stays_so(kind, scene, tmp_path):
+    """Exactly, over the photographs; in the sum of float32 as well."""
+    plain, _ = begin(scene, tmp_path)
+    trainer, run = begin(scene, tmp_path, exposure=kind)
+    assert torch.equal(plain.differentiate(1), trainer.differentiate(1)) or kind == "bilateral"
+    steps(trainer, run, 12)
+    maps = trainer.parts[0].maps.detach()
+    assert torch.equal(maps.double().sum(0), torch.zeros(maps.shape[1:], dtype=torch.float64))
+    assert (maps != 0).any(1).all() if kind == "gain" else (maps != 0).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_resumes_to_the_same_bytes(kind, scene, tmp_path):
+    options = {"parts": "exposure,floaters", "exposure": kind, "vignetting": True}
+    trainer, run = begin(scene, tmp_path, **options)
+    steps(trainer, run, 24)
+    expected, _ = state_of(trainer, run)
+    assert expected["parameters.exposure"] != expected["gradients.exposure"] and "parameters.vignetting" in expected
+    trainer, run = begin(scene, tmp_path, **options)
+    steps(trainer, run, 13)
+    keep(trainer, run)
+    trainer, run = begin(scene, tmp_path, **options)
+    restore(trainer, run, load_checkpoint(tmp_path))
+    steps(trainer, run, 24)
+    found, _ = state_of(trainer, run)
+    assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_threads_change_nothing(kind, scene, tmp_path):
+    part, before, found = part_of(scene, tmp_path, exposure=kind, vignetting=True), launch.get_threads(), []
+    image = torch.rand(130, 131, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
+    for threads in (1, 2, 3):
+        launch.set_threads(threads)
+        made = part.image(image, None, SimpleNamespace(view=scene.train[0]))
+        found.append(torch.autograd.grad(made.square().sum(), [image, part.maps, part.falloff]))
+    launch.set_threads(before)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_gains_are_found_from_the_tracks_and_decide_what_auto_takes(faulty):
+    """With those of the truth, but for what shine, noise and eight bits leave."""
+    folder, truth = faulty
+    clean, changed = (load_scene(path, eval=True, report=str) for path in (SCENE, folder))
+    used, told = choose(TrainConfig(parts="auto"), clean)
+    assert "exposure" not in used and any("Part exposure: left out, since photographs differ by 0.0" in t for t in told)
+    used, told = choose(TrainConfig(parts="auto"), changed)
+    assert "exposure" in used and any("Part exposure: taken, since photographs differ by 0.2" in line for line in told)
+    gains = gains_of(changed).stops
+    assert gains.keys() == truth.keys()
+    errors = np.array([gains[name] - truth[name] for name in truth])
+    assert np.median(np.abs(2 ** (errors - errors.mean(0)) - 1)) < 0.01
+    assert abs(sum(gains.values())).max() < 1e-12
+    assert choose(TrainConfig(parts="auto"), replace(changed, find_tracks=dict))[0] == []
+
+
+def test_light_times_a_number_is_a_gain_of_what_a_screen_shows():
+    """But for the darkest 4 %: the premise of maps without powers."""
+    light = np.linspace(0.004, 0.6, 1000)
+    for stops in (-0.5, 0.6):
+        factor = 2 ** (stops / 2.4)
+        expected = (to_srgb(light, np.where) + 0.055) * factor - 0.055
+        assert np.abs(to_srgb(light * 2**stops, np.where) - expected)[light * 2**stops > 0.0032].max() < 1e-12
