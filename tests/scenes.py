@@ -11,8 +11,10 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
+from warp_splat.lenses import Lens
 
 C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
+OPENCV, FISHEYE = Lens("OPENCV", (-0.12, 0.02, 0.01, -0.006)), Lens("OPENCV_FISHEYE", (0.03, -0.01, 0.004, -0.001))
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -69,6 +71,20 @@ def cloud(
     opacities = rng.uniform(*opacity, count)
     sh = colors(rng, count, degree, **sh_options)
     return pack(at_pixels(pixels, depth, camera), size[:, None] * ratios, opacities, sh, camera, rng)
+
+
+def through_lens(seed, count, lens, size, focal, most, sigma=(0.6, 6.0), degree=1):
+    """Random Gaussians all around the axis of a camera with a lens, up to ``most`` degrees from it."""
+    rng, base = np.random.default_rng(seed), make_camera(*size, fx=focal, fy=1.1 * focal, seed=seed)
+    camera = replace(base, cx=base.cx + 1.3, cy=base.cy - 0.8, lens=lens)
+    cosine = rng.uniform(np.cos(np.radians(most)), 1, count)
+    around, sine = rng.uniform(0, 2 * np.pi, count), np.sqrt(1 - cosine**2)
+    distance = distinct_depths(rng, count, 2, 8)
+    points = np.stack([sine * np.cos(around), sine * np.sin(around), cosine], 1) * distance[:, None]
+    longest = np.exp(rng.uniform(*np.log(sigma), count)) * distance / focal
+    ratios = np.exp(rng.uniform(np.log(0.15), 0, (count, 3)))
+    sh = colors(rng, count, degree)
+    return pack(to_world(points, camera), longest[:, None] * ratios, rng.uniform(0.05, 0.95, count), sh, camera, rng)
 
 
 def near_and_behind():
@@ -198,6 +214,8 @@ SCENES = {
     "ties": ties,
     "subpixel": lambda: cloud(15, 300, make_camera(34, 30), degree=1, sigma=(0.001, 0.5)),
     "huge": huge,
+    "opencv": lambda: through_lens(40, 150, OPENCV, (47, 35), 22.0, 75),
+    "fisheye": lambda: through_lens(41, 200, FISHEYE, (45, 43), 13.0, 180),
     "faint": faint,
     "empty": empty,
     "single": lambda: cloud(16, 1, make_camera(21, 19), degree=3, sigma=(3, 4), opacity=(0.8, 0.9), frame=-0.4),

@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "warp_splat"
 #: A module imports from its own layer and those above it in this list.
 LAYERS = [
     {"errors", "flags", "config", "presets", "text"},  # the standard library only
+    {"lenses"},
     {"kernels", "runtime", "camera", "color"},
     {"raster"},
     {"formats"},

@@ -25,7 +25,9 @@ from scene_files import (
     write_model,
 )
 
+from warp_splat import InputError
 from warp_splat.scene.images import read_pixels, target_size
+from warp_splat.scene.types import visible
 
 ROOT = Path(__file__).resolve().parent.parent
 FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
@@ -194,6 +196,30 @@ def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, 
     assert error[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
     assert error.max() < 3  # the outermost pixels may lie half a pixel outside of the file
     assert any(model in line for line in lines)
+
+
+@pytest.mark.parametrize("scale", [1, 2], ids=["same-size", "half-size"])
+def test_native_lenses_see_points_where_colmap_does(tmp_path, scale):
+    params = (40, 44, 22.5, 17.25, -0.15, 0.04, 0.002, -0.003)
+    line = f"OPENCV {WIDTH} {HEIGHT} {' '.join(map(str, params))}"
+    pixels = texture(WIDTH // scale, HEIGHT // scale)
+    scene, lines = load(write_colmap(tmp_path, ["a.png"], pixels, camera=line), lens="native")
+    camera, (rotation, translation) = scene.train[0].camera, pose(0)
+    np.testing.assert_array_equal(scene.train[0].image, pixels)
+    colmap = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
+    wanted = colmap.img_from_cam(POINTS @ rotation.T + translation)
+    found = camera.lens.distorted(POINTS @ camera.rotation.T + camera.translation)
+    found = found * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    np.testing.assert_allclose(found * scale, wanted, atol=1e-9)
+    inside = ((wanted >= 0) & (wanted <= [WIDTH, HEIGHT])).all(1)
+    np.testing.assert_array_equal(visible(camera, POINTS), inside)
+    assert 3 < inside.sum() and "models: OPENCV" in lines[-1]
+
+
+def test_native_lenses_that_fold_inside_the_picture_are_refused(tmp_path):
+    line = f"OPENCV {WIDTH} {HEIGHT} 40 44 22.5 17.25 -1.5 0 0 0"
+    with pytest.raises(InputError, match=r"a.png: Camera lens OPENCV: expected .* fold it \d+ degrees from the axis"):
+        load(write_colmap(tmp_path, ["a.png"], camera=line), lens="native")
 
 
 def test_zero_distortion_changes_nothing(tmp_path):

@@ -7,16 +7,18 @@ import pytest
 from scene_files import (
     COLORS,
     HEIGHT,
+    LENS,
     POINTS,
     WIDTH,
     load,
     project,
+    texture,
     write_colmap,
     write_transforms,
 )
 from test_scene import distorted_picture, fisheye, pattern, radial
 
-from warp_splat.errors import InputError
+from warp_splat import InputError, Lens
 
 
 def test_transforms_cameras_points_and_axes(tmp_path):
@@ -107,6 +109,27 @@ def test_transforms_with_distortion(tmp_path, model, distort, params, values):
     scene, lines = load(write_transforms(tmp_path, ["a.png"], pixels, **values))
     check_ideal(scene.train[0])
     assert len(lines) == 1 and "Undistorting 1 of 1" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("values", "lens"),
+    [
+        ({"k1": -0.15, "k2": 0.04, "p1": 0.002, "p2": -0.003}, Lens("OPENCV", (-0.15, 0.04, 0.002, -0.003))),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003},
+            Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, 0)),
+        ),
+        ({"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32}, Lens("EQUIRECTANGULAR")),
+    ],
+)
+def test_native_lenses_keep_the_pixels(tmp_path, values, lens):
+    width, height = values.get("w", WIDTH), values.get("h", HEIGHT)
+    pixels = texture(width, height)
+    scene, lines = load(write_transforms(tmp_path, ["a.png"], pixels, **{**LENS, **values}), lens="native")
+    camera = scene.train[0].camera
+    assert camera.lens == lens and (camera.width, camera.height) == (width, height)
+    np.testing.assert_array_equal(scene.train[0].image, pixels)
+    assert lines[0].startswith(f"Keeping 1 of 1 images as their lenses show them (models: {lens.model})")
 
 
 @pytest.mark.parametrize(

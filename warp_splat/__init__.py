@@ -13,6 +13,7 @@ _HOMES = {
     "CameraParameters": "raster.camera_parameters",
     "Falloff": "kernels.falloff",
     "InputError": "errors",
+    "Lens": "lenses",
     "RasterOptions": "config",
     "RenderOutput": "raster.api",
     "check_gradients": "raster.gradcheck",
@@ -27,6 +28,7 @@ __all__ = [
     "CameraParameters",
     "Falloff",
     "InputError",
+    "Lens",
     "RasterOptions",
     "RenderOutput",
     "check_gradients",
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from warp_splat.config import RasterOptions
     from warp_splat.errors import InputError
     from warp_splat.kernels.falloff import Falloff
+    from warp_splat.lenses import Lens
     from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
     from warp_splat.raster.camera_parameters import CameraParameters
     from warp_splat.raster.gradcheck import check_gradients

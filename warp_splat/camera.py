@@ -1,4 +1,4 @@
-"""A pinhole camera in COLMAP's conventions: x right, y down, z forward, pixel centers at +0.5."""
+"""A camera in COLMAP's conventions: x right, y down, z forward, pixel centers at +0.5."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.lenses import Lens, angle_of_view, check_picture
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera and its pose, world to camera: ``x_camera = rotation @ x_world + translation``.
+    """A camera and its pose, world to camera: ``x_camera = rotation @ x_world + translation``.
 
     Args:
         width: image width [px], at least 1.
@@ -22,9 +23,10 @@ class Camera:
         cy: principal point from the image's top edge [px].
         rotation: rotation part of camera_from_world, [3, 3], orthonormal with determinant +1.
         translation: translation part of camera_from_world, [3], world units.
+        lens: its distortion, a :class:`warp_splat.Lens`; None: a pinhole's, which has none.
 
     Raises:
-        InputError: if a value is missing its shape, not finite, or out of range.
+        InputError: if a value is missing its shape, not finite, or out of range, or the lens folds inside the picture.
     """
 
     width: int
@@ -35,6 +37,7 @@ class Camera:
     cy: float
     rotation: np.ndarray
     translation: np.ndarray
+    lens: Lens | None = None
 
     def __post_init__(self):
         for name in ("width", "height"):
@@ -64,6 +67,10 @@ class Camera:
         orthonormal = small and np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() <= 1e-4
         if not orthonormal or np.linalg.det(self.rotation) < 0:
             raise InputError("Camera rotation: expected an orthonormal matrix with determinant +1 (world to camera).")
+        if self.lens is not None:
+            if not isinstance(self.lens, Lens):
+                raise InputError(f"Camera lens: expected a warp_splat.Lens or None, got {self.lens!r:.80}.")
+            check_picture(self.lens, *self._picture)
 
     @property
     def center(self) -> np.ndarray:
@@ -74,6 +81,25 @@ class Camera:
     def forward(self) -> np.ndarray:
         """Viewing direction in world coordinates, unit length, [3]."""
         return self.rotation[2]
+
+    @property
+    def _picture(self) -> tuple[float, ...]:
+        """Left, top, right and bottom edge of the image, in focal lengths from the principal point."""
+        x, y = -self.cx / self.fx, -self.cy / self.fy
+        return x, y, x + self.width / self.fx, y + self.height / self.fy
+
+    @property
+    def reach(self) -> float:
+        """The largest angle between the axis and what a pixel sees [rad], of a camera with a lens."""
+        return angle_of_view(self.lens, *self._picture)
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions in the camera [P, 3] that are seen at ``pixels`` [P, 2]; NaN where the lens sees none."""
+        places = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
+        if self.lens:
+            return self.lens.undistorted(places)
+        rays = np.concatenate([places, np.ones((len(places), 1))], 1)
+        return rays / np.sqrt((rays * rays).sum(1, keepdims=True))
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image resized to ``width`` x ``height``: all of K is scaled."""

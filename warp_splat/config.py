@@ -39,6 +39,7 @@ EXTENTS = ("ellipse", "square")
 LOSS_SPACES = ("srgb", "log")
 OPTIMIZERS = ("default", "sparse_adam")
 EXP_DEGREES = (3, 4, 5, 6, None)
+LENSES = ("undistort", "native")  # what becomes of photographs with distortion; see load_scene
 VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.rendering.camera_paths
 
 LPIPS_HELP = "also measure LPIPS: torchvision's weights of VGG16 or AlexNet, a .pth file; needs the package lpips"

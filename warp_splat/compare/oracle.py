@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
+from warp_splat.compare import exact_lenses
+
 BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.2  # Gaussians nearer than this are culled
 BLUR = 0.3  # low-pass filter, px^2
@@ -32,7 +34,7 @@ class Splats:
     """Projected Gaussians, [N] each; ``live`` is False where the rest means nothing."""
 
     means2d: torch.Tensor  # [N, 2] px
-    z: torch.Tensor  # depth in the camera
+    z: torch.Tensor  # depth in the camera, of a wide lens the distance
     cov2d: torch.Tensor  # [N, 2, 2] px^2, low-pass filter included
     opacity: torch.Tensor  # [N] times the antialiasing factor
     color: torch.Tensor  # [N, 3]
@@ -141,17 +143,21 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
     """Gaussians as the camera sees them. Its numbers may be tensors that want gradients."""
     world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
     points = means @ world_to_camera.T + translation
-    live = (points[:, 2] > NEAR) & (quats.norm(dim=1) > 0)
-    points = torch.where(live[:, None], points, points.new_tensor([0.0, 0, 1]))  # no division by zero, no gradient
+    depth, live = exact_lenses.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
+    live = live & (depth > NEAR) & (quats.norm(dim=1) > 0)
+    points = torch.where(live[:, None], points, points.new_tensor([0.3, 0, 1]))  # no division by zero, no gradient
     x, y, z = points.unbind(1)
-    means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
 
     sigma = world_to_camera @ covariances(quats, scales) @ world_to_camera.T
     if projection == "ellipsoid":
         live = live & (z**2 > OUTLINE_REACH**2 * sigma[:, 2, 2])
         means2d, sharp = outlines(points, sigma, live, camera)
     else:
-        to_pixels = jacobians(points, camera)
+        if camera.lens:
+            means2d, to_pixels = exact_lenses.seen(points, camera)
+        else:
+            means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+            to_pixels = jacobians(points, camera)
         sharp = to_pixels @ sigma @ to_pixels.transpose(1, 2)
     cov2d = sharp + BLUR * torch.eye(2, dtype=torch.float64)
     opacity = opacities
@@ -164,7 +170,7 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
     degree = degree if sh_degree is None else min(degree, sh_degree)
     basis = sh_basis(torch.nn.functional.normalize(means - center, dim=1), degree)
     color = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
-    return Splats(means2d, z, cov2d, opacity, color, live)
+    return Splats(means2d, depth, cov2d, opacity, color, live)
 
 
 def _alphas(splats, order, camera, pixels):

@@ -23,6 +23,7 @@ from warp_splat.formats.atomic import write_text
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.formats.splats import SplatFile
+from warp_splat.lenses import Lens
 
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
@@ -200,10 +201,11 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
 
 
 def camera_entry(camera: Camera) -> dict[str, object]:
-    """A camera as ``cameras.json`` has it, with the principal point, which the reference's lacks."""
+    """A camera as ``cameras.json`` has it, with principal point and lens, which the reference's lacks."""
     pose = {"position": camera.center.tolist(), "rotation": camera.rotation.T.tolist()}
-    lens = {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
-    return {"width": camera.width, "height": camera.height, **pose, **lens}
+    focal = {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
+    lens = {"lens": {"model": camera.lens.model, "coefficients": camera.lens.coefficients}} if camera.lens else {}
+    return {"width": camera.width, "height": camera.height, **pose, **focal, **lens}
 
 
 def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
@@ -234,5 +236,6 @@ def _camera(entry: dict) -> Camera:
     position = np.array(entry["position"], np.float64)
     middle = {"cx": 0.5 * entry["width"], "cy": 0.5 * entry["height"]}
     numbers = {name: entry.get(name, middle.get(name)) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    lens = Lens(entry["lens"]["model"], tuple(entry["lens"]["coefficients"])) if entry.get("lens") else None
     with np.errstate(invalid="ignore"):  # what is not finite, the camera refuses
-        return Camera(**numbers, rotation=rotation, translation=-rotation @ position)
+        return Camera(**numbers, rotation=rotation, translation=-rotation @ position, lens=lens)

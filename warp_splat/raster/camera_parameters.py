@@ -43,6 +43,11 @@ class CameraParameters:
     def __init__(self, base: Camera, twist: torch.Tensor | None = None, intrinsics: torch.Tensor | None = None):
         if not isinstance(base, Camera):
             raise InputError(f"base: expected a warp_splat.Camera, got {type(base).__name__}.")
+        if base.lens:
+            raise InputError(
+                f"base: expected a camera without distortion, got one with {base.lens.model}; its pose, "
+                "intrinsics and coefficients have no gradients yet: undistort the photographs."
+            )
         self.base = base
         self.twist = _checked("twist", twist, [0.0] * 6)
         self.intrinsics = _checked("intrinsics", intrinsics, [base.fx, base.fy, base.cx, base.cy])

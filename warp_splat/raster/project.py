@@ -15,11 +15,13 @@ from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView
+from warp_splat.kernels.project.lens import LIMIT
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import UNSEEN, make_project
 from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
-from warp_splat.kernels.simd import TYPES
+from warp_splat.kernels.simd import TYPES, vec16
 from warp_splat.kernels.structs import HarmonicsView
+from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
@@ -49,14 +51,24 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
     cam.antialiasing = int(options.antialiasing)
     cam.alpha_min = options.alpha_min
+    if camera.lens:
+        cam.lens = vec16(*camera.lens.numbers, *[0.0] * (LIMIT - len(camera.lens.numbers)), lens_limit(camera))
     return cam
 
 
-def projection_of(options: RasterOptions) -> Projection:
-    """The user's own, or that of the file of that name."""
+def lens_limit(camera: Camera) -> float:
+    """How far from the axis kernels follow the camera's lens."""
+    if camera.lens.family.wide:
+        return math.cos(camera.lens.limit)
+    return math.tan(min((1.0 + FRUSTUM_MARGIN) * camera.reach, camera.lens.limit))
+
+
+def projection_of(options: RasterOptions, lens: Lens | None = None) -> Projection:
+    """The user's own, or that of the file of that name, through the lens if there is one."""
     if isinstance(options.projection, Projection):
         return options.projection
-    return importlib.import_module(f"warp_splat.kernels.project.{options.projection}").PROJECTION
+    module = importlib.import_module(f"warp_splat.kernels.project.{options.projection}")
+    return module.through(lens.family) if lens else module.PROJECTION
 
 
 def project(
@@ -72,7 +84,7 @@ def project(
         learned, limits, camera = (camera.twist, camera.intrinsics), camera.base, camera.camera
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     driver = driver or driver_of(gaussians.means.device)
-    kernel = make_project(projection_of(options), falloff_of(options).reach_of, driver.lanes)
+    kernel = make_project(projection_of(options, camera.lens), falloff_of(options).reach_of, driver.lanes)
     return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, driver, dropped or Dropped()))
 
 

@@ -150,7 +150,8 @@ def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Ca
     if not isinstance(resolution, int):
         raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
     flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
-    return load_scene(source, images=str(trained.get("images", "images")), resolution=resolution, **flags, report=say)
+    names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
+    return load_scene(source, **names, resolution=resolution, **flags, report=say)
 
 
 def make_picture(

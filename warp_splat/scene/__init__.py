@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_splat.color import from_srgb
+from warp_splat.config import LENSES
 from warp_splat.errors import InputError
 from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, find_mask, is_video, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, visible
@@ -33,6 +34,7 @@ def load_scene(
     eval: bool = False,
     invert_masks: bool = False,
     start: str = "",
+    lens: str = "undistort",
     report: Callable[[str], object] = print,
 ) -> Scene:
     """Load a folder with a COLMAP model (sparse/), a nerf-synthetic scene (transforms_train.json) or transforms.json.
@@ -46,6 +48,8 @@ def load_scene(
         eval: hold out a test set: every 8th image by name, or transforms_test.json. Otherwise all images train.
         invert_masks: of the masks in ``source``/masks, the dark part counts, not the bright one.
         start: a file of Gaussians to start from instead of the scene's points.
+        lens: "undistort" resamples photographs with distortion as pinholes would have taken them; "native" keeps them,
+            and their cameras have lenses.
         report: called with a line for each thing that the user should know: undistortion, a choice of models, ...
 
     Returns:
@@ -59,7 +63,9 @@ def load_scene(
     """
     if not isinstance(resolution, int) or (resolution < 1 and resolution != -1):
         raise InputError(f"resolution: expected a positive whole number or -1, got {resolution}; see -r in --help.")
-    train, test, points, colors = read_photos(source, images, report)
+    if lens not in LENSES:
+        raise InputError(f"lens: expected one of {', '.join(LENSES)}, got {lens!r:.80}; see --lens in --help.")
+    train, test, points, colors = read_photos(source, images, report, native=lens == "native")
     if not eval:
         train, test = train + test, []
     elif not test:
@@ -117,7 +123,7 @@ def require_one_kind(photographs: list[tuple[str, bool]], source: str | Path) ->
 
 
 def read_photos(
-    source: str | Path, folder: str, report: Callable[[str], object]
+    source: str | Path, folder: str, report: Callable[[str], object], native: bool = False
 ) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
     """All of a scene but its pixels; see :func:`load_scene`.
 
@@ -133,10 +139,10 @@ def read_photos(
         found = "a file" if source.exists() else "nothing"
         raise InputError(f"{source}: expected the folder of a scene, found {found}; check the path given as source.")
     if takes_colmap(source):
-        photos, points, colors = colmap.read_colmap(source, folder, report)
+        photos, points, colors = colmap.read_colmap(source, folder, report, native)
         return with_masks(photos, source, report), [], points, colors
     if transforms.has_transforms(source):
-        train, test, points, colors = transforms.read_transforms(source, report)
+        train, test, points, colors = transforms.read_transforms(source, report, native)
         return with_masks(train, source, report), with_masks(test, source, report), points, colors
     expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
     if (source / "point_cloud").is_dir():

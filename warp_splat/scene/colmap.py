@@ -13,7 +13,7 @@ from warp_splat.errors import InputError, reason_of
 from warp_splat.scene import images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
-from warp_splat.scene.lenses import Lens, make_photo, make_sampling
+from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.scene.types import Sightings
 
@@ -25,7 +25,7 @@ POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the t
 
 
 def read_colmap(
-    source: Path, folder: str, report: Callable[[str], object]
+    source: Path, folder: str, report: Callable[[str], object], native: bool = False
 ) -> tuple[list[Photo], np.ndarray, np.ndarray]:
     """Read the largest model under ``source``/sparse and find its images in ``source``/``folder``.
 
@@ -33,6 +33,7 @@ def read_colmap(
         source: the scene's folder.
         folder: name of the images' folder; its images may be smaller than the model's by one factor for all.
         report: called with a line for each thing that the user should know.
+        native: lenses stay as they are, instead of becoming pinholes.
 
     Returns:
         Photos sorted by name; points [P, 3] float32, maybe none; colors [P, 3] uint8.
@@ -45,7 +46,7 @@ def read_colmap(
     if not registered:
         raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run its mapper again.")
     points, colors = _points(model, report)
-    return _photos(where, registered, source / folder, report), points, colors
+    return _photos(where, registered, source / folder, report, make_sampling(native)), points, colors
 
 
 def read_tracks(source: Path) -> dict[str, Sightings]:
@@ -199,31 +200,33 @@ def _points(model: pycolmap.Reconstruction, report: Callable[[str], object]) -> 
     return points[finite], colors[finite]
 
 
-def _photos(where: Path, registered: list[pycolmap.Image], root: Path, report: Callable[[str], object]) -> list[Photo]:
+def _photos(
+    where: Path,
+    registered: list[pycolmap.Image],
+    root: Path,
+    report: Callable[[str], object],
+    sampling: Sampling | None,
+) -> list[Photo]:
     finder = ImageFinder(root)
     names = [image.name for image in registered]
     paths = finder.find_all(
         names, f"images of {where}", "copy them there or choose another folder with --images", report
     )
-    sampling = make_sampling()  # lives as long as the photos
-    photos, scaled, distorted = [], 0, []
+    photos, scaled = [], 0
     for image, path in zip(registered, paths, strict=True):
         size = images.read_size(path)
         photos.append(make_photo(image.name, path, lens_of(image), pose_of(image), size, sampling))
         scaled += size != (image.camera.width, image.camera.height)
-        distorted += [] if photos[-1].sampling is None else [image.camera.model_name]
     if scaled:
         report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {root.name}.")
-    if distorted:
-        models = ", ".join(sorted(set(distorted)))
-        report(f"Undistorting {len(distorted)} of {len(photos)} images to pinhole cameras (models: {models}).")
+    tell_lenses(photos, report)
     return photos
 
 
-def lens_of(image: pycolmap.Image) -> Lens:
+def lens_of(image: pycolmap.Image) -> Calibration:
     """What took the image."""
     camera = image.camera
-    return Lens(camera.model_name, camera.width, camera.height, tuple(camera.params))
+    return Calibration(camera.model_name, camera.width, camera.height, tuple(camera.params))
 
 
 def pose_of(image: pycolmap.Image) -> tuple[np.ndarray, np.ndarray]:

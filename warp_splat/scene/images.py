@@ -30,13 +30,14 @@ WARP_PAD = 4  # px repeated around the source: OpenImageIO's warp sees black out
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """An image file and the pinhole camera of its pixels, once undistorted."""
+    """An image file and the camera of its pixels: with its lens, or a pinhole once they are undistorted."""
 
     name: str  # as in the scene's files
     path: Path
     camera: Camera  # after undistortion, before the resize of `-r`
     sampling: Callable[[], np.ndarray] | None = None  # makes the map of `undistort`; None: the file is undistorted
     mask: Path | None = None  # an image of what counts
+    model: str = "PINHOLE"  # of the lens in the scene's files
 
 
 class LoadedImage(NamedTuple):

@@ -1,4 +1,4 @@
-"""Lenses: those with distortion become pinholes, by pycolmap. Pixel centers are at +0.5, as ours."""
+"""Photographs and their lenses: taken as they are, or undistorted by pycolmap. Pixel centers are at +0.5, as ours."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, reason_of
+from warp_splat.lenses import Lens
+from warp_splat.lenses.formulas import MODELS
 from warp_splat.scene import images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
@@ -20,7 +22,7 @@ PINHOLE = "PINHOLE"  # fx, fy, cx, cy: the model that needs no pycolmap
 
 
 @dataclass(frozen=True)
-class Lens:
+class Calibration:
     """A camera model by COLMAP's name, and its parameters."""
 
     model: str
@@ -34,18 +36,26 @@ class Lens:
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=self.params)
 
 
-def make_sampling() -> Sampling:
-    """:func:`sampling_of`, remembering the last lenses: photographs often share one."""
+def make_sampling(native: bool = False) -> Sampling | None:
+    """:func:`sampling_of`, remembering the last lenses: photographs often share one. None: nothing is resampled."""
+    if native:
+        return None
     return functools.lru_cache(maxsize=images.THREADS)(sampling_of)
 
 
 def make_photo(
-    name: str, path: Path, lens: Lens, pose: tuple[np.ndarray, np.ndarray], size: tuple[int, int], sampling: Sampling
+    name: str,
+    path: Path,
+    lens: Calibration,
+    pose: tuple[np.ndarray, np.ndarray],
+    size: tuple[int, int],
+    sampling: Sampling | None,
 ) -> Photo:
     """The photo whose file has ``size`` = (width, height) pixels, taken through ``lens`` at a pose, world to camera.
 
     Raises:
-        InputError: if the size does not fit the lens's, it cannot become a pinhole, or pycolmap is needed and missing.
+        InputError: if the size does not fit the lens's, it cannot become a pinhole or, without a sampling, folds inside
+            the picture, or pycolmap is needed and missing.
     """
     if not images.same_shape(size, (lens.width, lens.height)):
         raise InputError(
@@ -54,16 +64,42 @@ def make_photo(
         )
     with images.named(str(path)):
         finite = np.isfinite(lens.params).all()
+        if sampling is None and finite and lens.model in MODELS:
+            return Photo(name, path, _as_it_is(lens, pose).resized(*size), model=lens.model)
         if finite and lens.model == PINHOLE:
             return Photo(name, path, Camera(lens.width, lens.height, *lens.params, *pose).resized(*size))
         if not finite or (loaded := lens.load()).is_spherical():
             raise InputError(
                 "expected a camera model that can be undistorted to a pinhole, with finite parameters, got "
-                f"{lens.model} {list(lens.params)}; correct the model or leave this image out."
+                f"{lens.model} {list(lens.params)}; correct the model, leave this image out, or keep its lens "
+                "(--lens native)."
             )
         if loaded.is_undistorted():
             return Photo(name, path, _pinhole(loaded, pose).resized(*size))
-        return Photo(name, path, _pinhole(_undistorted(lens, size), pose), functools.partial(sampling, lens, size))
+        resample = functools.partial(sampling, lens, size)
+        return Photo(name, path, _pinhole(_undistorted(lens, size), pose), resample, model=lens.model)
+
+
+def tell_lenses(photos: list[Photo], report: Callable[[str], object]) -> None:
+    """Report what becomes of photos with distortion."""
+    for verb, rest, chosen in (
+        ("Undistorting", "to pinhole cameras", [photo.model for photo in photos if photo.sampling]),
+        ("Keeping", "as their lenses show them", [photo.model for photo in photos if photo.camera.lens]),
+    ):
+        if chosen:
+            report(f"{verb} {len(chosen)} of {len(photos)} images {rest} (models: {', '.join(sorted(set(chosen)))}).")
+
+
+def _as_it_is(lens: Calibration, pose: tuple[np.ndarray, np.ndarray]) -> Camera:
+    """The camera with its distortion."""
+    count = MODELS[lens.model][1]
+    distortion = Lens(lens.model, lens.params[len(lens.params) - count :] if count else ())
+    if lens.model == "EQUIRECTANGULAR":  # all around, whatever its parameters
+        focal, center = (lens.width / (2 * np.pi), lens.height / np.pi), (lens.width / 2, lens.height / 2)
+    else:
+        focals = lens.params[: len(lens.params) - count - 2]
+        focal, center = (focals[0], focals[-1]), lens.params[len(focals) : len(focals) + 2]
+    return Camera(lens.width, lens.height, *focal, *center, *pose, lens=distortion)
 
 
 def _pinhole(lens: pycolmap.Camera, pose: tuple[np.ndarray, np.ndarray]) -> Camera:
@@ -71,13 +107,13 @@ def _pinhole(lens: pycolmap.Camera, pose: tuple[np.ndarray, np.ndarray]) -> Came
     return Camera(lens.width, lens.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *pose)
 
 
-def _rescaled(lens: Lens, size: tuple[int, int]) -> pycolmap.Camera:
+def _rescaled(lens: Calibration, size: tuple[int, int]) -> pycolmap.Camera:
     camera = lens.load()
     camera.rescale(*size)
     return camera
 
 
-def _undistorted(lens: Lens, size: tuple[int, int]) -> pycolmap.Camera:
+def _undistorted(lens: Calibration, size: tuple[int, int]) -> pycolmap.Camera:
     """The pinhole that COLMAP's image_undistorter gives ``lens``, without blank pixels."""
     camera = _rescaled(lens, size)
     try:
@@ -89,7 +125,7 @@ def _undistorted(lens: Lens, size: tuple[int, int]) -> pycolmap.Camera:
         ) from error
 
 
-def sampling_of(lens: Lens, size: tuple[int, int]) -> np.ndarray:
+def sampling_of(lens: Calibration, size: tuple[int, int]) -> np.ndarray:
     """Where in the distorted image each pixel of the undistorted one lies, for :func:`images.undistort`."""
     pinhole = _undistorted(lens, size)
     y, x = np.mgrid[-1 : pinhole.height + 1, -1 : pinhole.width + 1] + 0.5

@@ -54,7 +54,10 @@ def _along_rays(cameras: list[Camera], extent: float, random: np.random.Generato
         mine = slice(index, None, len(cameras))
         x = (pixels[mine, 0] * camera.width - camera.cx) / camera.fx
         y = (pixels[mine, 1] * camera.height - camera.cy) / camera.fy
-        seen = np.stack([x, y, np.ones_like(x)], 1) * depths[mine, None] - camera.translation
+        ahead = np.stack([x, y, np.ones_like(x)], 1)
+        if camera.lens:
+            ahead = np.nan_to_num(camera.lens.undistorted(ahead[:, :2]))  # at the camera, where it sees nothing
+        seen = ahead * depths[mine, None] - camera.translation
         points[mine] = (seen[:, :, None] * camera.rotation).sum(1)
     return points
 

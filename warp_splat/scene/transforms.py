@@ -7,6 +7,7 @@ tells how nerfstudio came there from COLMAP's frame. It is ignored, so coordinat
 import json
 import reprlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from warp_splat.formats.ply import GRAY, load_points
 from warp_splat.formats.reading import reading
 from warp_splat.scene import images
 from warp_splat.scene.images import Photo
-from warp_splat.scene.lenses import Lens, Sampling, make_photo, make_sampling
+from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses
 from warp_splat.scene.photos import ImageFinder
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
@@ -27,7 +28,7 @@ TOLERANCE = 1e-3  # of a pose's axes, for files that round their numbers
 JSON_BYTES = 2**24  # of 20,000 frames; no JSON of this size takes more than a gigabyte once parsed
 LARGEST = 1e9  # of a number that describes a lens
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
-FISHEYE = "OPENCV_FISHEYE"
+FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 
 
 def has_transforms(source: Path) -> bool:
@@ -36,9 +37,11 @@ def has_transforms(source: Path) -> bool:
 
 
 def read_transforms(
-    source: Path, report: Callable[[str], object]
+    source: Path, report: Callable[[str], object], native: bool = False
 ) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
     """Read the cameras in ``source``, and its points or, for nerf-synthetic, random ones.
+
+    ``native``: lenses stay as they are, instead of becoming pinholes.
 
     Returns:
         Photos of the training set. Those of the test set: none without transforms_test.json or nerfstudio's lists of
@@ -51,10 +54,11 @@ def read_transforms(
     """
     if not (source / TRAIN).is_file():
         content = _parse(source / ALL)
-        train, test = _split(source / ALL, content, _read_photos(source / ALL, content, report), report)
+        train, test = _split(source / ALL, content, _read_photos(source / ALL, content, report, native), report)
         return train, test, *_points(source, content.get("ply_file_path"), report)
     train, test = (
-        _read_photos(path, _parse(path), report) if path.is_file() else [] for path in (source / TRAIN, source / TEST)
+        _read_photos(path, _parse(path), report, native) if path.is_file() else []
+        for path in (source / TRAIN, source / TEST)
     )
     points = np.random.default_rng(0).uniform(-HALF_WIDTH, HALF_WIDTH, (POINTS, 3)).astype(np.float32)
     return train, test, points, np.full((POINTS, 3), GRAY, np.uint8)
@@ -74,7 +78,7 @@ def _parse(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], object]) -> list[Photo]:
+def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], object], native: bool) -> list[Photo]:
     frames = _value(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: expected a list of at least one frame under the key frames; correct the file.")
@@ -82,14 +86,12 @@ def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], ob
     finder = ImageFinder(path.parent)
     names = [_path(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
     paths = finder.find_all(names, f"frames of {path.name}", "copy them there", report)
-    sampling = make_sampling()
+    sampling = make_sampling(native)
     photos = [
         _photo({**content, **frame}, found, finder, sampling, where)
         for frame, found, where in zip(frames, paths, places, strict=True)
     ]
-    distorted = sum(photo.sampling is not None for photo in photos)
-    if distorted:
-        report(f"Undistorting {distorted} of {len(photos)} images to pinhole cameras.")
+    tell_lenses(photos, report)
     return photos
 
 
@@ -123,7 +125,7 @@ def _names(content: dict[str, Any], key: str, path: Path) -> set[str]:
     return {Path(name).as_posix() for name in names}
 
 
-def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sampling, where: str) -> Photo:
+def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sampling | None, where: str) -> Photo:
     """The photo of a frame; ``values`` are its own and, where it has none, those of the file."""
     size = images.read_size(path)
     pose = _pose(_value(values, "transform_matrix", where), where)
@@ -135,10 +137,10 @@ def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sa
     mask = finder.find(_path(values, "mask_path", where))
     if mask is None:
         raise InputError(f"{where}: expected the mask {values['mask_path']!r:.200}, found no such file; copy it there.")
-    return Photo(name, path, photo.camera, photo.sampling, mask)
+    return replace(photo, mask=mask)
 
 
-def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Lens:
+def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibration:
     """The lens that a frame describes in the manner of nerfstudio, or by camera_angle_x as nerf-synthetic does."""
 
     def number(key: str, default: float = 0.0) -> float:
@@ -150,6 +152,8 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Lens:
     width, height = number("w", size[0]), number("h", size[1])
     if not (width.is_integer() and height.is_integer() and min(width, height) >= 1):
         raise InputError(f"{where}: expected w and h as numbers of pixels, got {width} and {height}; correct the file.")
+    if values.get("camera_model") == PANORAMA:
+        return Calibration(PANORAMA, int(width), int(height), (width, height))
     if "fl_x" in values:
         fx = number("fl_x")
     else:
@@ -169,10 +173,11 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Lens:
         )
     else:
         raise InputError(
-            f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2 or {FISHEYE} with k1 to k4, got "
+            f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2, {FISHEYE} with k1 to k4 or {PANORAMA}, "
+            f"got "
             f"{reprlib.repr(model)} with k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs first."
         )
-    return Lens(model, int(width), int(height), params)
+    return Calibration(model, int(width), int(height), params)
 
 
 def _points(source: Path, name: Any, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:

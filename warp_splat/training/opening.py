@@ -100,7 +100,10 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene
     if learn.coarse > 1 and learn.coarse_until_iter > learn.iterations:
         say(f"Warning: images reach their full size at --coarse_until_iter {learn.coarse_until_iter}, after the end.")
     start = data.start_ply if not begun or os.path.isfile(data.start_ply) else ""  # if it has gone
-    same = {name: getattr(data, name) for name in ("images", "resolution", "white_background", "eval", "invert_masks")}
+    same = {
+        name: getattr(data, name)
+        for name in ("images", "resolution", "white_background", "eval", "invert_masks", "lens")
+    }
     scene = load_scene(data.source_path, **same, start=start, report=say)
     if scene.random_points and not begun:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")

@@ -5,7 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from warp_splat.config import ADJOINTS, LAST_PORT, LOSS_SPACES, LPIPS_HELP, OPTIMIZERS, PORT, PORT_HELP, PROJECTIONS
+from warp_splat.config import (
+    ADJOINTS,
+    LAST_PORT,
+    LENSES,
+    LOSS_SPACES,
+    LPIPS_HELP,
+    OPTIMIZERS,
+    PORT,
+    PORT_HELP,
+    PROJECTIONS,
+)
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers, data, flag, growing, learning, machinery, rendering, reporting
 from warp_splat.training.growth import GROWTHS
@@ -28,6 +38,7 @@ class DataOptions:
     images: str = data("images", "folder of the photographs inside a COLMAP scene", "-i")
     white_background: bool = data(False, "composite on white instead of black", "-w")
     invert_masks: bool = data(False, "of the masks in masks/, the dark part counts, not the bright one")
+    lens: str = data("undistort", "photographs with distortion: as pinholes would take them, or as is", choices=LENSES)
     loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=LOSS_SPACES)
     start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")

@@ -18,9 +18,10 @@ ARGUMENTS = {"lens": 4, "outline": 17}
 
 
 class Projection(NamedTuple):
-    """What one projection does otherwise than another. Both members make a Warp function for a number of lanes.
+    """What one projection does otherwise than another.
 
-    Numbers are of ``TYPES[lanes].number``, and written with the words of :mod:`warp_splat.kernels.simd`.
+    ``lens`` and ``outline`` make a Warp function for a number of lanes. Numbers are of ``TYPES[lanes].number``, and
+    written with the words of :mod:`warp_splat.kernels.simd`.
 
     lens(camera, x, y, z):
         The mean in the camera [world units] -> (px, py, j00, j01, j02, j10, j11, j12): where it is seen [px], and the
@@ -28,10 +29,13 @@ class Projection(NamedTuple):
     outline(camera, z, px, py, a10, a11, a12, a20, a21, a22, t0, t1, t2, sx, sy, sz, drawn):
         a1, a2: rows of J W R S [px]; t: third row of W R, times the scales s the extent along the optical axis; a mask.
         -> (px, py, a10, a11, a12, a20, a21, a22, drawn): the corrected ones. None: all stays as it is.
+    wide:
+        It sees beside and behind the camera: depth is the distance, and z may be negative.
     """
 
     lens: Callable[[int], wp.Function]
     outline: Callable[[int], wp.Function] | None = None
+    wide: bool = False
 
     def functions(self, lanes: int) -> list[wp.Function | None]:
         """Lens and outline for a number of lanes.
@@ -40,7 +44,7 @@ class Projection(NamedTuple):
             InputError: if a member makes no Warp function of as many arguments.
         """
         found = []
-        for (name, count), make in zip(ARGUMENTS.items(), self, strict=True):
+        for (name, count), make in zip(ARGUMENTS.items(), self[:2], strict=True):
             made = make(lanes) if callable(make) else make
             fits = isinstance(made, wp.Function) and len(made.input_types) == count
             if not fits and (make is not None or name == "lens"):

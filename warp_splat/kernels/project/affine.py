@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project import Projection, lens
 from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.simd import TYPES, fill, fma, inverse, less, over, pick, times
 
@@ -46,4 +46,5 @@ def make_pinhole(lanes: int, limited: bool = True) -> wp.Function:
     return pinhole
 
 
+through = lens.through  # a lens with distortion
 PROJECTION = Projection(make_pinhole)

@@ -20,6 +20,7 @@ class CameraView:
     sh_degree: int
     antialiasing: int
     alpha_min: float
+    lens: vec16  # coefficients of its formula; last, how far from the axis it is followed (:mod:`.lens`)
 
 
 @wp.func

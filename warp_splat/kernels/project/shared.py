@@ -75,6 +75,26 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         pass
 
     @wp.func
+    def all_finite(
+        mx: number,
+        my: number,
+        mz: number,
+        qw: number,
+        qx: number,
+        qy: number,
+        qz: number,
+        sx: number,
+        sy: number,
+        sz: number,
+        opacity: number,
+    ):
+        """Mask: 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU."""
+        none = fill(0.0, opacity)
+        nought = fma(mx, none, fma(my, none, fma(mz, none, times(opacity, none))))
+        nought = fma(qw, none, fma(qx, none, fma(qy, none, fma(qz, none, nought))))
+        return equal(fma(sx, none, fma(sy, none, fma(sz, none, nought))), none)
+
+    @wp.func
     def rotation(qw: number, qx: number, qy: number, qz: number, size: number):
         """The matrix of a quaternion whose largest entry is ``size``, row by row."""
         one = fill(1.0, size)
@@ -154,7 +174,8 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
     def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
         pass
 
-    parts = {"lens": lens, "rotation": rotation, "covariance": covariance} | ({"outline": outline} if outline else {})
+    parts = {"all_finite": all_finite, "lens": lens, "rotation": rotation, "covariance": covariance}
+    parts |= {"outline": outline} if outline else {}
 
     @kernel_of_parts(DIFFERENTIABLE, **parts)
     def project(
@@ -179,10 +200,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         opacity = opacities[g]
         zero = fill(0.0, opacity)
         one = fill(1.0, opacity)
-        # 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU
-        nought = fma(mx, zero, fma(my, zero, fma(mz, zero, times(opacity, zero))))
-        nought = fma(qw, zero, fma(qx, zero, fma(qy, zero, fma(qz, zero, nought))))
-        finite = equal(fma(sx, zero, fma(sy, zero, fma(sz, zero, nought))), zero)
+        finite = all_finite(mx, my, mz, qw, qx, qy, qz, sx, sy, sz, opacity)
         size = largest(qw, qx, qy, qz)
         valid = times(finite, less(zero, size))
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
@@ -195,11 +213,15 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         r21 = turn(camera, 2, 1, one)
         r22 = turn(camera, 2, 2, one)
         depth = fma(r20, ox, fma(r21, oy, times(r22, oz)))
+        if wp.static(projection.wide):
+            depth = root(fma(ox, ox, fma(oy, oy, times(oz, oz))))
         here = times(here, less(fill(NEAR, one), depth))
         if not some(here):
             return
         # harmless numbers take the place of those that are left out
         z = pick(here, depth, one)
+        if wp.static(projection.wide):
+            z = fma(r20, ox, fma(r21, oy, times(r22, oz)))
         size = pick(here, size, one)
         qw = pick(here, qw, one)
         qx = pick(here, qx, zero)
@@ -241,9 +263,8 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         radii_out[g] = whole(code)
         here = times(times(here, bounded), one - less(opacity, fill(camera.alpha_min, one)))
         extent_x, extent_y, farthest = support(opacity, camera.alpha_min, xx, xy, yy)
-        here = times(
-            here, times(covers_pixel(px, extent_x, camera.size[0]), covers_pixel(py, extent_y, camera.size[1]))
-        )
+        inside = times(covers_pixel(px, extent_x, camera.size[0]), covers_pixel(py, extent_y, camera.size[1]))
+        here = times(here, inside)
         if not some(here):
             return
         means2d_out[g] = rows(pick(here, px, zero), pick(here, py, zero))

@@ -1,0 +1,204 @@
+"""Formulas in NumPy, written down as functions of kernels, with their derivatives.
+
+A :class:`Number` takes part in a computation and notes each step instead of taking it. It also notes its slopes: its
+derivatives by the variables, by the rules of forward differentiation. So one function of NumPy serves arrays on the
+host and sixteen Gaussians in a kernel, and no derivative of it is written by hand.
+"""
+
+from __future__ import annotations
+
+import linecache
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_splat.kernels import simd
+from warp_splat.kernels.project.camera_view import CameraView, turn
+
+Name = str | None  # of a variable of the function; None: zero
+
+
+class Notes:
+    """The steps of a computation, each taken once."""
+
+    def __init__(self):
+        self.steps: dict[tuple[str, ...], str] = {}  # what is computed of what, and the name of the result
+
+    def note(self, operation: str, *operands: str) -> str:
+        """The name of what an operation of :mod:`.simd` gives."""
+        return self.steps.setdefault((operation, *operands), f"v{len(self.steps)}")
+
+    def constant(self, value: float) -> Name:
+        """Its name."""
+        return self.note("fill", repr(float(value))) if value else None
+
+    def given(self, code: str) -> Number:
+        """A number of the camera."""
+        return Number(self, self.note("fill", code))
+
+    def product(self, a: Name, b: Name) -> Name:
+        """Of what may be zero or one."""
+        one = self.steps.get(("fill", "1.0"))
+        if a is None or b is None or one in (a, b):
+            return None if a is None or b is None else a if b == one else b
+        return self.note("times", *sorted((a, b)))
+
+    def sum(self, a: Name, b: Name) -> Name:
+        """Likewise."""
+        return self.note("plus", a, b) if a and b else a or b
+
+    def difference(self, a: Name, b: Name) -> Name:
+        """Likewise."""
+        return self.note("minus", a, b) if a and b else a or (b and self.note("negative", b))
+
+    def chosen(self, mask: str, a: Name, b: Name) -> Name:
+        """``a`` where the mask is set, else ``b``."""
+        return self.note("pick", mask, self.real(a), self.real(b)) if a or b else None
+
+    def real(self, a: Name) -> str:
+        """The name of a number that may be zero."""
+        return a or self.note("fill", "0.0")
+
+    def lines(self, results: Sequence[str], like: str) -> list[str]:
+        """As statements: only what ``results`` need; a sum with a product that nothing else needs is fused."""
+        steps, needed = {name: step for step, name in self.steps.items()}, Counter(results)
+        for name in reversed(steps):
+            if name in needed:
+                needed.update(operand for operand in steps[name][1:] if operand in steps)
+        written = []
+        for name, (operation, *operands) in steps.items():
+            if name not in needed:
+                continue
+            if operation == "plus":
+                product = next((a for a in operands if needed[a] == 1 and steps.get(a, " ")[0] == "times"), None)
+                if product:
+                    (other,) = (a for a in operands if a != product)
+                    written = [line for line in written if not line.startswith(f"{product} ")]
+                    operation, operands = "fma", [*steps[product][1:], other]
+            operands += [like] if operation == "fill" else []
+            code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}"}.get(operation)
+            code = code.format(*operands) if code else f"{operation}({', '.join(operands)})"
+            written.append(f"{name} = {code}")
+        return written
+
+
+class Number(np.lib.mixins.NDArrayOperatorsMixin):
+    """A number of a computation that is noted, and its slopes.
+
+    Args:
+        notes: of the computation.
+        name: of the number.
+        slopes: the names of its derivatives by the variables.
+    """
+
+    def __init__(self, notes: Notes, name: Name, slopes: tuple[Name, ...] = ()):
+        self.notes, self.name, self.slopes = notes, name, slopes
+
+    def __array_ufunc__(self, function: np.ufunc, method: str, *operands):
+        if method != "__call__" or function not in RULES:
+            raise NotImplementedError(f"{function}: no rule for it; see warp_splat/kernels/formula.py")
+        return RULES[function](self.notes, *_aligned(self.notes, operands))
+
+    def __array_function__(self, function: Callable, _types, operands, _keywords):
+        if function is not np.where:
+            raise NotImplementedError(f"{function}: no rule for it; see warp_splat/kernels/formula.py")
+        mask, a, b = _aligned(self.notes, operands)
+        slopes = (self.notes.chosen(mask.name, *pair) for pair in zip(a.slopes, b.slopes, strict=True))
+        return Number(self.notes, self.notes.chosen(mask.name, a.name, b.name), tuple(slopes))
+
+
+def _aligned(notes: Notes, operands: Sequence) -> list[Number]:
+    """All as numbers with as many slopes."""
+    found = [a if isinstance(a, Number) else Number(notes, notes.constant(a)) for a in operands]
+    most = max(len(a.slopes) for a in found)
+    return [Number(notes, a.name, a.slopes or (None,) * most) for a in found]
+
+
+def _multiply(notes: Notes, a: Number, b: Number) -> Number:
+    pairs = zip(a.slopes, b.slopes, strict=True)
+    slopes = (notes.sum(notes.product(da, b.name), notes.product(a.name, db)) for da, db in pairs)
+    return Number(notes, notes.product(a.name, b.name), tuple(slopes))
+
+
+def _add(notes: Notes, a: Number, b: Number) -> Number:
+    slopes = (notes.sum(*pair) for pair in zip(a.slopes, b.slopes, strict=True))
+    return Number(notes, notes.sum(a.name, b.name), tuple(slopes))
+
+
+def _subtract(notes: Notes, a: Number, b: Number) -> Number:
+    slopes = (notes.difference(*pair) for pair in zip(a.slopes, b.slopes, strict=True))
+    return Number(notes, notes.difference(a.name, b.name), tuple(slopes))
+
+
+def _negative(notes: Notes, a: Number) -> Number:
+    return _subtract(notes, Number(notes, None, (None,) * len(a.slopes)), a)
+
+
+def _divide(notes: Notes, a: Number, b: Number) -> Number:
+    per_b = notes.note("inverse", notes.real(b.name))
+    ratio = notes.product(a.name, per_b)
+    pairs = zip(a.slopes, b.slopes, strict=True)
+    slopes = (notes.product(notes.difference(da, notes.product(ratio, db)), per_b) for da, db in pairs)
+    return Number(notes, ratio, tuple(slopes))
+
+
+def _sqrt(notes: Notes, a: Number) -> Number:
+    root = notes.note("root", notes.real(a.name))
+    half = notes.product(notes.constant(0.5), notes.note("inverse", root))
+    return Number(notes, root, tuple(notes.product(slope, half) for slope in a.slopes))
+
+
+def _arctan2(notes: Notes, a: Number, b: Number) -> Number:
+    per_square = notes.note(
+        "inverse", notes.real(notes.sum(notes.product(a.name, a.name), notes.product(b.name, b.name)))
+    )
+    turns = (
+        notes.difference(notes.product(b.name, da), notes.product(a.name, db))
+        for da, db in zip(a.slopes, b.slopes, strict=True)
+    )
+    slopes = (notes.product(turned, per_square) for turned in turns)
+    return Number(notes, notes.note("angle", notes.real(a.name), notes.real(b.name)), tuple(slopes))
+
+
+def _less(notes: Notes, a: Number, b: Number) -> Number:
+    return Number(notes, notes.note("less", notes.real(a.name), notes.real(b.name)), (None,) * len(a.slopes))
+
+
+#: What formulas may use besides ``np.where``.
+RULES = {
+    np.add: _add,
+    np.subtract: _subtract,
+    np.multiply: _multiply,
+    np.true_divide: _divide,
+    np.negative: _negative,
+    np.sqrt: _sqrt,
+    np.arctan2: _arctan2,
+    np.less: _less,
+    np.greater: lambda notes, a, b: _less(notes, b, a),
+}
+
+
+def write_function(
+    name: str, notes: Notes, parameters: Sequence[str], results: Sequence[Number], lanes: int
+) -> wp.Function:
+    """The function of ``lanes`` numbers, the camera first, that does what was noted.
+
+    Args:
+        name: of the function.
+        notes: of the computation.
+        parameters: the numbers that it takes.
+        results: what it returns.
+        lanes: numbers side by side.
+    """
+    names = [notes.real(result.name) for result in results]
+    body = [*notes.lines(names, parameters[-1]), f"return {', '.join(names)}"]
+    head = f"def {name}(camera: CameraView, {', '.join(f'{parameter}: number' for parameter in parameters)}):"
+    source = "\n    ".join([head, *body]) + "\n"
+    path = f"<{name} {zlib.crc32(source.encode())} of {lanes}>"
+    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
+    known = {**vars(simd), "CameraView": CameraView, "turn": turn, "number": simd.TYPES[lanes].number}
+    exec(compile(source, path, "exec"), known)
+    return wp.func(known[name])
