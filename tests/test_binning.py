@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from warp_splat import Camera, InputError, RasterOptions, set_threads
-from warp_splat.raster import api, bin, cpu, depth_order
+from warp_splat.raster import api, bin, depth_order
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU, CUDA, using
@@ -64,9 +64,8 @@ def test_places_are_those_of_each_splat():
 
 
 @pytest.mark.parametrize("width", [9, 10])
-def test_rows_are_summed_by_gaussian(width, monkeypatch):
+def test_rows_are_summed_by_gaussian(width):
     """Whoever shares the work: bit for bit the sums that one gets from first to last."""
-    monkeypatch.setattr(cpu, "AT_ONCE", 700)
     camera, projected = project(5000)
     threads = get_threads()
     try:
@@ -86,17 +85,7 @@ def test_rows_are_summed_by_gaussian(width, monkeypatch):
         set_threads(threads)
 
 
-@pytest.fixture
-def torch_threads():
-    threads = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(threads)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_rows_are_summed_in_any_mode_of_torch(count, torch_threads, monkeypatch):
-    monkeypatch.setattr(cpu, "AT_ONCE", 100)
-    torch_threads(count)
+def test_rows_are_summed_in_any_mode_of_torch():
     camera, projected = project(2000)
     bins = CPU.bin(projected, camera, PLAIN)
     slots = torch.rand(len(bins.instances), 9)

@@ -155,12 +155,13 @@ def render(
         bins = driver.bin(splats, camera, options)
     with stage("blend"):
         image, alpha, depth = blend(splats, bins, background, camera, options, adjoint, driver, dropped)
+    all_valid = isinstance(bins.invalid, int) and not bins.invalid  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,
         alpha=alpha,
         depth=depth / alpha.clamp_min(1e-10) if options.depth else None,
         means2d=splats.means2d,
-        radii=splats.radii.clamp_min(0),
+        radii=splats.radii if all_valid else splats.radii.clamp_min(0),
         conics=splats.conics,
         colors=splats.colors,
         depths=splats.depths,

@@ -26,7 +26,7 @@ from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gra
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import launch, pack_struct, view
-from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, torch_slices
+from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, fill, in_slices, torch_slices
 from warp_splat.runtime.timers import stage
 
 
@@ -169,11 +169,13 @@ class Project(torch.autograd.Function):
         ctx, means, quats, scales, opacities, sh_dc, sh_rest, twist, intrinsics, camera, cam, kernel, driver, dropped
     ):
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
-        count, new, lanes = means.shape[0], means.new_zeros, driver.lanes
+        count, new, lanes = means.shape[0], means.new_empty, driver.lanes
         splats = Splats2D(
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
-            radii=torch.full((count,), int(UNSEEN), dtype=torch.int32, device=means.device),
+            radii=new(count, dtype=torch.int32),
         )
+        fill(0, *splats[:-1])
+        fill(int(UNSEEN), splats.radii)
         _project_geometry(cam, kernel, lanes, _shapes(gaussians), _geometry(splats))
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
@@ -199,7 +201,8 @@ class Project(torch.autograd.Function):
             inputs = [ctx.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
             outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
-            shapes = (torch.zeros_like(tensor) for tensor in (given.quats, given.scales, given.opacities))
+            shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
+            fill(0, *shapes)
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
             adj_placed = torch.zeros_like(adj_means) if wants_twist else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)

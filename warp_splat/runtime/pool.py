@@ -169,3 +169,13 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
         _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
         _helpers[-1].start()
     _Job(slices).share(helpers)
+
+
+def fill(value: float, *tensors: torch.Tensor) -> None:
+    """Set every number of dense ``tensors``, N rows each, to ``value``, on the threads of the CPU."""
+
+    def run(low: int, high: int) -> None:
+        for tensor in tensors:
+            tensor[low:high].fill_(value)
+
+    in_slices(run, torch_slices(len(tensors[0]), tensors[0].device))
