@@ -26,7 +26,7 @@ from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gra
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import launch, pack_struct, view
-from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, fill, in_slices, torch_slices
+from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
 
 
@@ -174,8 +174,8 @@ class Project(torch.autograd.Function):
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
             radii=new(count, dtype=torch.int32),
         )
-        fill(0, *splats[:-1])
-        fill(int(UNSEEN), splats.radii)
+        set_all(0, *splats[:-1])
+        set_all(int(UNSEEN), splats.radii)
         _project_geometry(cam, kernel, lanes, _shapes(gaussians), _geometry(splats))
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
@@ -202,7 +202,7 @@ class Project(torch.autograd.Function):
             outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
-            fill(0, *shapes)
+            set_all(0, *shapes)
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
             adj_placed = torch.zeros_like(adj_means) if wants_twist else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)

@@ -171,7 +171,7 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
     _Job(slices).share(helpers)
 
 
-def fill(value: float, *tensors: torch.Tensor) -> None:
+def set_all(value: float, *tensors: torch.Tensor) -> None:
     """Set every number of dense ``tensors``, N rows each, to ``value``, on the threads of the CPU."""
 
     def run(low: int, high: int) -> None:
