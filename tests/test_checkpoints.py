@@ -24,11 +24,11 @@ from test_train import ROOT, SCENE, SHORT, fails, train
 from warp_splat.cli import main, parse
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import LAST, load_checkpoint, save_checkpoint
+from warp_splat.formats.curve import along_curve
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.splats import SplatFile
-from warp_splat.gaussians import along_curve
 from warp_splat.training.config_file import load_options
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import Run, keep, restore

@@ -8,7 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from warp_splat.gaussians import GaussianModel, along_curve
+from warp_splat.formats.curve import along_curve
+from warp_splat.gaussians import GaussianModel
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.growth.reference import Reference, rotate
 from warp_splat.training.optimizer import Optimizer

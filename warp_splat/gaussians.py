@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
+from warp_splat.formats.curve import along_curve
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.activation import make_activate, make_adj_activate
@@ -22,15 +23,6 @@ from warp_splat.runtime.launch import lanes_of, launch_in_lanes
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
-CELLS = 2**20  # of the Morton curve, along an axis
-#: Shifts and masks that put two zeros between the bits of a number below 2^21.
-MORTON = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
 
 
 def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -174,21 +166,3 @@ def _log(x: np.ndarray) -> np.ndarray:
     m, exponent = np.frexp(x)
     s = (m - 1.0) / (m + 1.0)
     return exponent * LN_2 + 2.0 * s * np.polyval(1.0 / np.arange(19, 0, -2), s * s)
-
-
-def along_curve(means: torch.Tensor) -> torch.Tensor:
-    """The order of points [N, 3] along a Morton curve (1966): indices [N] int64.
-
-    What lies near each other in space then does so in memory. With splats stored in that order, a step of 194,000
-    Gaussians takes 13 % less time.
-    """
-    values = torch.nan_to_num(means.detach())
-    count, spare = len(values), len(values) // 100  # what lies far out shall not set the size of the cells
-    if not count:
-        return torch.empty(0, dtype=torch.int64, device=means.device)
-    low, high = (values.kthvalue(place, dim=0).values for place in (1 + spare, count - spare))
-    shares = torch.nan_to_num((values - low) / (high - low).amax().clamp_min(1e-30)).clamp(0.0, 1.0)
-    cells = (shares * (CELLS - 1)).long()
-    for shift, mask in MORTON:
-        cells = (cells | (cells << shift)) & mask
-    return torch.sort(cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2), stable=True).indices

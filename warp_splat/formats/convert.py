@@ -28,7 +28,7 @@ def convert(config: ConvertConfig) -> int:
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")
     before = before._replace(antialiased=bool(trained["antialiasing"]))
     notes: list[str] = []
-    save_gaussians(config.target, before, notes.append)
+    before = save_gaussians(config.target, before, notes.append)
     after = load_gaussians(config.target)
     degree = COEFFICIENTS.index(after.splats.sh.shape[1])
     print(f"{config.target}: {len(after.splats.means)} Gaussians, SH degree {degree}")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from warp_splat.errors import InputError
 from warp_splat.formats.gltf import load_gltf, save_gltf
 from warp_splat.formats.ply import load_ply, save_ply
+from warp_splat.formats.sog import load_sog, save_sog
 from warp_splat.formats.splat32 import load_splat, save_splat
 from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows
 from warp_splat.formats.spz import load_spz, save_spz
@@ -21,12 +22,14 @@ class Format(NamedTuple):
 
     load: Callable[[str | Path, Report], SplatFile]
     save: Callable[[str | Path, SplatFile, Report], None]
+    along_curve: bool = False  # written in an order in which near Gaussians follow each other
 
 
 FORMATS = {
     ".ply": Format(load_ply, save_ply),
     ".splat": Format(load_splat, save_splat),
     ".spz": Format(load_spz, save_spz),
+    ".sog": Format(load_sog, save_sog, along_curve=True),
     ".glb": Format(load_gltf, save_gltf),
     ".gltf": Format(load_gltf, save_gltf),
 }
@@ -58,7 +61,7 @@ def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:
     return file._replace(splats=finite_rows(file.splats, path, report))
 
 
-def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) -> None:
+def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) -> SplatFile:
     """Write Gaussians in the format that the name asks for.
 
     Args:
@@ -66,8 +69,17 @@ def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) ->
         file: the Gaussians, finite.
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
+    Returns:
+        The Gaussians in the order in which they were written.
+
     Raises:
         InputError: if the ending is unknown, a shape disagrees with the others, or the file cannot be written.
     """
     check_shapes(file.splats)
-    format_of(path).save(path, file, report)
+    form = format_of(path)
+    if form.along_curve:
+        from warp_splat.formats.curve import arranged  # noqa: PLC0415 - torch takes seconds to load
+
+        file = file._replace(splats=arranged(file.splats))
+    form.save(path, file, report)
+    return file

@@ -8,7 +8,6 @@ Own code, plain JSON and NumPy: the libraries for glTF build objects from the JS
 
 from __future__ import annotations
 
-import json
 import math
 import struct
 from pathlib import Path
@@ -17,7 +16,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from warp_splat.formats.reading import Unexpected
+from warp_splat.formats.reading import Unexpected, entries_of, json_object, numbers_of, whole_number
 
 HEADER = struct.Struct("<4sII")  # of a .glb file: magic, version, length
 CHUNK = struct.Struct("<I4s")  # length, type
@@ -57,7 +56,7 @@ class Document:
                 raise Unexpected(f"a JSON file of {size} bytes, more than {JSON_BYTES}")
             else:
                 text = source.read()
-        self.json = _parse(text)
+        self.json = json_object(text)
         count = len(self.entries("buffers"))
         if count > MOST_BUFFERS:
             raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
@@ -71,7 +70,7 @@ class Document:
 
     def entries(self, key: str) -> list:
         """A list of the JSON, empty if it has none."""
-        return _list(self.json, key)
+        return entries_of(self.json, key)
 
     def entry(self, kind: str, index: Any) -> dict:
         """The object ``index`` of the list ``kind`` of the JSON."""
@@ -114,9 +113,9 @@ class Document:
         """The meshes of the scene, each with the matrix [4, 4] from its coordinates to the world's."""
         nodes = self.entries("nodes")
         if "scenes" in self.json:
-            roots = _list(self.entry("scenes", self.json.get("scene", 0)), "nodes")
+            roots = entries_of(self.entry("scenes", self.json.get("scene", 0)), "nodes")
         else:  # a library of meshes: all that nobody else places
-            children = [child for node in nodes if isinstance(node, dict) for child in _list(node, "children")]
+            children = [child for node in nodes if isinstance(node, dict) for child in entries_of(node, "children")]
             roots = sorted(set(range(len(nodes))) - {child for child in children if isinstance(child, int)})
         open_nodes, seen, found = [(index, np.eye(4)) for index in reversed(roots)], set(), []
         while open_nodes:
@@ -131,7 +130,7 @@ class Document:
                 raise ValueError(f"node {index} has a transform that is not finite")
             if "mesh" in node:
                 found.append((self.entry("meshes", node["mesh"]), world))
-            open_nodes += [(child, world) for child in reversed(_list(node, "children"))]
+            open_nodes += [(child, world) for child in reversed(entries_of(node, "children"))]
         return found
 
     def _open(self, entry: dict, chunk: Buffer | None) -> Buffer:
@@ -177,15 +176,6 @@ class Document:
         return source.read(text.length), chunks.get(b"BIN\0")
 
 
-def whole_number(value: Any, what: str, most: int) -> int:
-    """``value`` if it is a whole number, 0 to ``most``."""
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise Unexpected(f"{what} {value!r:.40}, which is no whole number")
-    if not 0 <= value <= most:
-        raise ValueError(f"{what} {value if abs(value) < 10**18 else 'of many digits'}, at most {most} is there")
-    return value
-
-
 def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
 
@@ -202,46 +192,19 @@ def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     return u @ v, matrix[:3, 3], scale
 
 
-def _parse(text: bytes) -> dict:
-    def refuse(name: str):
-        raise ValueError(f"the JSON holds {name}")
-
-    parsed = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    if not isinstance(parsed, dict):
-        raise Unexpected("JSON that is no object")
-    return parsed
-
-
-def _list(entry: dict, key: str) -> list:
-    found = entry.get(key, [])
-    if not isinstance(found, list):
-        raise Unexpected(f"{key} that are no list")
-    return found
-
-
 def _matrix(node: dict) -> np.ndarray:
     """The transform [4, 4] of a node."""
     if "matrix" in node:
-        return _numbers(node, "matrix", 16).reshape(4, 4).T
+        return numbers_of(node, "matrix", 16).reshape(4, 4).T
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most files have none
 
     matrix = np.eye(4)
-    matrix[:3, 3] = _numbers(node, "translation", 3) if "translation" in node else 0
+    matrix[:3, 3] = numbers_of(node, "translation", 3) if "translation" in node else 0
     if "rotation" in node:
-        quat = _numbers(node, "rotation", 4)
+        quat = numbers_of(node, "rotation", 4)
         if not 1e-6 < np.linalg.norm(quat) < 1e6:
             raise ValueError(f"a rotation {quat.tolist()}")
         matrix[:3, :3] = Rotation.from_quat(quat).as_matrix()
     if "scale" in node:
-        matrix[:3, :3] *= _numbers(node, "scale", 3)
+        matrix[:3, :3] *= numbers_of(node, "scale", 3)
     return matrix
-
-
-def _numbers(node: dict, key: str, count: int) -> np.ndarray:
-    values = _list(node, key)
-    if len(values) != count or not all(isinstance(value, int | float) for value in values):
-        raise Unexpected(f"{key} that are not {count} numbers")
-    array = np.array([float(value) for value in values])
-    if not np.isfinite(array).all():
-        raise ValueError(f"{key} that are not finite")
-    return array

@@ -22,7 +22,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.reading import Unexpected, check_expansion, reading
 from warp_splat.formats.splats import (
     COEFFICIENTS,
     SplatArrays,
@@ -49,8 +49,6 @@ SCALE_STEP, SCALE_LOW = 16.0, -10.0  # per unit of the log scale; its least
 FRACTION_BITS = 12  # steps of 1/4096 world unit, as the authors write, if the scene is less than 2048 units wide
 POSITION_MAX = 2**23 - 1
 DEGREE_COEFFICIENTS = (*COEFFICIENTS, 25)  # degree 4 is read, and left out
-LARGEST_RATIO = 64  # of packed to compressed bytes; files of real scenes reach 3
-SMALLEST_LIMIT = 2**24  # bytes that any file may expand to
 
 
 class _Packed(NamedTuple):
@@ -188,9 +186,7 @@ def _sizes(version: int, count: int, degree: int, file_bytes: int) -> list[int]:
     if degree >= len(DEGREE_COEFFICIENTS):
         raise Unexpected(f"SH degree {degree}")
     per_row = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * (DEGREE_COEFFICIENTS[degree] - 1))
-    limit = max(SMALLEST_LIMIT, LARGEST_RATIO * file_bytes)
-    if count * sum(per_row) > limit:
-        raise ValueError(f"{count} Gaussians expand to {count * sum(per_row)} bytes, over {limit}")
+    check_expansion(count, sum(per_row), file_bytes)
     return [count * row for row in per_row]
 
 

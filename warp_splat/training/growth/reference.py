@@ -11,7 +11,8 @@ import torch
 import warp as wp
 
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.gaussians import activate, along_curve
+from warp_splat.formats.curve import along_curve
+from warp_splat.gaussians import activate
 from warp_splat.kernels.simd import Types
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput

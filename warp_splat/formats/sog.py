@@ -1,0 +1,273 @@
+"""Gaussians as .sog files, version 2: PlayCanvas's Spatially Ordered Gaussians, lossless WebP images in a zip file.
+
+A pixel is a Gaussian, the same in all images but the palette. Positions are 16 bits on an axis of logarithms, in two
+images; scales, colors and palette are indices into codebooks of 256 numbers; rotations three bytes and which number
+they leave out; harmonics an index into a palette of up to 65536. ``meta.json`` holds the rest. The description is at
+developer.playcanvas.com (the SOG format). It says that axes are right, up, back; all programs there are, its authors'
+among them, keep those of the PLY file, and so do we.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from warp_splat.errors import InputError
+from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.palettes import ENTRIES, codebook, palette
+from warp_splat.formats.reading import (
+    Unexpected,
+    check_expansion,
+    entries_of,
+    json_object,
+    numbers_of,
+    reading,
+    whole_number,
+)
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, logit, sigmoid, unit_quats
+
+META = "meta.json"
+META_BYTES = 2**20  # fifty times that of any scene
+STEPS = 2**16 - 1  # of a position
+TAG = 252  # of a rotation: plus the index of the number that is left out, of w x y z
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+PALETTE_ROW = 64  # entries beside each other
+PALETTE_MOST = 2**16
+PALETTE_SHARE = 8  # Gaussians for an entry of the palette
+SPARE_PIXELS = 2**16  # that an image may have beyond twice the Gaussians
+PIXEL_BYTES = 20  # of a Gaussian's images, without harmonics
+
+
+def save_sog(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+    """Write Gaussians as a .sog file; near ones should follow each other, since images of them compress better.
+
+    Args:
+        path: the file to write.
+        file: the Gaussians.
+        report: not called: every range follows the values.
+
+    Raises:
+        InputError: if there are no Gaussians; if the file cannot be written.
+    """
+    means, sh, opacities, scales, quats = file.splats
+    count, coefficients, _ = sh.shape
+    if not count:
+        raise InputError(f"{path}: there are no Gaussians, and a .sog file cannot say so; choose another format.")
+    logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    steps = np.rint(STEPS * (logs - low) / np.where(high > low, high - low, 1)).astype(np.uint16)
+    scale_entries, scale_labels = codebook(scales)
+    color_entries, color_labels = codebook(sh[:, 0])
+    alphas = np.rint(255 * sigmoid(opacities.astype(np.float64))).astype(np.uint8)
+    images = {
+        "means_l": _laid_out(steps & 255),
+        "means_u": _laid_out(steps >> 8),
+        "scales": _laid_out(scale_labels),
+        "quats": _laid_out(_pack_quats(quats)),
+        "sh0": _laid_out(np.concatenate([color_labels, alphas[:, None]], axis=1)),
+    }
+    meta = {
+        "version": 2,
+        "asset": {"generator": "warp-splat"},
+        "count": count,
+        **({"antialias": True, "model": "antialiased"} if file.antialiased else {}),
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"codebook": _listed(scale_entries), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": _listed(color_entries), "files": ["sh0.webp"]},
+    }
+    if coefficients > 1:
+        entries, labels = palette(sh[:, 1:].reshape(count, -1), min(PALETTE_MOST, max(1024, count // PALETTE_SHARE)))
+        numbers, indices = codebook(entries)
+        rows = -(-len(entries) // PALETTE_ROW)
+        table = np.zeros((rows * PALETTE_ROW, coefficients - 1, 3), np.uint8)
+        table[: len(entries)] = indices.reshape(-1, coefficients - 1, 3)
+        images["shN_centroids"] = table.reshape(rows, -1, 3)
+        images["shN_labels"] = _laid_out(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1))
+        meta["shN"] = {
+            "count": len(entries),
+            "bands": COEFFICIENTS.index(coefficients),
+            "codebook": _listed(numbers),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        # entries without a time, so that equal Gaussians give equal bytes; WebP is compressed already
+        archive.writestr(zipfile.ZipInfo(META), json.dumps(meta, allow_nan=False))
+        for name, image in images.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(image))
+
+
+def load_sog(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+    """Read a .sog file of version 2.
+
+    Args:
+        path: the file.
+        report: not called; other formats have things to say.
+
+    Raises:
+        InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
+    """
+    with reading(path, "a .sog file of version 2"):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                return _Bundle(archive, Path(path).stat().st_size).file()
+        except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError) as error:
+            raise ValueError(str(error) or type(error).__name__) from error
+
+
+class _Bundle:
+    """An opened .sog file: every number is checked before it is used, every image's size before it is decoded."""
+
+    def __init__(self, archive: zipfile.ZipFile, file_bytes: int):
+        self.archive = archive
+        self.file_bytes = file_bytes
+        self.meta = json_object(self._bytes(META, META_BYTES))
+        version = self.meta.get("version", 1)  # the first had none
+        if version != 2:
+            raise Unexpected(f"version {version!r:.40}; save it with splat-transform, which writes version 2")
+        self.count = whole_number(self.meta.get("count"), "count", 2**32)
+        harmonics = self.meta.get("shN") is not None
+        self.degree = whole_number(self._part("shN").get("bands"), "bands", 3) if harmonics else 0
+        self.coefficients = COEFFICIENTS[self.degree]
+        check_expansion(self.count, PIXEL_BYTES + 3 * (self.coefficients - 1), file_bytes)
+
+    def file(self) -> SplatFile:
+        """The Gaussians."""
+        means, colors = self._part("means"), self._pixels("sh0", 0)
+        low, high = numbers_of(means, "mins", 3), numbers_of(means, "maxs", 3)
+        steps = self._pixels("means", 0)[:, :3] + 256.0 * self._pixels("means", 1)[:, :3]
+        sh = np.zeros((self.count, self.coefficients, 3), np.float32)
+        sh[:, 0] = self._codebook("sh0")[colors[:, :3]]
+        if self.degree:
+            sh[:, 1:] = self._harmonics()
+        with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32, the reader leaves out
+            logs = low + (high - low) * (steps / STEPS)
+            positions = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+        splats = SplatArrays(
+            means=positions,
+            sh=sh,
+            opacities=logit(colors[:, 3] / 255),
+            scales=self._codebook("scales")[self._pixels("scales", 0)[:, :3]],
+            quats=_unpack_quats(self._pixels("quats", 0)),
+        )
+        return SplatFile(splats, self.meta.get("antialias") is True or self.meta.get("model") == "antialiased")
+
+    def _part(self, name: str) -> dict:
+        part = self.meta.get(name)
+        if not isinstance(part, dict):
+            raise Unexpected(f"no object {name!r} in its {META}")
+        return part
+
+    def _codebook(self, part: str) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            return numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
+
+    def _pixels(self, part: str, index: int) -> np.ndarray:
+        """The Gaussians' pixels [N, 4] of an image."""
+        return self._image(part, index).reshape(-1, 4)[: self.count]
+
+    def _harmonics(self) -> np.ndarray:
+        """[N, K - 1, 3] float32."""
+        part = self._part("shN")
+        entries = whole_number(part.get("count"), "count of the palette", PALETTE_MOST)
+        size = (PALETTE_ROW * (self.coefficients - 1), -(-entries // PALETTE_ROW))
+        table = self._image("shN", 0, size).reshape(-1, self.coefficients - 1, 4)[:entries, :, :3]
+        labels = self._pixels("shN", 1)
+        indices = labels[:, 0] + 256 * labels[:, 1].astype(np.int64)
+        if self.count and indices.max() >= entries:
+            raise ValueError(f"index {indices.max()} into a palette of {entries}")
+        return self._codebook("shN")[table][indices]
+
+    def _image(self, part: str, index: int, size: tuple[int, int] | None = None) -> np.ndarray:
+        """An image [H, W, 4] uint8 of ``size`` (width, height), or of one that holds the Gaussians."""
+        names = entries_of(self._part(part), "files")
+        if index >= len(names) or not isinstance(names[index], str):
+            raise Unexpected(f"no name of image {index} of {part!r}")
+        data = self._bytes(names[index], self.file_bytes)
+        width, height = _webp_size(data, names[index])
+        fits = (width, height) == size if size else self.count <= width * height <= 2 * self.count + SPARE_PIXELS
+        if not fits:
+            raise ValueError(f"an image {names[index]!r:.80} of {width}x{height} pixels for {self.count} Gaussians")
+        try:
+            with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+                return np.asarray(image.convert("RGBA"))
+        except (OSError, SyntaxError) as error:  # Pillow's words for damage
+            raise ValueError(f"image {names[index]!r:.80}: {error}") from error
+
+    def _bytes(self, name: str, most: int) -> bytes:
+        """A file of the archive, of at most ``most`` bytes."""
+        try:
+            info = self.archive.getinfo(name)
+        except KeyError:
+            raise Unexpected(f"no file {name!r:.80} in it") from None
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise Unexpected(f"{name!r:.80} in another compression than deflate")
+        with self.archive.open(info) as source:
+            data = source.read(most + 1)
+        if len(data) > most:
+            raise ValueError(f"{name!r:.80} expands to more than {most} bytes")
+        return data
+
+
+def _laid_out(rows: np.ndarray) -> np.ndarray:
+    """Pixels [N, C] as an image [H, W, C] uint8 with sides of whole fours, zeros at its end."""
+    count, channels = rows.shape
+    width = 4 * int(np.ceil(np.sqrt(count) / 4))
+    height = 4 * -(-count // (4 * width))
+    image = np.zeros((height * width, channels), np.uint8)
+    image[:count] = rows
+    return image.reshape(height, width, channels)
+
+
+def _webp(image: np.ndarray) -> bytes:
+    target = io.BytesIO()
+    Image.fromarray(image).save(target, "WEBP", lossless=True, exact=True, quality=80, method=4)
+    return target.getvalue()
+
+
+def _webp_size(data: bytes, name: str) -> tuple[int, int]:
+    """Width and height by the header: Pillow allocates an image as it opens it."""
+    if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+        raise Unexpected(f"an image {name!r:.80} that is no WebP")
+    match data[12:16]:
+        case b"VP8L":
+            bits = int.from_bytes(data[21:25], "little")
+            return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+        case b"VP8X":
+            return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    raise Unexpected(f"an image {name!r:.80} whose compression changes values")
+
+
+def _listed(entries: np.ndarray) -> list[float]:
+    """Nine digits say which float32 a number is."""
+    return [float(f"{entry:.9g}") for entry in entries]
+
+
+def _pack_quats(quats: np.ndarray) -> np.ndarray:
+    """Rotations as bytes [N, 4]: the three smallest of w x y z in steps of sqrt(2) / 255, and which is left out."""
+    unit = unit_quats(quats).astype(np.float64)
+    largest = np.abs(unit).argmax(axis=1)[:, None]
+    unit *= np.where(np.take_along_axis(unit, largest, axis=1) < 0, -1, 1)
+    others = np.take_along_axis(unit, OTHERS[largest[:, 0]], axis=1)
+    packed = np.rint(255 * (others / np.sqrt(2) + 0.5))
+    return np.concatenate([np.clip(packed, 0, 255), TAG + largest], axis=1).astype(np.uint8)
+
+
+def _unpack_quats(rows: np.ndarray) -> np.ndarray:
+    """Rotations [N, 4] w x y z from bytes [N, 4]."""
+    if (rows[:, 3] < TAG).any():
+        raise ValueError(f"a rotation marked {rows[:, 3].min()}, below {TAG}")
+    largest = rows[:, 3:].astype(np.int64) - TAG
+    others = (rows[:, :3] / 255 - 0.5) * np.sqrt(2)
+    quats = np.zeros((len(rows), 4))
+    np.put_along_axis(quats, OTHERS[largest[:, 0]], others, axis=1)
+    np.put_along_axis(quats, largest, np.sqrt(np.maximum(0, 1 - (others * others).sum(axis=1, keepdims=True))), axis=1)
+    return quats.astype(np.float32)
