@@ -1,18 +1,21 @@
 """Gaussians to write into files, and readers and writers of such files that share nothing with the package."""
 
 import gzip
+import io
 import json
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 import zstandard
+from PIL import Image
 
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.splats import SplatArrays, SplatFile
 
-ENDINGS = (".ply", ".splat", ".spz", ".glb", ".gltf")
+ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf")
 
 
 def some_splats(count=50, coefficients=16, seed=0):
@@ -79,6 +82,30 @@ def glb_attributes(path):
         values = np.frombuffer(binary, dtype, accessor["count"] * width, start)
         found[name] = values.reshape(-1, width) if width > 1 else values
     return found
+
+
+def sog_parts(path):
+    """The JSON of a .sog file and its images, by name, as RGBA [H, W, 4]."""
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+        names = [name for name in archive.namelist() if name != "meta.json"]
+        return meta, {name: np.asarray(Image.open(archive.open(name)).convert("RGBA")) for name in names}
+
+
+def sog_bytes(meta, files, compression=zipfile.ZIP_STORED):
+    """A .sog file of a meta.json, which may be bytes, and files by name."""
+    target = io.BytesIO()
+    with zipfile.ZipFile(target, "w", compression) as archive:
+        archive.writestr("meta.json", meta if isinstance(meta, bytes) else json.dumps(meta))
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return target.getvalue()
+
+
+def webp_bytes(image, **options):
+    target = io.BytesIO()
+    Image.fromarray(image).save(target, "WEBP", **{"lossless": True, "exact": True, **options})
+    return target.getvalue()
 
 
 def silent(line):

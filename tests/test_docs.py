@@ -53,6 +53,9 @@ PROOFS = {
     "`.spz`": """
         test_spz.py::test_spz_bytes_are_the_documented_layout test_spz.py::test_spz_version_2
         test_spz.py::test_spz_version_4_holds_the_same""",
+    "`.sog`": """
+        test_sog.py::test_sog_bytes_are_the_documented_layout test_sog.py::test_a_palette_stands_for_many_harmonics
+        test_sog.py::test_archives_of_others_are_read""",
     "`.glb`, `.gltf`": """
         test_exchange.py::test_gltf_holds_what_the_extension_says
         test_exchange.py::test_gltf_nodes_move_turn_and_scale""",

@@ -33,7 +33,11 @@ COMMANDS = {
     "train": (TrainConfig, "training.command.train", "train Gaussians on a scene's photographs"),
     "render": (RenderConfig, "rendering.command.render_model", "render a model: its views with metrics, or a video"),
     "view": (ViewConfig, "viewer.command.view_model", "look at a trained model in a browser"),
-    "convert": (ConvertConfig, "formats.convert.convert", "convert Gaussians between .ply, .splat, .spz and glTF"),
+    "convert": (
+        ConvertConfig,
+        "formats.convert.convert",
+        "convert Gaussians between .ply, .splat, .spz, .sog, glTF",
+    ),
     "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
     "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }

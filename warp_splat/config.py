@@ -81,7 +81,7 @@ class RasterOptions:
 class RenderConfig:
     """Rendering options; the reference's render.py where it has them."""
 
-    model_path: str = flag("", "folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)", "-m")
+    model_path: str = flag("", "folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)", "-m")
     source_path: str = flag("", "scene folder, if it has moved since training; a file of Gaussians needs one", "-s")
     iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
     skip_train: bool = flag(False, "no images of the training views")
@@ -114,7 +114,7 @@ class RenderConfig:
 class ViewConfig:
     """A model to look at in a browser."""
 
-    model: str = argument("folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
+    model: str = argument("folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
     source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
     iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
     port: int = flag(PORT, PORT_HELP, least=1, most=LAST_PORT)
@@ -151,7 +151,7 @@ class InspectConfig:
 
 @dataclass
 class ConvertConfig:
-    """A model and a file of Gaussians: .ply, .splat, .spz, .glb or .gltf."""
+    """A model and a file of Gaussians: .ply, .splat, .spz, .sog, .glb or .gltf."""
 
     source: str = argument("the file to read, or the folder of a trained model")
     target: str = argument("the file to write; its ending says in which format")
@@ -161,7 +161,7 @@ class ConvertConfig:
 class ExportHtmlConfig:
     """A model as a page that shows it."""
 
-    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .splat, .spz, .glb)")
+    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
     page: str = argument("the page to write, *.html")
     max_gaussians: int = flag(0, "keep only this many, by opacity and size; 0: all that can be seen")
 

@@ -10,7 +10,8 @@ from scipy.cluster.vq import kmeans2
 ENTRIES = 256  # of a codebook: an index is a byte
 LLOYD_STEPS = 40  # of a codebook, after which entries move by less than float32 resolves in a picture
 COARSE = 256  # clusters that share out the entries of a palette
-KMEANS_STEPS = 8  # the error of a palette falls by less than 1 % after them
+KMEANS_STEPS = 8
+#: Tried: weights by opacity, area or both in place of none: 46.2 to 46.6 dB of renders, held-out views 0.02 dB better.
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -59,8 +60,8 @@ def palette(vectors: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     if len(distinct) <= size:
         return distinct, place.ravel()
     _, coarse = _cluster(vectors, min(COARSE, size))
-    members = [rows for rows in (np.flatnonzero(coarse == cluster) for cluster in range(COARSE)) if len(rows)]
-    # as many entries as are due to those before a cluster and itself, but for those before
+    members = [np.flatnonzero(coarse == cluster) for cluster in range(coarse.max() + 1)]
+    # as many entries as are due to the clusters so far, but for those that the ones before have got
     due = np.cumsum([len(rows) for rows in members]) * (size - len(members)) // len(vectors)
     entries, labels, used = [], np.empty(len(vectors), np.int64), 0
     for rows, count in zip(members, 1 + np.diff(due, prepend=0), strict=True):

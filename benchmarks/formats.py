@@ -1,0 +1,68 @@
+"""What does each file format cost? Size, loss of renders, seconds to write and read, on trained models.
+
+Half a minute for each model of 80,000 Gaussians on two cores.
+
+    python benchmarks/formats.py -s SCENE -m MODEL [-s SCENE -m MODEL ...] [--out docs/benchmarks]
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from common import machine, write_table
+
+from warp_splat.evaluation.metrics import psnr
+from warp_splat.formats.exchange import FORMATS, load_gaussians, save_gaussians
+from warp_splat.formats.model_folder import open_model
+from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.command import load_trained_scene, make_picture, options_of
+from warp_splat.runtime import launch
+
+HEADERS = ("Gaussians", "format", "bytes each", "of the .ply", "renders to its", "test PSNR dB", "write s", "read s")
+LEFT_OUT = {".gltf"}  # holds what a .glb does
+
+
+def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
+    """A row for each format, the .ply first."""
+    _, file, trained = open_model(model)
+    scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None)
+    first, first_bytes, rows = None, 0, []
+    for ending in (ending for ending in FORMATS if ending not in LEFT_OUT):
+        path, start = folder / f"a{ending}", time.perf_counter()
+        save_gaussians(path, file, lambda _: None)
+        written = time.perf_counter()
+        splats = load_gaussians(path).splats
+        read, size = time.perf_counter(), path.stat().st_size
+        picture = make_picture(GaussianModel.from_splats(splats), False, options_of(trained))
+        renders = [picture(view.camera) for view in scene.test]
+        if first is None:
+            first, first_bytes = np.concatenate(renders), size
+        same = np.array_equal(np.concatenate(renders), first)
+        close = "the same" if same else f"{psnr(np.concatenate(renders), first):.1f} dB"
+        pairs = zip(renders, scene.test, strict=True)
+        quality = np.mean([psnr(image, view.picture, view.mask) for image, view in pairs])
+        count = len(splats.means)
+        share = f"1/{first_bytes / size:.1f}"
+        times = (f"{written - start:.1f}", f"{read - written:.1f}")
+        rows.append((count, f"`{ending}`", f"{size / count:.1f}", share, close, f"{quality:.2f}", *times))
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-s", "--scenes", type=Path, action="append", required=True, help="one for each model")
+    parser.add_argument("-m", "--models", type=Path, action="append", required=True, help="folders of trained models")
+    parser.add_argument("--out", type=Path, help="folder for formats.md and formats.json")
+    arguments = parser.parse_args()
+    launch.prepare("cpu", 0)
+    with tempfile.TemporaryDirectory() as folder:
+        pairs = zip(arguments.scenes, arguments.models, strict=True)
+        rows = [row for scene, model in pairs for row in measure(scene, model, Path(folder))]
+    note = "Renders of the held-out views as 8-bit pictures, of all formats against those of the `.ply`."
+    write_table("formats", arguments.out, HEADERS, rows, note, {"headers": HEADERS, "rows": rows, "machine": machine()})
+
+
+if __name__ == "__main__":
+    main()
