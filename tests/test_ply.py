@@ -202,7 +202,7 @@ def test_every_cut_gives_one_sentence(tmp_path):
         (b"f_rest_8\n", b"f_rest_9\n", "f_rest_8"),
         (b"element vertex 3", b"element point 3", "'vertex', found none"),
         (b"element vertex 3", b"element vertex 4", "cut short"),
-        (b"element vertex 3", b"element vertex 1000000000000", "cut short .1000000000000 vertices need"),
+        (b"element vertex 3", b"element vertex 1000000000000", "cut short .1000000000000 rows of 'vertex' need"),
         (b"element vertex 3", b"element vertex 99999999999999", "cut short"),
         (b"element vertex 3", b"element vertex " + b"9" * 5000, "the header line 'element vertex 999"),
         (b"element vertex 3", b"element vertex -1", "a.ply"),
@@ -235,7 +235,7 @@ def test_bad_headers(tmp_path, old, new, sentence):
 @pytest.mark.parametrize("count", [10**12, 10**15 - 1])
 def test_a_count_that_lies_fails_at_once_in_a_text(tmp_path, count):
     (tmp_path / "a.ply").write_text(ascii_splats(["1 " * 17], count))
-    with pytest.raises(InputError, match=rf"a\.ply.*cut short .{count} vertices need"):
+    with pytest.raises(InputError, match=rf"a\.ply.*cut short .{count} rows of 'vertex' need"):
         load_ply(tmp_path / "a.ply")
 
 

@@ -3,23 +3,18 @@
 One element ``vertex`` of little-endian float32: ``x y z nx ny nz f_dc_0..2 f_rest_0..n opacity scale_0..2 rot_0..3``.
 Values are stored before their activation: opacity as a logit, scales as natural logarithms, quaternions w x y z of any
 length. ``f_rest`` is channel-major: all coefficients of red, then of green, then of blue; here they are [N, K, 3].
-
-Own code, since no permissively licensed reader of arbitrary vertex properties is well kept.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from itertools import islice
+from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.ply_container import Tables, write_tables
+from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 
 POSITION = ("x", "y", "z")
@@ -34,14 +29,6 @@ REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
 EXPECTED = "a PLY file with an element 'vertex'"
 ANTIALIASED = "SplatRenderMode: mip"  # the comment that Brush and splat-transform write and read
 ANTIALIASED_READ = {ANTIALIASED, "antialiased 1"}  # the second is Postshot's
-HEADER_BYTES = 64 * 1024  # forty times the longest header of the reference: no damaged file is searched to its end
-COUNT_DIGITS = 15  # more rows than any disk holds, and sums of such counts stay below 2**63
-BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
-TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
-TYPES |= {"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
-LIST = "list"  # in place of a NumPy type
-TYPES_WRITTEN = {"f4": "float", "u1": "uchar"}
 
 
 def save_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
@@ -62,7 +49,8 @@ def save_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
     columns = (means, np.zeros((count, 3)), sh[:, 0], rest, opacities[:, None], scales, quats)
     names = (*POSITION, *NORMAL, *F_DC, *_rest_names(rest.shape[1]), "opacity", *SCALE, *ROTATION)
     table = np.concatenate(columns, axis=1, dtype="<f4")
-    _write(path, table.view([(name, "<f4") for name in names])[:, 0], [ANTIALIASED] * file.antialiased)
+    rows = table.view([(name, "<f4") for name in names])[:, 0]
+    write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased)
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -82,7 +70,7 @@ def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> Non
     rows = np.zeros(len(points), [(name, "<f4") for name in POSITION + NORMAL] + [(name, "u1") for name in COLOR])
     for axis in range(3):
         rows[POSITION[axis]], rows[COLOR[axis]] = points[:, axis], colors[:, axis]
-    _write(path, rows, ())
+    write_tables(path, {"vertex": rows})
 
 
 def load_points(path: str | Path, report: Callable[[str], None] = print) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +82,8 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     Raises:
         InputError: if the file is missing, damaged, or has no positions.
     """
-    vertex, _ = _read_vertices(path)
+    with reading(path, EXPECTED), open(path, "rb") as file:
+        vertex = Tables(file).rows("vertex")
     names = vertex.dtype.names or ()
     if not set(POSITION) <= set(names):
         raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {', '.join(names):.200}.")
@@ -126,7 +115,9 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
     Raises:
         InputError: if the file is missing, damaged, or not a PLY file of 3D Gaussians.
     """
-    vertex, comments = _read_vertices(path)
+    with reading(path, EXPECTED), open(path, "rb") as file:
+        tables = Tables(file)
+        vertex = tables.rows("vertex")
     names = vertex.dtype.names or ()
     rest_count = sum(name.startswith("f_rest_") for name in names)
     if rest_count not in REST_COUNTS:
@@ -144,7 +135,7 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
     with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
         table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
     splats = finite_rows(_split_columns(table, rest_count // 3), path, report)
-    return SplatFile(splats, not ANTIALIASED_READ.isdisjoint(comments))
+    return SplatFile(splats, not ANTIALIASED_READ.isdisjoint(tables.comments))
 
 
 def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:
@@ -162,92 +153,3 @@ def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:
 
 def _rest_names(count: int) -> list[str]:
     return [f"f_rest_{index}" for index in range(count)]
-
-
-def _write(path: str | Path, rows: np.ndarray, comments: Sequence[str]) -> None:
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    header += [f"element vertex {len(rows)}"]
-    header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code, *_ in rows.dtype.descr]
-    header += ["end_header", ""]
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(rows.data)
-
-
-class _Element(NamedTuple):
-    """A table of the file, as the header announces it."""
-
-    name: str
-    rows: int
-    properties: dict[str, str]  # from names to NumPy types without byte order, or LIST
-
-    def least_bytes(self, text: bool) -> int:
-        """Size of the rows; of a text, if each number has one digit and one separator."""
-        return self.rows * sum(2 if text else int(code[1]) for code in self.properties.values())
-
-
-def _read_vertices(path: str | Path) -> tuple[np.ndarray, list[str]]:
-    """The rows of the element ``vertex``, one field for each property, and the comments."""
-    with reading(path, EXPECTED), open(path, "rb") as file:
-        byte_order, elements, comments = _read_header(file)
-        return _read_rows(file, byte_order, elements), comments
-
-
-def _read_header(file: BinaryIO) -> tuple[str, list[_Element], list[str]]:
-    """Read up to the first row: the byte order, "" for a text, the elements up to ``vertex``, and the comments."""
-    byte_order = None
-    elements: list[_Element] = []
-    comments: list[str] = []
-    if _header_line(file) != "ply":
-        raise Unexpected("another first line than 'ply'")
-    while (line := _header_line(file)) != "end_header":
-        match line.split():
-            case ["comment" | "obj_info", *words]:
-                comments.append(" ".join(words))
-            case ["format", name, "1.0"] if name in BYTE_ORDERS:
-                byte_order = BYTE_ORDERS[name]
-            case ["element", name, count] if count.isdecimal() and len(count) <= COUNT_DIGITS:
-                elements.append(_Element(name, int(count), {}))
-            case ["property", code, name] if elements and code in TYPES and name not in elements[-1].properties:
-                elements[-1].properties[name] = TYPES[code]
-            case ["property", "list", _, _, name] if elements and name not in elements[-1].properties:
-                elements[-1].properties[name] = LIST
-            case _:
-                raise Unexpected(f"the header line {line[:80]!r}")
-    names = [element.name for element in elements]
-    if byte_order is None or "vertex" not in names:
-        raise Unexpected("no line 'format'" if byte_order is None else "none")
-    elements = elements[: names.index("vertex") + 1]
-    if any(LIST in element.properties.values() for element in elements):
-        raise Unexpected("a list property in it or before it; export one number for each property")
-    return byte_order, elements, comments
-
-
-def _header_line(file: BinaryIO) -> str:
-    line = file.readline(HEADER_BYTES - file.tell())
-    if not line.endswith(b"\n"):
-        raise Unexpected(f"no line 'end_header' within the first {HEADER_BYTES} bytes")
-    return line.decode("latin-1").strip()  # any byte is a character; comments may hold them
-
-
-def _read_rows(file: BinaryIO, byte_order: str, elements: list[_Element]) -> np.ndarray:
-    """Rows of the last element; nothing is allocated before the file is known to be long enough for them."""
-    text = byte_order == ""
-    *before, vertex = elements
-    skipped = sum(element.least_bytes(text) for element in before)
-    needed = skipped + vertex.least_bytes(text)
-    found = os.fstat(file.fileno()).st_size - file.tell()
-    if needed > found + text:  # the last line of a text may lack its end
-        raise ValueError(f"{vertex.rows} vertices need at least {needed} bytes, found {found}")
-    dtype = np.dtype([(name, byte_order + code) for name, code in vertex.properties.items()])
-    if text:
-        first = sum(element.rows for element in before)
-        lines = islice(file, first, first + vertex.rows)
-        with np.errstate(over="ignore"):  # too large for a float32: infinite, as from a double
-            rows = np.fromiter((tuple(line.split()) for line in lines), dtype)
-    else:
-        file.seek(skipped, os.SEEK_CUR)
-        rows = np.fromfile(file, dtype, vertex.rows)
-    if len(rows) < vertex.rows:
-        raise ValueError(f"found {len(rows)} of {vertex.rows} vertices")
-    return rows
