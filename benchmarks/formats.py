@@ -20,7 +20,17 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import load_trained_scene, make_picture, options_of
 from warp_splat.runtime import launch
 
-HEADERS = ("Gaussians", "format", "bytes each", "of the .ply", "renders to its", "test PSNR dB", "write s", "read s")
+HEADERS = (
+    "scene",
+    "Gaussians",
+    "format",
+    "bytes each",
+    "of the .ply",
+    "renders to its",
+    "test PSNR dB",
+    "write s",
+    "read s",
+)
 LEFT_OUT = {".gltf"}  # holds what a .glb does
 
 
@@ -46,7 +56,9 @@ def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
         count = len(splats.means)
         share = f"1/{first_bytes / size:.1f}"
         times = (f"{written - start:.1f}", f"{read - written:.1f}")
-        rows.append((count, f"`{ending}`", f"{size / count:.1f}", share, close, f"{quality:.2f}", *times))
+        rows.append(
+            (scene_path.name, count, f"`{ending}`", f"{size / count:.1f}", share, close, f"{quality:.2f}", *times)
+        )
     return rows
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.splats import SplatArrays, SplatFile
 
-ENDINGS = (".ply", ".splat", ".spz", ".sog", ".glb", ".gltf")
+ENDINGS = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb", ".gltf")
 
 
 def some_splats(count=50, coefficients=16, seed=0):

@@ -49,6 +49,7 @@ PROOFS = {
         test_masks.py::test_metrics_do_not_see_what_is_masked""",
     "`--start_ply FILE`": "test_inputs.py::test_start_from_a_file",
     "`.ply`": "test_ply.py:: test_exchange.py::test_round_trip_returns_the_scene",
+    "`.compressed.ply`": "test_compressed_ply.py::",
     "`.splat`": "test_exchange.py::test_splat_bytes_are_the_documented_layout",
     "`.spz`": """
         test_spz.py::test_spz_bytes_are_the_documented_layout test_spz.py::test_spz_version_2

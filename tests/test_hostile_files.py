@@ -25,7 +25,7 @@ from warp_splat.formats.exchange import load_gaussians, save_gaussians
 
 QUICK, LONG = 150, 2_000  # examples for each reader
 MEMORY = 200 * 2**20  # bytes for a file of a few kilobytes: JSON of many lists and the smallest limits of SPZ fit in
-KINDS = ("ply", "text.ply", "splat", "2.spz", "3.spz", "4.spz", "sog", "glb", "gltf")
+KINDS = ("ply", "text.ply", "compressed.ply", "splat", "2.spz", "3.spz", "4.spz", "sog", "glb", "gltf")
 NUMBERS = [0, -1, 1, 2**31, 2**32, 10**12, 2**63, 10**400, 0.5, -0.0, 1e308, True, None, "", [], {}, [[]], "..", 5126]
 
 WORDS = b"0 1 3 5 -1 1000000000000 99999999999999 1e3 float double uchar int8 list vertex face x nx f_rest_0 opacity"
@@ -37,7 +37,7 @@ def valid(tmp_path_factory):
     """A small valid file of each kind, as bytes."""
     folder = tmp_path_factory.mktemp("valid")
     file, files = some_file(4, 4), {}
-    for ending in ("ply", "splat", "sog", "glb"):
+    for ending in ("ply", "compressed.ply", "splat", "sog", "glb"):
         save_gaussians(folder / f"a.{ending}", file, report=lambda line: None)
         files[ending] = (folder / f"a.{ending}").read_bytes()
     rows = np.frombuffer(files["ply"].split(b"end_header\n")[1], "<f4").reshape(4, -1)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from warp_splat.errors import InputError
 from warp_splat.formats.gltf import load_gltf, save_gltf
-from warp_splat.formats.ply import load_ply, save_ply
+from warp_splat.formats.ply import load_ply, save_compressed_ply, save_ply
 from warp_splat.formats.sog import load_sog, save_sog
 from warp_splat.formats.splat32 import load_splat, save_splat
 from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows
@@ -27,6 +27,7 @@ class Format(NamedTuple):
 
 FORMATS = {
     ".ply": Format(load_ply, save_ply),
+    ".compressed.ply": Format(load_ply, save_compressed_ply, along_curve=True),
     ".splat": Format(load_splat, save_splat),
     ".spz": Format(load_spz, save_spz),
     ".sog": Format(load_sog, save_sog, along_curve=True),
@@ -41,10 +42,11 @@ def format_of(path: str | Path) -> Format:
     Raises:
         InputError: if its ending is not one of FORMATS.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in FORMATS:
-        raise InputError(f"{path}: expected a name that ends in {', '.join(FORMATS)}, found {suffix or 'no ending'!r}.")
-    return FORMATS[suffix]
+    endings = [ending for ending in FORMATS if Path(path).name.lower().endswith(ending)]
+    if not endings:
+        found = Path(path).suffix or "no ending"
+        raise InputError(f"{path}: expected a name that ends in {', '.join(FORMATS)}, found {found!r}.")
+    return FORMATS[max(endings, key=len)]
 
 
 def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:

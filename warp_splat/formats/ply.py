@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.formats.compressed_ply import is_compressed, read_compressed, write_compressed
 from warp_splat.formats.ply_container import Tables, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
@@ -51,6 +52,20 @@ def save_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
     table = np.concatenate(columns, axis=1, dtype="<f4")
     rows = table.view([(name, "<f4") for name in names])[:, 0]
     write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased)
+
+
+def save_compressed_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+    """Write Gaussians as a compressed PLY file, in the given order, in which near ones should follow each other.
+
+    Args:
+        path: the file to write.
+        file: the Gaussians.
+        report: called with a part of a sentence for each kind of value that the format cannot hold.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    write_compressed(path, file.splats, [ANTIALIASED] * file.antialiased, report)
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -101,7 +116,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
 
 
 def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
-    """Read Gaussians by property name: any order, with or without normals, SH degree 0 to 3.
+    """Read Gaussians, compressed ones or by property name: any order, with or without normals, SH degree 0 to 3.
 
     Rows with a value that is not finite (as a float32) are left out, since one of them can spoil a whole image.
 
@@ -117,6 +132,9 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
     """
     with reading(path, EXPECTED), open(path, "rb") as file:
         tables = Tables(file)
+        antialiased = not ANTIALIASED_READ.isdisjoint(tables.comments)
+        if is_compressed(tables):
+            return SplatFile(finite_rows(read_compressed(tables), path, report), antialiased)
         vertex = tables.rows("vertex")
     names = vertex.dtype.names or ()
     rest_count = sum(name.startswith("f_rest_") for name in names)
@@ -129,13 +147,13 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
     missing = [name for name in wanted if name not in names]
     if missing:
         raise InputError(
-            f"{path}: expected an uncompressed PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
+            f"{path}: expected a PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
             "missing; export it as 'PLY (standard)' or train again."
         )
     with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
         table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
     splats = finite_rows(_split_columns(table, rest_count // 3), path, report)
-    return SplatFile(splats, not ANTIALIASED_READ.isdisjoint(tables.comments))
+    return SplatFile(splats, antialiased)
 
 
 def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:

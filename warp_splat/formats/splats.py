@@ -16,6 +16,7 @@ from warp_splat.errors import InputError
 COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
 SH_C0 = 0.28209479177387814  # color = SH_C0 * (coefficient of degree 0) + 0.5
 LOG_SCALES = (-87.0, 88.0)  # exp() of these, and of what lies between, is a normal number in float32
+OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # than one of four
 AXIS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 
 
@@ -82,6 +83,22 @@ def unit_quats(quats: np.ndarray) -> np.ndarray:
     quats = quats.astype(np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0]).astype(np.float32)
+
+
+def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which of w x y z is largest [N], and the others [N, 3] in that order, as -0.5..0.5, where it is positive."""
+    unit = unit_quats(quats).astype(np.float64)
+    largest = np.abs(unit).argmax(axis=1)
+    unit *= np.where(unit[np.arange(len(unit)), largest] < 0, -1, 1)[:, None]
+    return largest, np.take_along_axis(unit, OTHERS[largest], axis=1) * np.sqrt(0.5)
+
+
+def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """The rotations [N, 4] w x y z of :func:`smallest_three`."""
+    quats = np.zeros((len(others), 4))
+    np.put_along_axis(quats, OTHERS[largest], others * np.sqrt(2), axis=1)
+    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(0, 1 - (quats * quats).sum(axis=1)))
+    return quats.astype(np.float32)
 
 
 def clipped(what: str, values: np.ndarray, low: float, high: float, report: Callable[[str], None]) -> np.ndarray:

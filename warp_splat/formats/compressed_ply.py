@@ -1,0 +1,151 @@
+"""Gaussians as compressed PLY files, PlayCanvas's: 16 bytes each, and one for each number of the harmonics.
+
+Three elements. ``chunk``: the ranges of position, log scale and color (0.5 + 0.28 x coefficient) of 256 Gaussians.
+``vertex``: four uint32, the position within its chunk's range (11, 10, 11 bits), the rotation (which of w x y z is
+largest, then the others, 10 bits each), the scale (11, 10, 11 bits) and the color with the opacity (8 bits each).
+``sh``: harmonics as ``f_rest_*`` of the PLY file, in steps of 1/32 from -4 to 4. The axes are those of the PLY file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.formats.ply_container import Tables, write_tables
+from warp_splat.formats.reading import Unexpected
+from warp_splat.formats.splats import SH_C0, SplatArrays, clipped, from_smallest_three, logit, sigmoid, smallest_three
+
+CHUNK = 256  # Gaussians that share their ranges
+WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+RANGES = tuple(
+    f"{end}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for name in names
+)
+WITHOUT_COLOR = 12  # of RANGES, in older files: colors are in 0..1 then
+POINT_BITS = (11, 10, 11)
+COLOR_BITS = (8, 8, 8, 8)
+SCALES = (-20.0, 20.0)  # logarithms
+HARMONIC_STEPS = 32.0  # of harmonics, per unit; the first and the last byte stand for the ends of the range
+HARMONICS = (-4.0, 4.0)
+QUAT_BITS = (10, 10, 10)
+
+
+def is_compressed(tables: Tables) -> bool:
+    """Whether an opened PLY file is one of this kind."""
+    return "vertex" in tables.elements and WORDS[0] in tables.elements["vertex"].properties
+
+
+def write_compressed(path: str | Path, splats: SplatArrays, comments: list[str], report: Callable[[str], None]) -> None:
+    """Write Gaussians; near ones should follow each other, since ranges of chunks are small then.
+
+    Args:
+        path: the file to write.
+        splats: the Gaussians.
+        comments: of the header.
+        report: called with a part of a sentence for each kind of value that the format cannot hold.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    count, coefficients, _ = splats.sh.shape
+    scales = clipped("log scale", splats.scales, *SCALES, report)
+    harmonics = clipped("harmonics", splats.sh[:, 1:], *HARMONICS, report)
+    starts, ranges, shares = np.arange(0, count, CHUNK), [], []
+    for values in (splats.means, scales, (0.5 + SH_C0 * splats.sh[:, 0]).astype(np.float32)):
+        ends = [extreme.reduceat(values, starts) if count else values for extreme in (np.minimum, np.maximum)]
+        low, high = (end.astype(np.float64).repeat(CHUNK, axis=0)[:count] for end in ends)
+        ranges += ends
+        shares.append((values - low) / np.where(high > low, high - low, 1))
+    words = np.zeros(count, [(name, "<u4") for name in WORDS])
+    words["packed_position"] = _pack(shares[0], POINT_BITS)
+    largest, others = smallest_three(splats.quats)
+    words["packed_rotation"] = largest << 30 | _pack(others + 0.5, QUAT_BITS)
+    words["packed_scale"] = _pack(shares[1], POINT_BITS)
+    words["packed_color"] = _pack(np.column_stack([shares[2], sigmoid(splats.opacities)]), COLOR_BITS)
+    table = np.concatenate(ranges, axis=1).astype("<f4")
+    tables = {"chunk": table.view([(name, "<f4") for name in RANGES])[:, 0], "vertex": words}
+    if coefficients > 1:
+        steps = np.clip(np.floor(HARMONIC_STEPS * harmonics) + 128, 0, 255).astype(np.uint8)
+        rows = np.ascontiguousarray(steps.transpose(0, 2, 1)).reshape(count, 3 * (coefficients - 1))
+        tables["sh"] = rows.view([(f"f_rest_{index}", "u1") for index in range(rows.shape[1])])[:, 0]
+    write_tables(path, tables, comments)
+
+
+def read_compressed(tables: Tables) -> SplatArrays:
+    """The Gaussians of an opened file of this kind.
+
+    Raises:
+        Unexpected: if a table or a property is missing, or of another type.
+        ValueError: if tables have other lengths than each other, or the file is cut short.
+    """
+    words = _columns(tables, "vertex", WORDS, "u4")
+    count = len(words)
+    old = "chunk" in tables.elements and RANGES[-1] not in tables.elements["chunk"].properties
+    ranges = _columns(tables, "chunk", RANGES[:WITHOUT_COLOR] if old else RANGES, "f4").astype(np.float64)
+    if len(ranges) != -(-count // CHUNK):
+        raise ValueError(f"{len(ranges)} chunks for {count} Gaussians")
+    if old:
+        ranges = np.pad(np.pad(ranges, ((0, 0), (0, 3))), ((0, 0), (0, 3)), constant_values=1)
+    low, high = ranges.reshape(-1, 3, 2, 3).transpose(2, 1, 0, 3).repeat(CHUNK, axis=2)[:, :, :count]
+    colors = _unpack(words[:, 3], COLOR_BITS)
+    shares = np.stack([_unpack(words[:, 0], POINT_BITS), _unpack(words[:, 2], POINT_BITS), colors[:, :3]])
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the reader leaves out
+        means, scales, base = (low * (1 - shares) + high * shares).astype(np.float32)
+        base = (base - np.float32(0.5)) / np.float32(SH_C0)
+    return SplatArrays(
+        means=means,
+        sh=np.concatenate([base[:, None], _harmonics(tables, count)], axis=1),
+        opacities=logit(colors[:, 3]),
+        scales=scales,
+        quats=from_smallest_three(words[:, 1] >> 30, _unpack(words[:, 1], QUAT_BITS) - 0.5),
+    )
+
+
+def _harmonics(tables: Tables, count: int) -> np.ndarray:
+    """[N, K - 1, 3] float32, K - 1 = 0 if the file has none."""
+    if "sh" not in tables.elements:
+        return np.zeros((count, 0, 3), np.float32)
+    names = [f"f_rest_{index}" for index in range(len(tables.elements["sh"].properties))]
+    if len(names) not in (9, 24, 45):
+        raise Unexpected(f"{len(names)} properties of harmonics, not 9, 24 or 45")
+    steps = _columns(tables, "sh", names, "u1")
+    if len(steps) != count:
+        raise ValueError(f"harmonics of {len(steps)} of {count} Gaussians")
+    values = (steps + np.float32(0.5) - 128) / np.float32(HARMONIC_STEPS)
+    values = np.where(steps == 0, HARMONICS[0], np.where(steps == 255, HARMONICS[1], values)).astype(np.float32)
+    return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
+
+
+def _columns(tables: Tables, element: str, names: tuple[str, ...] | list[str], code: str) -> np.ndarray:
+    """The properties [N, len(names)] of an element, which have to have the type ``code``."""
+    if element not in tables.elements:
+        raise Unexpected(f"a compressed one without an element {element!r}")
+    properties = tables.elements[element].properties
+    wrong = [name for name in names if properties.get(name) != code]
+    if wrong:
+        raise Unexpected(f"a compressed one whose {element} lacks {', '.join(wrong):.200} of type {code}")
+    rows = tables.rows(element)
+    return np.stack([rows[name] for name in names], axis=1).astype(code)
+
+
+def _pack(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Numbers 0..1 [N, len(bits)] in one word, the first in its highest bits."""
+    word = np.zeros(len(shares), np.uint32)
+    for column, width in zip(shares.T, bits, strict=True):
+        most = (1 << width) - 1
+        word = (word << width) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(np.uint32)
+    return word
+
+
+def _unpack(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Numbers 0..1 [N, len(bits)] from words."""
+    columns, shift = [], sum(bits)
+    for width in bits:
+        shift -= width
+        most = (1 << width) - 1
+        columns.append((words >> shift & most) / most)
+    return np.stack(columns, axis=1)
