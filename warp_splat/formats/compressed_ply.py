@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.ply_container import Tables, write_tables
+from warp_splat.formats.ply_container import PlyTables, write_tables
 from warp_splat.formats.reading import Unexpected
 from warp_splat.formats.splats import SH_C0, SplatArrays, clipped, from_smallest_three, logit, sigmoid, smallest_three
 
@@ -34,7 +34,7 @@ HARMONICS = (-4.0, 4.0)
 QUAT_BITS = (10, 10, 10)
 
 
-def is_compressed(tables: Tables) -> bool:
+def is_compressed(tables: PlyTables) -> bool:
     """Whether an opened PLY file is one of this kind."""
     return "vertex" in tables.elements and WORDS[0] in tables.elements["vertex"].properties
 
@@ -75,7 +75,7 @@ def write_compressed(path: str | Path, splats: SplatArrays, comments: list[str],
     write_tables(path, tables, comments)
 
 
-def read_compressed(tables: Tables) -> SplatArrays:
+def read_compressed(tables: PlyTables) -> SplatArrays:
     """The Gaussians of an opened file of this kind.
 
     Raises:
@@ -105,7 +105,7 @@ def read_compressed(tables: Tables) -> SplatArrays:
     )
 
 
-def _harmonics(tables: Tables, count: int) -> np.ndarray:
+def _harmonics(tables: PlyTables, count: int) -> np.ndarray:
     """[N, K - 1, 3] float32, K - 1 = 0 if the file has none."""
     if "sh" not in tables.elements:
         return np.zeros((count, 0, 3), np.float32)
@@ -120,7 +120,7 @@ def _harmonics(tables: Tables, count: int) -> np.ndarray:
     return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
 
 
-def _columns(tables: Tables, element: str, names: tuple[str, ...] | list[str], code: str) -> np.ndarray:
+def _columns(tables: PlyTables, element: str, names: tuple[str, ...] | list[str], code: str) -> np.ndarray:
     """The properties [N, len(names)] of an element, which have to have the type ``code``."""
     if element not in tables.elements:
         raise Unexpected(f"a compressed one without an element {element!r}")

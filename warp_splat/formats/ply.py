@@ -14,7 +14,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.compressed_ply import is_compressed, read_compressed, write_compressed
-from warp_splat.formats.ply_container import Tables, write_tables
+from warp_splat.formats.ply_container import PlyTables, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 
@@ -98,7 +98,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
         InputError: if the file is missing, damaged, or has no positions.
     """
     with reading(path, EXPECTED), open(path, "rb") as file:
-        vertex = Tables(file).rows("vertex")
+        vertex = PlyTables(file).rows("vertex")
     names = vertex.dtype.names or ()
     if not set(POSITION) <= set(names):
         raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {', '.join(names):.200}.")
@@ -131,7 +131,7 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
         InputError: if the file is missing, damaged, or not a PLY file of 3D Gaussians.
     """
     with reading(path, EXPECTED), open(path, "rb") as file:
-        tables = Tables(file)
+        tables = PlyTables(file)
         antialiased = not ANTIALIASED_READ.isdisjoint(tables.comments)
         if is_compressed(tables):
             return SplatFile(finite_rows(read_compressed(tables), path, report), antialiased)

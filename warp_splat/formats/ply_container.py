@@ -55,7 +55,7 @@ class Element(NamedTuple):
         return self.rows * sum(2 if text else int(code[1]) for code in self.properties.values())
 
 
-class Tables:
+class PlyTables:
     """An opened PLY file; errors are those that :func:`reading` turns into a sentence.
 
     Attributes:
