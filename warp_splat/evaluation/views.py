@@ -10,13 +10,14 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.evaluation import report
-from warp_splat.evaluation.metrics import Metric, evaluate_folder, write_results
+from warp_splat.evaluation.metrics import Metric, evaluate_folder, psnr, write_results
 from warp_splat.formats.atomic import write_text
 from warp_splat.formats.png import save_png
 from warp_splat.scene.types import View
 from warp_splat.text import format_table
 
-DECIBELS = ("PSNR", "CC_PSNR")
+POSE = "PSNR_POSE"  # PSNR from where the model says that a photograph was taken
+DECIBELS = ("PSNR", "CC_PSNR", POSE)
 TOLD = 10  # views, at most, in the table that is printed
 
 
@@ -58,8 +59,11 @@ def evaluate_views(
     iteration: int,
     extra: dict,
     metrics: Mapping[str, Metric],
+    where_taken: Callable[[View], Camera] | None = None,
 ) -> tuple[dict[str, float], list[Comparison]]:
     """Render ``views`` into ``<model>/<split>/ours_<iteration>``, then ``metrics`` of the saved 8-bit images.
+
+    With ``where_taken``, also the PSNR of renders from there, under a name of its own.
 
     Returns:
         The mean of each metric, and each view with its values.
@@ -70,6 +74,10 @@ def evaluate_views(
     folder = model_folder / split / f"ours_{iteration}"
     renders = write_views(picture, views, folder)
     means, per_view = evaluate_folder(folder, metrics)
+    if where_taken:
+        values = [psnr(picture(where_taken(view)), view.picture, view.mask) for view in views]
+        per_view[POSE] = dict(zip(per_view["PSNR"], values, strict=True))
+        means[POSE] = sum(values) / len(values)
     write_results(model_folder, iteration, means, per_view, extra)
     values = [
         dict(zip(per_view, row, strict=True)) for row in zip(*(v.values() for v in per_view.values()), strict=True)

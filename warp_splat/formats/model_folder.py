@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from warp_splat.scene.types import View
 
 
+CAMERAS = "cameras.json"
+
+
 def default_model_path() -> Path:
     """A folder name that is new each time: ``output/`` and ten characters of a UUID."""
     return Path("output") / str(uuid.uuid4())[:10]
@@ -197,7 +200,7 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
         {"id": index, "img_name": view.name, **camera_entry(view.original)}
         for index, view in enumerate([*views_test, *views_train])
     ]
-    write_text(Path(folder) / "cameras.json", json.dumps(cameras, allow_nan=False))
+    write_text(Path(folder) / CAMERAS, json.dumps(cameras, allow_nan=False))
 
 
 def camera_entry(camera: Camera) -> dict[str, object]:
@@ -216,7 +219,7 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     Raises:
         InputError: if the file is damaged.
     """
-    path = Path(folder) / "cameras.json"
+    path = Path(folder) / CAMERAS
     if not path.exists():
         return []
     with reading(path, "a list of cameras as training writes it"):
@@ -229,6 +232,15 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
             raise Unexpected(f"a camera without {error}") from error
         except (TypeError, ValueError, InputError) as error:
             raise Unexpected(f"a camera with other values ({error!s:.200})") from error
+
+
+def read_refined(folder: str | Path, iteration: int) -> dict[str, Camera]:
+    """By name, the cameras that were learned with the Gaussians of an iteration; none if they were not.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    return dict(read_cameras(ply_path(folder, iteration).parent))
 
 
 def _camera(entry: dict) -> Camera:

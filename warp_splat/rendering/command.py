@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
 from warp_splat.config import RasterOptions, RenderConfig
 from warp_splat.errors import InputError
+from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.flags import check_numbers
@@ -30,7 +31,7 @@ from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_or
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene import load_scene
-from warp_splat.scene.types import Scene
+from warp_splat.scene.types import Scene, View
 
 OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}
 WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
@@ -50,7 +51,7 @@ def render_model(config: RenderConfig) -> int:
     model = GaussianModel.from_splats(gaussians.splats).arranged()
     scene = None
     if _needs_scene(config):
-        scene = load_trained_scene(config.model_path, config.source_path, trained, say)
+        scene = load_trained_scene(config.model_path, config.source_path, trained, say, iteration)
     options, linear = options_of(trained), is_linear(scene, trained)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
@@ -67,7 +68,11 @@ def render_model(config: RenderConfig) -> int:
                 print(f"  train  {len(scene.train)} views in {written}")
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}
-                means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics)
+                where = None
+                if model_folder.read_refined(folder, iteration):
+                    background = torch.full((3,), float(bool(trained.get("white_background"))), device=device)
+                    where = where_taken(model.activated(), background, options, scene.extent)
+                means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
                 print(f"  {metrics_line(means)}: {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
@@ -128,17 +133,20 @@ def is_linear(scene: Scene | None, trained: dict) -> bool:
     return scene.linear if scene else bool(trained.get("linear_light"))
 
 
-def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Callable[[str], object]) -> Scene:
-    """The scene that a model was trained on, as it was loaded then.
+def load_trained_scene(
+    model_path: str, source_path: str, trained: dict, say: Callable[[str], object], iteration: int
+) -> Scene:
+    """The scene that a model was trained on, as it was loaded then, with the cameras that were learned.
 
     Args:
         model_path: the model, for messages.
         source_path: where the scene is now; empty: where it was.
         trained: options of the training.
         say: receives what there is to say.
+        iteration: of the model, whose cameras are taken if they were refined.
 
     Raises:
-        InputError: as :func:`load_scene`, or if it is not known which scene that is.
+        InputError: as :func:`load_scene`; if it is not known which scene that is, or it has changed since.
     """
     trained_on = str(trained.get("source_path", ""))
     source = source_path or trained_on
@@ -151,7 +159,25 @@ def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Ca
         raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
     flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
     names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
-    return load_scene(source, **names, resolution=resolution, **flags, report=say)
+    scene = load_scene(source, **names, resolution=resolution, **flags, report=say)
+    cameras = model_folder.read_refined(model_path, iteration)
+    if cameras:
+        say(f"The cameras are those of the model, which were refined in iteration {iteration}.")
+        train, test = ([_refined(view, cameras, model_path) for view in views] for views in (scene.train, scene.test))
+        scene = replace(scene, train=train, test=test)
+    return scene
+
+
+def _refined(view: View, cameras: Mapping[str, Camera], model_path: str) -> View:
+    """The view with its camera of ``cameras``. Raises InputError if it has none of its size."""
+    camera, given = cameras.get(view.name), view.original
+    if camera is None or (camera.width, camera.height) != (given.width, given.height):
+        found = "none" if camera is None else f"one for {camera.width}x{camera.height} px"
+        raise InputError(
+            f"{model_path}: expected a refined camera for {view.name}, {given.width}x{given.height} px, found {found}; "
+            "the scene has changed since the training, name the one of then with -s."
+        )
+    return replace(view, camera=camera.resized(view.camera.width, view.camera.height), original=camera)
 
 
 def make_picture(

@@ -245,7 +245,7 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     bar.set_postfix_str(text, refresh=False)
     if time.perf_counter() - run.preview > PREVIEW_SECONDS:
         run.preview = time.perf_counter()
-        view = views[len(views) // 2]
+        view = trainer.refined(views)[len(views) // 2]
         try:
             save_png(run.folder / "preview.png", np.concatenate([view.picture, trainer.picture(view.camera)], 1))
         except InputError as error:

@@ -21,6 +21,7 @@ from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
+from warp_splat.formats.colmap_text import write_colmap
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.text import format_table
@@ -66,7 +67,23 @@ def save_model(trainer: Trainer, run: Run) -> Path:
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
         trainer.model.arranged().save(path, antialiased)
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
+    try:
+        _save_cameras(trainer, run.folder, path.parent)
+    except InputError as error:
+        warn(error)
     return path
+
+
+def _save_cameras(trainer: Trainer, folder: Path, beside: Path) -> None:
+    """If they were refined: beside the model, for viewers, and as a COLMAP model for other tools."""
+    scene, train = trainer.scene, trainer.refined(trainer.scene.train)
+    if train is scene.train:
+        return
+    test = trainer.refined(scene.test)
+    for place in (beside, folder):
+        model_folder.write_cameras(place, test, train)
+    cameras = [(view.name, view.original) for view in (*train, *test)]
+    write_colmap(folder / "colmap" / "sparse" / "0", cameras, scene.points, scene.colors)
 
 
 def save_or_warn(trainer: Trainer, run: Run) -> None:
@@ -158,7 +175,8 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     metrics, absent = choose_metrics(trainer.config.report.lpips_weights)
     for sentence in absent:
         say(sentence)
-    means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics)
+    views, where = trainer.refined(views), trainer.where_taken()
+    means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
     show_views(compared, run.folder, split, run.iteration, say)
     run.events.write_means(run.iteration, split, means)
     plot = run.folder / "training.png"

@@ -24,6 +24,10 @@ they run in this order:
     loss(loss, out, step) -> loss           a scalar, which is differentiated
     after_step(iteration)                   after Adam
 
+For what is shown and saved, a part may have:
+
+    refined(camera, view) -> camera         of a photograph, held out or not, as it is learned by now
+
 Both may have:
 
     asks(options, step) -> options          what they need of the renderer in this step: depth, ...

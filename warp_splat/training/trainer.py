@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -14,11 +15,13 @@ from warp_splat.camera import Camera
 from warp_splat.color import to_bytes, to_srgb
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load
@@ -164,7 +167,9 @@ class Trainer:
     def warm_up(self) -> None:
         """Compile and load every kernel of a step, changing nothing."""
         view = self.scene.train[0]
-        out = self._render(view.camera.resized(TILE, TILE), self.background, self._asked(Step(0, view)))
+        step = Step(0, view)
+        camera = self._through("camera", view.camera.resized(TILE, TILE), step)
+        out = self._render(camera, self.background, self._asked(step))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.adam.zero_grad()
         self.optimizer.load()
@@ -239,7 +244,9 @@ class Trainer:
                 dealt.append(self._deck.pop(index))
         return dealt[self.processes.rank]
 
-    def _render(self, camera: Camera, background: torch.Tensor, options: RasterOptions) -> RenderOutput:
+    def _render(
+        self, camera: Camera | CameraParameters, background: torch.Tensor, options: RasterOptions
+    ) -> RenderOutput:
         with stage("project"):
             gaussians = self.model.activated(self.degree)
         return render(gaussians, camera, background, replace(options, sh_degree=self.degree), self.config.model.adjoint)
@@ -253,8 +260,22 @@ class Trainer:
         """The present model seen by ``camera``, [H, W, 3] uint8."""
         return to_bytes(self.look(camera).image, self.scene.linear)
 
+    def refined(self, views: list[View]) -> list[View]:
+        """The views, with the cameras that parts have learned."""
+        if not having(self.parts, "refined"):
+            return views
+        through = lambda camera, view: self._through("refined", camera, view)  # noqa: E731
+        return [replace(v, camera=through(v.camera, v), original=through(v.original, v)) for v in views]
+
+    def where_taken(self) -> Callable[[View], Camera] | None:
+        """A function from a held-out view to where the model says that it was taken, if parts refine cameras."""
+        if not having(self.parts, "refined") or not self.scene.test:
+            return None
+        return where_taken(self.model.activated(self.degree), self.background, self.options, self.scene.extent)
+
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
+        views = self.refined(views)
         return float(np.mean([psnr(self.picture(view.camera), view.picture, view.mask) for view in views]))
 
 

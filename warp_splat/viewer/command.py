@@ -33,7 +33,7 @@ def view_model(config: ViewConfig) -> int:
     iteration, gaussians, trained = open_model(config.model, config.iteration)
     model = GaussianModel.from_splats(gaussians.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
-    scene = _find_scene(config, trained)
+    scene = _find_scene(config, trained, iteration)
     draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained))
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
@@ -49,10 +49,10 @@ def view_model(config: ViewConfig) -> int:
     return 0
 
 
-def _find_scene(config: ViewConfig, trained: dict) -> Scene | None:
+def _find_scene(config: ViewConfig, trained: dict, iteration: int) -> Scene | None:
     """The scene of the model; None if it is not known or has gone, since one can look around without it."""
     try:
-        return load_trained_scene(config.model, config.source_path, trained, print)
+        return load_trained_scene(config.model, config.source_path, trained, print, iteration)
     except InputError as error:
         if config.source_path:
             raise

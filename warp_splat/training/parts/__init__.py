@@ -43,10 +43,21 @@ class ExposureOptions:
     vignetting: bool = learning(False, "exposure also learns how all photographs darken towards their corners")
 
 
+@dataclass(frozen=True)
+class PoseOptions:
+    """Poses and lenses that are learned."""
+
+    pose_lr: float = learning(0.001, "rate of --parts pose at its start, in radians and shares of the scene's extent")
+    pose_from_iter: int = learning(500, "step from which poses move", least=0)
+    pose_reg: float = learning(0.1, "weight of the squared distance from the given poses and lenses in the loss")
+    pose_intrinsics: str = learning("", "what of the lens --parts pose refines, too", choices=("", "focal", "all"))
+
+
 #: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
     "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
     "exposure": Entry(ExposureOptions, "warp_splat.training.parts.exposure.Exposure"),
+    "pose": Entry(PoseOptions, "warp_splat.training.parts.pose.Pose"),
     "floaters": Entry(FloatersOptions, "warp_splat.training.parts.floaters.Floaters"),
 }
 

@@ -1,0 +1,202 @@
+"""Refined poses: what moves and what stays, the verdict, the same bytes after a resume, the files that know them."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scene_files import write_colmap
+from scipy.spatial.transform import Rotation
+from test_checkpoints import begin, state_of, steps
+from test_train import SCENE, fails, train
+
+from warp_splat.cli import main
+from warp_splat.evaluation.alignment import find_pose
+from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.formats.model_folder import read_cameras
+from warp_splat.raster.api import rasterize
+from warp_splat.scene import load_scene
+from warp_splat.scene.types import View
+from warp_splat.training.parts.pose import Pose, gauge, pose_error
+from warp_splat.training.record import keep, restore
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import cameras
+import poses
+
+ALL = {"parts": "pose", "pose_from_iter": 1, "pose_intrinsics": "all"}
+
+
+def similar(camera, turn, shift, growth, middle):
+    """The camera where a similarity about ``middle`` of the world takes it."""
+    matrix = Rotation.from_rotvec(turn).as_matrix()
+    rotation, center = camera.rotation @ matrix.T, growth * matrix @ (camera.center - middle) + shift + middle
+    return replace(camera, rotation=rotation, translation=-rotation @ center)
+
+
+def twist_between(camera, other, extent):
+    """From one pose to the other, to first order, in radians and extents."""
+    turn = Rotation.from_matrix(other.rotation @ camera.rotation.T)
+    shift = other.translation - turn.as_matrix() @ camera.translation
+    return np.concatenate([turn.as_rotvec(), shift / extent])
+
+
+def test_the_gauge_is_what_similarities_do(scene):
+    """Seven orthonormal motions, which hold all that small similarities do to the cameras, and no more."""
+    given = [view.camera for view in scene.train]
+    basis = np.stack(gauge(given, scene.extent))
+    np.testing.assert_allclose(basis @ basis.T, np.eye(7), atol=1e-12)
+    middle = np.mean([camera.center for camera in given], axis=0)
+    for numbers in 1e-6 * np.random.default_rng(0).normal(size=(9, 7)):
+        moved = [similar(camera, numbers[:3], numbers[3:6], 1 + numbers[6], middle) for camera in given]
+        twist = np.concatenate([twist_between(*pair, scene.extent) for pair in zip(given, moved, strict=True)])
+        np.testing.assert_allclose(basis.T @ (basis @ twist), twist, atol=1e-10)
+    assert len(gauge([replace(camera, translation=np.zeros(3)) for camera in given], scene.extent)) == 6
+
+
+def test_only_what_is_seen_learns_and_the_set_stays(scene, tmp_path):
+    trainer, run = begin(scene, tmp_path, **ALL)
+    pose = trainer.parts[0]
+    trainer.differentiate(1)
+    assert int((pose.twists.grad != 0).any(1).sum()) == 1 and pose.stretches.grad.shape == (1, 4)
+    assert bool((pose.stretches.grad != 0).all())
+    trainer, run = begin(scene, tmp_path, **ALL)
+    steps(trainer, run, 12)
+    pose, moved = trainer.parts[0], trainer.refined(scene.train)
+    twists = pose.twists.detach().double().numpy()
+    assert np.abs(twists).max() > 1e-4 and len(pose.gauge) == 7
+    assert np.abs(np.stack(pose.gauge) @ twists.ravel()).max() < 1e-8 * len(twists)
+    for view, other, twist in zip(scene.train, moved, twists, strict=True):
+        found = twist_between(view.camera, other.camera, scene.extent)
+        np.testing.assert_allclose(found[:3], twist[:3], atol=1e-9)
+    given = replace(scene.train[0])  # as if it were held out: the lens alone is known
+    held = trainer.refined([given])[0]
+    assert np.array_equal(held.camera.rotation, given.camera.rotation)
+    assert held.camera.fx == moved[1].camera.fx != given.camera.fx
+    assert held.original.fx / given.original.fx == pytest.approx(held.camera.fx / given.camera.fx)
+
+
+@pytest.mark.parametrize("lens", ["", "focal", "all"])
+def test_it_resumes_to_the_same_bytes(lens, scene, tmp_path):
+    options = {**ALL, "pose_intrinsics": lens, "pose_from_iter": 5}
+    trainer, run = begin(scene, tmp_path, **options)
+    steps(trainer, run, 34)
+    expected, _ = state_of(trainer, run)
+    assert ("parameters.lens" in expected) == bool(lens)
+    trainer, run = begin(scene, tmp_path, **options)
+    for stop in (3, 20):
+        steps(trainer, run, stop)
+        keep(trainer, run)
+        trainer, run = begin(scene, tmp_path, **options)
+        restore(trainer, run, load_checkpoint(tmp_path))
+    steps(trainer, run, 34)
+    found, _ = state_of(trainer, run)
+    assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
+
+
+def test_verdict(tmp_path):
+    """Of the embedded scene, the same with poses that are off, and one without keypoints."""
+    scene = load_scene(SCENE, eval=True, resolution=2, report=lambda line: None)
+    assert not Pose.needed(scene).needed
+    wrong = poses.misplaced(scene, np.random.default_rng(0))
+    assert Pose.needed(wrong).needed
+    (tmp_path / "plain").mkdir()
+    verdict = Pose.needed(load_scene(write_colmap(tmp_path / "plain"), report=lambda line: None))
+    assert not verdict.needed and "keeps no keypoints" in verdict.sentence
+
+
+def test_the_error_of_a_pose_is_the_way_of_its_points(scene):
+    """Where a known turn and shift would move them; keypoints that are mistaken say little."""
+    generator = np.random.default_rng(0)
+    for view in scene.train[:5]:
+        camera, seen = view.original, scene.tracks[view.name]
+        right = seen._replace(slopes=slopes_of(camera, seen.points))
+        wrong = replace(
+            camera,
+            rotation=Rotation.from_rotvec([0.004, -0.006, 0.01]).as_matrix() @ camera.rotation,
+            translation=camera.translation + 0.01,
+        )
+        way = (slopes_of(wrong, seen.points) - right.slopes) * [camera.fx, camera.fy]
+        assert pose_error(wrong, right) == pytest.approx(np.sqrt((way**2).sum(1).mean()), rel=0.02)
+        assert pose_error(camera, right) < 1e-9
+        mistaken = np.where(generator.random((len(right.ids), 1)) < 0.1, 0.3, 0.0)
+        assert pose_error(camera, right._replace(slopes=right.slopes + mistaken)) < 0.01
+        behind = replace(camera, rotation=np.diag([1.0, -1.0, -1.0]) @ camera.rotation, translation=-camera.translation)
+        assert pose_error(behind, right) > 10
+
+
+def slopes_of(camera, points):
+    x, y, z = camera.rotation @ points.T + camera.translation[:, None]
+    return np.stack([x / z, y / z], axis=1)
+
+
+def test_a_photograph_is_found_while_the_model_stays():
+    """From 1 degree and 2 %, to where the model itself took it."""
+    gaussians, right = cameras.cube(0), cameras.looking()
+    with torch.no_grad():
+        photo = np.rint(255 * rasterize(*gaussians, right).image.numpy().clip(0, 1)).astype(np.uint8)
+    turn = Rotation.from_rotvec([0.01, 0.01, -0.01]).as_matrix()
+    start = replace(right, rotation=turn, translation=right.translation - 0.012)
+    camera = find_pose(lambda learned: rasterize(*gaussians, learned).image, View("a.png", start, photo, start), 1.0)
+    degrees, meters, focal = cameras.distance(camera, right)
+    assert degrees < 0.05 and meters < 1e-3 and focal == 0
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    assert train(folder, "--iterations", "24", "--parts", "pose", "--pose_from_iter", "1", "--pose_intrinsics=all") == 0
+    return folder
+
+
+def test_render_knows_the_cameras(trained, capsys):
+    trained_results = json.loads((trained / "results.json").read_text())["ours_24"]
+    assert trained_results["PSNR_POSE"] >= trained_results["PSNR"]
+    assert "PSNR_POSE" in (trained / "per_view.md").read_text()
+    assert main(["render", "-m", str(trained), "--skip_train"]) == 0
+    assert "refined in iteration 24" in capsys.readouterr().out
+    results = json.loads((trained / "results.json").read_text())["ours_24"]
+    for name in ("PSNR", "SSIM"):
+        assert results[name] == pytest.approx(trained_results[name], abs=1e-3), name
+    assert results["PSNR_POSE"] >= results["PSNR"]
+
+
+def test_other_tools_get_the_cameras(trained):
+    """cameras.json, and a COLMAP model that pycolmap reads."""
+    cameras_now, given = dict(read_cameras(trained)), load_scene(SCENE, eval=True, report=lambda line: None)
+    beside = trained / "colmap"
+    (beside / "images").symlink_to(SCENE / "images")
+    scene = load_scene(beside, report=lambda line: None)
+    assert len(scene.train) == len(cameras_now) == 50
+    for view in scene.train:
+        camera = cameras_now[view.name]
+        np.testing.assert_allclose(view.camera.rotation, camera.rotation, atol=1e-12)
+        np.testing.assert_allclose(view.camera.translation, camera.translation, atol=1e-12)
+        assert (view.camera.fx, view.camera.cy) == (camera.fx, camera.cy)
+    assert any(not np.allclose(cameras_now[v.name].rotation, v.camera.rotation, atol=1e-6) for v in given.train)
+    np.testing.assert_allclose(np.sort(scene.points, 0), np.sort(given.points, 0), rtol=1e-6)
+
+
+def test_a_scene_that_changed_is_refused(trained, tmp_path, capsys):
+    other = write_colmap(tmp_path, ["a.png", "b.png"])
+    message = fails(capsys, "render", "-m", str(trained), "-s", str(other))
+    assert "expected a refined camera for" in message and "found none; the scene has changed" in message
+
+
+@pytest.mark.parametrize("value", ["-1", "nan"])
+def test_bad_options_are_refused(value, tmp_path, capsys):
+    assert "--pose_lr: expected" in fails(capsys, "train", "-s", str(SCENE), "-m", str(tmp_path), f"--pose_lr={value}")
+
+
+def test_without_it_nothing_changes(scene, tmp_path):
+    states = []
+    for options in ({}, {"pose_lr": 9.0, "pose_reg": 9.0, "pose_intrinsics": "all"}):
+        trainer, run = begin(scene, tmp_path, **options)
+        steps(trainer, run, 12)
+        states.append(state_of(trainer, run)[0])
+        assert trainer.refined(scene.train) is scene.train and trainer.where_taken() is None
+    assert states[0] == states[1]

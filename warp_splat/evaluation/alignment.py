@@ -1,0 +1,59 @@
+"""Where a photograph was really taken: its pose is refined, while the model stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch.nn.functional import avg_pool2d
+
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.raster.api import render
+from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.data import Gaussians
+from warp_splat.scene.types import View
+
+LEVELS = (1, 2, 4, 8, 16)  # px: boxes over which differences are averaged; fine detail sees no large displacement
+STEPS = 40  # at most, each a picture and its adjoint
+
+
+def where_taken(
+    gaussians: Gaussians, background: torch.Tensor, options: RasterOptions, extent: float
+) -> Callable[[View], Camera]:
+    """A function from a view to the camera that :func:`find_pose` finds for it."""
+    gaussians = Gaussians(*(tensor.detach() for tensor in gaussians))
+    return lambda view: find_pose(lambda camera: render(gaussians, camera, background, options).image, view, extent)
+
+
+def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, extent: float) -> Camera:
+    """The camera from which the model looks most like the photograph, by L-BFGS from where it was given.
+
+    Args:
+        draw: the model's image [H, W, 3] through a camera, with gradients for that.
+        view: the photograph; where it has a mask, the rest does not count.
+        extent: size of the scene, world units.
+    """
+    camera = view.camera
+    units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
+    photo = torch.from_numpy(np.float32(view.image / 255.0) if view.image.dtype == np.uint8 else view.image)
+    mask = torch.ones(1) if view.mask is None else torch.from_numpy(view.mask[..., None]).float()
+
+    def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        twist = torch.from_numpy(numbers).requires_grad_()
+        image = draw(_moved(camera, twist * units))
+        difference = ((image - photo.to(image.device)) * mask.to(image.device)).permute(2, 0, 1)
+        levels = [level for level in LEVELS if level <= min(difference.shape[1:])]
+        errors = torch.stack([avg_pool2d(difference, level).square().mean() for level in levels]).sum()
+        errors.backward()
+        return errors.item(), twist.grad.numpy()
+
+    found = minimize(loss, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxfun": STEPS})
+    return _moved(camera, torch.from_numpy(found.x) * units).camera
+
+
+def _moved(camera: Camera, twist: torch.Tensor) -> CameraParameters:
+    lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    return CameraParameters(camera, twist, lens)
