@@ -16,8 +16,9 @@ from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, v
 from warp_splat.kernels.simd import Types
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes, stage
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes
 from warp_splat.runtime.sums import in_pairs
+from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import NEEDED, gains_of
 from warp_splat.scene.types import Scene
 from warp_splat.training.optimizer import power
