@@ -1,5 +1,6 @@
 """Exposure: kernels against float64, the gauge, what it finds of faults that are known, and the same bytes again."""
 
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 from test_checkpoints import begin, state_of, steps
 from test_train import SCENE
 
+from warp_splat.cli import main
 from warp_splat.color import to_srgb
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.raster.drivers import CPU, CUDA, using
@@ -144,3 +146,19 @@ def test_light_times_a_number_is_a_gain_of_what_a_screen_shows():
         factor = 2 ** (stops / 2.4)
         expected = (to_srgb(light, np.where) + 0.055) * factor - 0.055
         assert np.abs(to_srgb(light * 2**stops, np.where) - expected)[light * 2**stops > 0.0032].max() < 1e-12
+
+
+def test_inspect_tells_it_beside_exif(faulty, tmp_path, capsys):
+    """Two photographs of three have EXIF."""
+    folder, truth = faulty
+    assert main(["inspect", str(folder), "-o", str(tmp_path / "page.html")]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if " exposure " in line)
+    found = re.fullmatch(
+        r"warning +exposure +photographs differ by (\S+) stops .*: (\S+) \((\S+)\) to (\S+) \((\S+)\) in all; EXIF has "
+        r"the exposure of 29 of 50, (\S+) stops beside .*; train with --parts exposure\.",
+        line,
+    )
+    assert found and float(found[1]) > 0.15 and float(found[6]) < 0.05
+    green = {name: change[1] for name, change in truth.items()}
+    assert (found[3], found[5]) == (min(green, key=green.__getitem__), max(green, key=green.__getitem__))
+    assert (tmp_path / "page.html").read_text().count("<img") == 5

@@ -49,12 +49,12 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
     findings, page = examine(EMBEDDED, tmp_path, capsys, 0)
     assert not worst(findings)
     html = page.read_text()
-    assert html.count('src="data:image/jpeg;base64,') == html.count("<img") == 4
+    assert html.count('src="data:image/jpeg;base64,') == html.count("<img") == 5
     text = re.sub('base64,[^"]*', "", html)  # in which any word may stand
     assert "http" not in text and "<script" not in text
     assert {check for _, check, _ in findings} >= {
         "cameras", "intrinsics", "sizes", "files", "sub-models", "reprojection", "coverage", "unseen points",
-        "axes", "duplicates", "masks", "loading", "forecast",
+        "axes", "exposure", "duplicates", "masks", "loading", "forecast",
     }  # fmt: skip
 
 

@@ -39,6 +39,8 @@ def draw_pictures(subject: Subject, measured: Measured) -> Iterable[tuple[str, s
     yield "Cameras (with their viewing directions) and points, from two sides", _encode(_map(subject))
     if measured.errors:
         yield "Reprojection error and points of each image, by name", _encode(_bars(measured))
+    if measured.stops:
+        yield "Exposure of each photograph beside the others, by name", _encode(_exposures(measured))
 
 
 def _encode(figure: Figure) -> str:
@@ -133,4 +135,17 @@ def _bars(measured: Measured) -> Figure:
     for axes, (title, values, color) in zip(grid[0], panels, strict=True):
         plain_axes(axes, title, "image")
         axes.bar(range(len(values)), values, color=color)
+    return figure
+
+
+def _exposures(measured: Measured) -> Figure:
+    figure, axes = new_panels(2.6)
+    places = {name: place for place, name in enumerate(measured.stops)}
+    plain_axes(axes, "brightness of the same points [stops]", "photograph")
+    axes.bar(places.values(), measured.stops.values(), color=BLUE, label="measured")
+    if measured.exif:
+        axes.scatter(
+            [places[name] for name in measured.exif], measured.exif.values(), 12, ORANGE, label="EXIF", zorder=2
+        )
+        axes.legend(fontsize=7)
     return figure

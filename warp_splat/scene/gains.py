@@ -18,6 +18,7 @@ from warp_splat.scene.types import Scene
 
 LONG = 480  # px, of the images from which colors are taken: means over several pixels of larger ones
 DARKEST, BRIGHTEST = 0.003, 0.9  # light that counts: the rest is noise, the foot of sRGB's curve, or saturated
+GREEN = 1  # the channel of exposure: white balance is red and blue beside it
 FEWEST = 30  # points of a photograph
 ROUNDS, SMALLEST = 12, 0.02  # of the fit; residuals [stops] below which it takes squares
 NEEDED = 0.05  # stops: an unlikeness of gains from which on it is worth to learn them

@@ -5,6 +5,7 @@ those that say so, are in linear light and are not quantized. The orientation ta
 motion saw the pixels as stored.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -92,6 +93,21 @@ def read_lens(path: Path) -> tuple[int, int, str, float]:
     spec = _open(path).spec()
     focal = spec.get_float_attribute("Exif:FocalLength")
     return spec.width, spec.height, _text(spec.get_string_attribute, "Model"), focal
+
+
+def read_exposure(path: Path) -> float | None:
+    """What EXIF says of how much light counts in a photograph [stops, from any zero]; None without a time.
+
+    Raises:
+        InputError: if the file is not an image that OpenImageIO reads.
+    """
+    spec = _open(path).spec()
+    names = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings")
+    time, aperture, speed, older = (spec.get_float_attribute(name) for name in names)
+    if not 0 < time < math.inf:
+        return None
+    aperture, speed = (value if 0 < value < math.inf else 1.0 for value in (aperture, speed or older))
+    return math.log2(time * speed / aperture**2)
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:

@@ -19,7 +19,7 @@ from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import lanes_of, launch_in_lanes
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
-from warp_splat.scene.gains import NEEDED, gains_of
+from warp_splat.scene.gains import GREEN, NEEDED, gains_of
 from warp_splat.scene.types import Scene
 from warp_splat.training.optimizer import power
 from warp_splat.training.parts import ExposureOptions
@@ -56,7 +56,7 @@ class Exposure:
             return Verdict(
                 False, "the scene does not say which points its photographs saw, so exposure is not measured"
             )
-        stops = [gain.mean() for gain in gains.stops.values()]
+        stops = [gain[GREEN] for gain in gains.stops.values()]
         figure = (
             f"{gains.unlike:.3f} stops from those that show the same ({min(stops):+.2f} to {max(stops):+.2f} in all)"
         )
