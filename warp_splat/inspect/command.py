@@ -9,7 +9,7 @@ from pathlib import Path
 
 from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
-from warp_splat.inspect import geometry, light, verdicts
+from warp_splat.inspect import brightness, geometry, verdicts
 from warp_splat.inspect.html_page import write_page
 from warp_splat.inspect.pictures import draw_pictures
 from warp_splat.inspect.subject import Finding, read_subject
@@ -38,7 +38,7 @@ def inspect(config: InspectConfig) -> int:
     findings += geometry.check_reprojection(subject, measured)
     findings += geometry.check_coverage(subject, measured)
     findings += geometry.check_axes(subject)
-    findings += light.check_exposure(subject, measured)
+    findings += brightness.check_exposure(subject, measured)
     findings += verdicts.check_names(subject)
     findings += verdicts.check_masks(subject)
     findings += verdicts.check_loading(subject, config.images)
