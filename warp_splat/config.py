@@ -27,6 +27,8 @@ OUTLINE_REACH = 3.0  # it leaves out a Gaussian of which this many standard devi
 COMPENSATION_MIN = 2.5e-5  # floor of the share of its area that antialiasing leaves a Gaussian, squared
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is clamped this share of the half field of view outside the image
 TILE = 16  # px, side of a tile
+CHANNELS_MOST = 512  # of features
+STRONGEST_MOST = 8  # Gaussians of a pixel that are told
 
 PORT, LAST_PORT = 8080, 65535  # of the viewer
 PORT_HELP = "of the viewer; if it is busy, the next free one"
@@ -63,6 +65,9 @@ class RasterOptions:
             "square" (of the reference: 3 standard deviations of the long axis).
         exp_degree: degree of the polynomial in the exponential, 3 to 6; None calls the C library's, without lanes.
         falloff: of your own instead of the Gaussian's, see :class:`warp_splat.Falloff`; not with adjoint "manual".
+        median_depth: also return the depth per pixel at which half of the light is gone.
+        normals: also blend the Gaussians' normals: their shortest axes, towards the camera.
+        strongest: also return which Gaussians weigh most in each pixel, so many of them, 0 to 8, and their weights.
     """
 
     depth: bool = False
@@ -75,6 +80,9 @@ class RasterOptions:
     extent: str = "ellipse"
     exp_degree: int | None = 5
     falloff: Falloff | None = None
+    median_depth: bool = False
+    normals: bool = False
+    strongest: int = 0
 
 
 @dataclass

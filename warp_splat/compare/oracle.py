@@ -53,6 +53,9 @@ class Render:
     touches: torch.Tensor  # [N] bool, reaches a pixel beyond doubt
     near_image: torch.Tensor  # [N] bool, the box around alpha >= 1/255 overlaps the image (or nearly)
     reach: torch.Tensor  # [N] px, long half axis of the ellipse alpha = 1/255, 0 where there is none
+    order: torch.Tensor  # [M] Gaussians that a pixel sees, nearest first
+    weights: torch.Tensor  # [H, W, M] their shares in the pixels
+    z: torch.Tensor  # [N] depth in the camera
 
 
 def rotation_matrices(quats):
@@ -266,4 +269,7 @@ def exact_render(
         touches=touches,
         near_image=near_image,
         reach=reach,
+        order=order,
+        weights=weight.reshape(*shape, len(order)),
+        z=splats.z,
     )

@@ -16,8 +16,16 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.blend import blend
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.checks import check_background, check_camera, check_gaussians, check_options, explain_invalid
-from warp_splat.raster.data import Dropped, Gaussians
+from warp_splat.raster.channels import Blended, blend_beside
+from warp_splat.raster.checks import (
+    check_background,
+    check_camera,
+    check_features,
+    check_gaussians,
+    check_options,
+    explain_invalid,
+)
+from warp_splat.raster.data import Dropped, Gaussians, Walk
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.runtime.timers import stage
@@ -39,6 +47,11 @@ class RenderOutput:
     invalid_count: int | torch.Tensor  # see `invalid`; on a GPU, reading it waits for the image
     gaussians: Gaussians  # that were rendered
     dropped: Dropped = field(default_factory=Dropped)
+    features: torch.Tensor | None = None  # [H, W, C] sum of weight times feature, if given
+    normals: torch.Tensor | None = None  # [H, W, 3] sum of weight times normal, in the world, if asked for
+    median_depth: torch.Tensor | None = None  # [H, W] world units, z where half of the light is gone; 0 where it is not
+    strongest: torch.Tensor | None = None  # [H, W, k] int64, Gaussians of the largest weights; -1 where there is none
+    strongest_weights: torch.Tensor | None = None  # [H, W, k] share of them in the pixel
 
     @property
     def invalid(self) -> int:
@@ -56,6 +69,7 @@ def rasterize(
     background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
     adjoint: str = "manual",
     options: RasterOptions | None = None,
+    features: torch.Tensor | None = None,
 ) -> RenderOutput:
     """Render Gaussians through a camera (Kerbl et al. 2023), differentiable in every tensor given.
 
@@ -72,9 +86,12 @@ def rasterize(
             "stepwise": reverse loop by hand, its body by Warp. "reversible": the whole loop by Warp, transmittance
             recovered by division, as in the two before. "stored": likewise, every transmittance kept in memory.
         options: what to compute; see :class:`RasterOptions`.
+        features: any numbers, [N, C] with C from 1 to 512, blended as color is, on black. Their adjoint is by hand
+            where ``adjoint`` is "manual"; in the other modes Warp derives a step of it, as in "stepwise".
 
     Returns:
-        A :class:`RenderOutput`. ``image``, ``alpha``, ``depth`` and all that lies on the way to them (``means2d``,
+        A :class:`RenderOutput`. ``image``, ``alpha``, ``depth``, ``features``, ``normals``, ``median_depth`` (in
+        ``depths`` only), ``strongest_weights`` and all that lies on the way to them (``means2d``,
         ``conics``, ``colors``, ``depths``, ``opacities2d``) carry gradients. A pixel whose
         upstream gradient is not finite is dropped, as is a Gaussian's gradient that is not finite; both are counted
         in ``dropped``.
@@ -83,7 +100,7 @@ def rasterize(
         InputError: if a shape, dtype, device or value is not as stated (the message names the argument), or if the
             memory does not suffice for "stored".
     """
-    return _checked(means, quats, scales, opacities, sh, [camera], background, adjoint, options)[0]
+    return _checked(means, quats, scales, opacities, sh, [camera], background, adjoint, options, features)[0]
 
 
 def rasterize_views(
@@ -96,6 +113,7 @@ def rasterize_views(
     background: torch.Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
     adjoint: str = "manual",
     options: RasterOptions | None = None,
+    features: torch.Tensor | None = None,
 ) -> list[RenderOutput]:
     """:func:`rasterize` through each of ``cameras``, which may differ in size; the Gaussians are checked but once.
 
@@ -112,6 +130,7 @@ def rasterize_views(
         background: RGB, the same in all images.
         adjoint: how the pixel loop is differentiated.
         options: what to compute.
+        features: [N, C].
 
     Returns:
         A :class:`RenderOutput` for each camera, in their order.
@@ -121,19 +140,23 @@ def rasterize_views(
     """
     if isinstance(cameras, (Camera, CameraParameters)) or not isinstance(cameras, Sequence):
         raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
-    return _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options)
+    return _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options, features)
 
 
-def _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options) -> list[RenderOutput]:
+def _checked(
+    means, quats, scales, opacities, sh, cameras, background, adjoint, options, features
+) -> list[RenderOutput]:
     """See :func:`rasterize_views`."""
     for camera in cameras:
         check_camera(camera)
     options = check_options(adjoint, options)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = check_background(background, means.device)
+    if features is not None:
+        check_features(features, means)
     outputs = []
     for camera in cameras:
-        outputs.append(render(gaussians, camera, background, options, adjoint))
+        outputs.append(render(gaussians, camera, background, options, adjoint, features))
         if outputs[-1].invalid:
             explain_invalid(outputs[-1].invalid, gaussians.quats)
     return outputs
@@ -145,16 +168,22 @@ def render(
     background: torch.Tensor,
     options: RasterOptions,
     adjoint: str = "manual",
+    features: torch.Tensor | None = None,
 ) -> RenderOutput:
     """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted."""
-    driver, dropped = driver_of(gaussians.means.device), Dropped()
+    driver, dropped, walk = driver_of(gaussians.means.device), Dropped(), Walk()
     with stage("project"):
         splats = project(gaussians, camera, options, driver, dropped)
-    camera = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
+    seen = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
     with stage("bin"):
-        bins = driver.bin(splats, camera, options)
+        bins = driver.bin(splats, seen, options)
     with stage("blend"):
-        image, alpha, depth = blend(splats, bins, background, camera, options, adjoint, driver, dropped)
+        image, alpha, depth = blend(splats, bins, background, seen, options, adjoint, driver, dropped, walk)
+    more = {}
+    if features is not None or options.normals or options.median_depth or options.strongest:
+        with stage("channels"):
+            blended = Blended(bins, walk, seen, options, adjoint, driver, dropped)
+            more = blend_beside(features, gaussians, splats, camera, blended)
     all_valid = isinstance(bins.invalid, int) and not bins.invalid  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,
@@ -169,4 +198,5 @@ def render(
         invalid_count=bins.invalid,
         gaussians=gaussians,
         dropped=dropped,
+        **more,
     )

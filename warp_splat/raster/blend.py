@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D
+from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D, Walk
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.timers import stage
 
@@ -22,11 +22,16 @@ def blend(
     adjoint: str = "manual",
     driver: Driver | None = None,
     dropped: Dropped | None = None,
+    walk: Walk | None = None,
 ) -> Pixels:
-    """The pixels of ``splats``, which ``bins`` have packed; ``dropped`` counts what the adjoint refuses to spread."""
+    """The pixels of ``splats``, which ``bins`` have packed; ``dropped`` counts what the adjoint refuses to spread.
+
+    ``walk`` is filled in, if given.
+    """
     driver = driver or driver_of(background.device)
     anchors = (splats.means2d, splats.conics, splats.opacities, splats.colors, splats.depths)
-    return Pixels(*Blend.apply(*anchors, background, bins, camera, options, adjoint, driver, dropped or Dropped()))
+    chosen = (camera, options, adjoint, driver, dropped or Dropped(), walk or Walk())
+    return Pixels(*Blend.apply(*anchors, background, bins, *chosen))
 
 
 class Blend(torch.autograd.Function):
@@ -37,7 +42,20 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, means2d, conics, opacities, colors, depths, background, bins, camera, options, adjoint, driver, dropped
+        ctx,
+        means2d,
+        conics,
+        opacities,
+        colors,
+        depths,
+        background,
+        bins,
+        camera,
+        options,
+        adjoint,
+        driver,
+        dropped,
+        walk,
     ):
         differentiated = any(ctx.needs_input_grad)
         if adjoint == "manual" and options.falloff is not None and differentiated:
@@ -48,6 +66,7 @@ class Blend(torch.autograd.Function):
         keep = adjoint == "stored" and differentiated
         background = background.contiguous()
         pixels, saved = driver.blend(bins, camera, background, options, keep)
+        walk.final, walk.count, _ = saved
         ctx.save_for_backward(background, *saved)
         ctx.bins, ctx.options, ctx.adjoint, ctx.driver, ctx.dropped = bins, options, adjoint, driver, dropped
         return tuple(pixels)
@@ -63,4 +82,4 @@ class Blend(torch.autograd.Function):
             )
             ctx.dropped.pixel_count += dropped.sum()
             grads = ctx.driver.gather(ctx.bins, slots)
-        return *grads, adj_background, *[None] * 6
+        return *grads, adj_background, *[None] * 7

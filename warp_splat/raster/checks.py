@@ -9,7 +9,15 @@ from dataclasses import replace
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import ADJOINTS, EXP_DEGREES, EXTENTS, PROJECTIONS, RasterOptions
+from warp_splat.config import (
+    ADJOINTS,
+    CHANNELS_MOST,
+    EXP_DEGREES,
+    EXTENTS,
+    PROJECTIONS,
+    STRONGEST_MOST,
+    RasterOptions,
+)
 from warp_splat.errors import InputError
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.project import Projection
@@ -53,7 +61,7 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
     if not (options.falloff is None or isinstance(options.falloff, Falloff)):
         raise InputError(f"options.falloff: expected a warp_splat.Falloff or None, got {options.falloff!r:.80}.")
-    for name in ("depth", "antialiasing"):
+    for name in ("depth", "antialiasing", "median_depth", "normals"):
         if not isinstance(getattr(options, name), bool):
             raise InputError(f"options.{name}: expected True or False, got {getattr(options, name)!r}.")
     for name in ("alpha_min", "t_min"):
@@ -63,8 +71,12 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     steps = options.max_steps
     if steps is not None and not (isinstance(steps, numbers.Integral) and int(steps) >= 0):
         raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {steps!r}.")
+    most = options.strongest
+    if isinstance(most, bool) or not (isinstance(most, numbers.Integral) and 0 <= int(most) <= STRONGEST_MOST):
+        raise InputError(f"options.strongest: expected a whole number, 0 to {STRONGEST_MOST}, got {most!r}.")
     return replace(
         options,
+        strongest=int(most),
         sh_degree=None if options.sh_degree is None else int(options.sh_degree),
         exp_degree=None if options.exp_degree is None else int(options.exp_degree),
         alpha_min=float(options.alpha_min),
@@ -102,6 +114,14 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
     outside = bool(((opacities < 0) | (opacities > 1)).any())
     check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
     return Gaussians(*(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
+
+
+def check_features(features: torch.Tensor, means: torch.Tensor) -> None:
+    """Raise InputError if ``features`` are not a number of finite channels for each of ``means``."""
+    _check_tensor("features", features, (means.shape[0], "C"), means.device)
+    if not 1 <= features.shape[1] <= CHANNELS_MOST:
+        raise InputError(f"features: expected 1 to {CHANNELS_MOST} channels, got {features.shape[1]}.")
+    _check_finite("features", features.detach())
 
 
 def _check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.device | None) -> None:

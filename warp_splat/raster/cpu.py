@@ -20,7 +20,7 @@ from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
-from warp_splat.raster.data import Bins, Pixels, limits_of, variant_of
+from warp_splat.raster.data import Bins, Pixels, Walk, limits_of, variant_of
 from warp_splat.runtime.launch import empty, launch, view
 
 
@@ -116,8 +116,10 @@ def differentiate(mode: str, bins: Bins, options: RasterOptions, saved, upstream
         launch(rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [rows])
 
 
-def gather(bins: Bins, slots: torch.Tensor) -> list[torch.Tensor]:
-    """Gradients of means2d, conics, opacities, colors and depths: sums of each Gaussian's slots, zero where culled.
+def gather(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
+    """Sums of each Gaussian's slots, zero where culled, written into ``grads`` [N, width] each, column after column.
+
+    Without, gradients of means2d, conics, opacities, colors and depths.
 
     Always in the same order and without atomics: the same bits for any number of threads. Splats come in the order of
     the Gaussians. Tried:
@@ -125,7 +127,7 @@ def gather(bins: Bins, slots: torch.Tensor) -> list[torch.Tensor]:
     - 36 instead of 23 ms at 1M Gaussians: torch's ``embedding_bag``, some thousands at a time, their columns by numpy
     - 2 x the time: a kernel that does not ask for memory before
     """
-    grads, width = bins.new_gradients(slots), slots.shape[1]
+    grads, width = grads or bins.new_gradients(slots), slots.shape[1]
     columns = [grad.data_ptr() + 4 * column for grad in grads for column in range(grad.shape[1])][:width]
     addresses, widths = torch.tensor(columns), tuple(grad.shape[1] for grad in grads)
     kernel = make_gather(widths if sum(widths) == width else widths[:-1])
@@ -133,6 +135,16 @@ def gather(bins: Bins, slots: torch.Tensor) -> list[torch.Tensor]:
     inputs += [view(slots, wp.types.vector(length=width, dtype=float)), 0.0]
     launch(kernel, len(bins.place_begins) + 1, inputs, [view(addresses, wp.uint64)])
     return [grad.squeeze(1) for grad in grads]
+
+
+def launch_tiles(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list) -> None:
+    """Launch a kernel that takes a tile."""
+    launch(kernel, len(bins.ranges), inputs, outputs, bounds=bins.slices)
+
+
+def view_walk(walk: Walk) -> list:
+    """Final transmittances and counts, as kernels take them."""
+    return _in_lanes(walk.final, walk.count)
 
 
 def _in_lanes(*tensors: torch.Tensor) -> list:

@@ -13,7 +13,7 @@ from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
-from warp_splat.raster.data import WIDTHS, Bins, Pixels, limits_of, variant_of
+from warp_splat.raster.data import Bins, Pixels, Walk, limits_of, variant_of
 from warp_splat.runtime.launch import launch_blocks, view
 
 THREADS = TILE * TILE
@@ -77,14 +77,27 @@ def spread_upstream(bins: Bins, options: RasterOptions, background, final, count
     return (up, adj_final), adj_background, dropped, steps
 
 
-def gather(bins: Bins, slots: torch.Tensor) -> list[torch.Tensor]:
+def gather(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
     """See :func:`warp_splat.raster.cpu.gather`; splats are all Gaussians, nearest first."""
-    grads, gaussians = bins.new_gradients(slots), wp.to_torch(bins.gaussians)
+    grads, gaussians = grads or bins.new_gradients(slots), wp.to_torch(bins.gaussians)
     rows = embedding_bag(bins.places, slots, bins.place_begins, mode="sum")
-    widths = WIDTHS if slots.shape[1] == sum(WIDTHS) else WIDTHS[:-1]
-    for grad, columns in zip(grads, rows.split(widths, 1), strict=False):
-        grad[gaussians] = columns
+    first = 0
+    for grad in grads:
+        last = first + grad.shape[1]
+        if last <= slots.shape[1]:
+            grad[gaussians] = rows[:, first:last]
+        first = last
     return [grad.squeeze(1) for grad in grads]
+
+
+def launch_tiles(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list) -> None:
+    """See :func:`warp_splat.raster.cpu.launch_tiles`; a block takes one."""
+    launch_blocks(kernel, len(bins.ranges), inputs, outputs, bins.instances.device)
+
+
+def view_walk(walk: Walk) -> list:
+    """See :func:`warp_splat.raster.cpu.view_walk`."""
+    return [_float(walk.final), view(walk.count, wp.int32)]
 
 
 def _float(tensor: torch.Tensor):

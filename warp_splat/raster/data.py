@@ -5,7 +5,7 @@ N Gaussians, V splats, M tile instances (a splat in the list of a tile), T tiles
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -99,6 +99,22 @@ class Pixels(NamedTuple):
     def view(self) -> PixelsView:
         """As kernels take them."""
         return pack_struct(PixelsView, **self._asdict())
+
+
+@dataclass
+class Walk:
+    """Where the blend of the color stopped in each pixel: what other channels are blended and differentiated by.
+
+    The blend fills it in. Kernels read it in the layout of their device.
+    """
+
+    final: torch.Tensor = field(default_factory=lambda: torch.empty(0))  # transmittance behind the last Gaussian
+    count: torch.Tensor = field(default_factory=lambda: torch.empty(0))  # instances walked before the pixel stopped
+
+    @property
+    def steps(self) -> torch.Tensor:
+        """Instances of each tile that a pixel blends, [T] int32."""
+        return self.count.flatten(1).amax(1).int()
 
 
 @dataclass

@@ -5,15 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
+from warp_splat.kernels.cpu import channels as lanes
+from warp_splat.kernels.cpu import strongest as lanes_strongest
+from warp_splat.kernels.cuda import channels as blocks
+from warp_splat.kernels.cuda import strongest as blocks_strongest
 from warp_splat.kernels.simd import LANES
+from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster import bin, cpu, cuda
-from warp_splat.raster.data import Bins, Pixels, Splats2D
+from warp_splat.raster.data import Bins, Pixels, Splats2D, Walk
+
+
+class ChannelKernels(NamedTuple):
+    """What blends any number of channels, beside the color."""
+
+    at_once: int  # channels of a group
+    blend: Callable[[BlendVariant], wp.Kernel]
+    adjoint: Callable[..., wp.Kernel]
+    strongest: Callable[[BlendVariant, int], wp.Kernel]
+
 
 Saved = tuple[torch.Tensor, ...]  # what a driver's blend leaves for its adjoint
 
@@ -27,11 +43,24 @@ class Driver:
     bin: Callable[[Splats2D, Camera, RasterOptions], Bins]
     blend: Callable[[Bins, Camera, torch.Tensor, RasterOptions, bool], tuple[Pixels, Saved]]
     adjoint: Callable[[str, Bins, RasterOptions, torch.Tensor, Saved, Pixels], tuple[torch.Tensor, ...]]
-    gather: Callable[[Bins, torch.Tensor], list[torch.Tensor]]
+    gather: Callable[..., list[torch.Tensor]]
+    channels: ChannelKernels
+    launch_tiles: Callable[[wp.Kernel, Bins, list, list], None]
+    view_walk: Callable[[Walk], list]
 
 
-CPU = Driver(LANES, True, bin.bin_by_counting, cpu.blend, cpu.adjoint, cpu.gather)
-CUDA = Driver(1, False, bin.bin_by_sorting, cuda.blend, cuda.adjoint, cuda.gather)
+CPU = Driver(
+    *(LANES, True, bin.bin_by_counting, cpu.blend, cpu.adjoint, cpu.gather),
+    ChannelKernels(lanes.AT_ONCE, lanes.make_blend_channels, lanes.make_adj_channels, lanes_strongest.make_strongest),
+    *(cpu.launch_tiles, cpu.view_walk),
+)
+CUDA = Driver(
+    *(1, False, bin.bin_by_sorting, cuda.blend, cuda.adjoint, cuda.gather),
+    ChannelKernels(
+        blocks.AT_ONCE, blocks.make_blend_channels, blocks.make_adj_channels, blocks_strongest.make_strongest
+    ),
+    *(cuda.launch_tiles, cuda.view_walk),
+)
 #: By torch's name of the device.
 DRIVERS = {"cpu": CPU, "cuda": CUDA}
 

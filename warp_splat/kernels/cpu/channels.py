@@ -1,0 +1,316 @@
+"""Any number of channels on the CPU, blended and differentiated beside the color, some at a time.
+
+The blend of the color has found where each pixel stops, and its transmittance there. So these loops decide nothing:
+forward they repeat the weights, backward they recover T as ``manual`` and ``stepwise`` do. Their sums stay in the first
+cache, which is why channels go in groups. Kernels for one group serve any number of channels in it.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.cpu.adjoint import folded, vec5, vec8
+from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
+from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
+from warp_splat.kernels.step import conic_from_root, geometry_from_moments, make_manual, make_stepwise, opaque
+from warp_splat.kernels.structs import BinsView
+
+AT_ONCE = 32  # channels
+vec_geometry = wp.types.vector(length=CHANNEL, dtype=float)
+mat_geometry = wp.types.matrix(shape=(CHANNEL, LANES), dtype=float)
+
+
+@wp.func
+def pixel_of(tile: int, tiles_x: int, number: int):
+    """Column and line of a tile's pixel, block by block."""
+    block = number // LANES
+    lane = number % LANES
+    column = (tile % tiles_x) * TILE + 4 * (block & 3) + lane % 4
+    return column, (tile // tiles_x) * TILE + 4 * (block >> 2) + lane // 4
+
+
+@wp.func
+def row_of_splat(rows: wp.array2d[float], splat: int):
+    """The channels of a splat, as an array whose stride is known."""
+    return wp.array(ptr=rows.ptr + wp.uint64(4 * AT_ONCE) * wp.uint64(splat), shape=(AT_ONCE,), dtype=float)
+
+
+@functools.cache
+def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
+    """The sums of weights times channels; nothing stands behind them."""
+    fall_at, WIDTH = make_falloff(variant.falloff).value, AT_ONCE
+    T, WALKED, SUMS, STATE = 0, BLOCKS, 2 * BLOCKS, (2 + AT_ONCE) * BLOCKS
+    mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
+
+    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def blend_channels(
+        first: int,
+        bins: BinsView,
+        alpha_min: float,
+        count: wp.array2d[vec16],  # [T, BLOCKS]
+        steps: wp.array[int],  # [T]
+        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats
+        begin: int,  # of the group
+        channels: int,  # of the group
+        # out
+        pixels_out: wp.array3d[float],  # [H, W, C]
+    ):
+        tile = first + wp.tid()
+        start = bins.ranges[tile][0]
+        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
+        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
+        room = mat_room()
+        s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
+        near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
+        for block in range(BLOCKS):
+            s[T + block] = vec16(1.0)
+            s[WALKED + block] = count[tile, block]
+        for row in range(SUMS, s.shape[0]):
+            s[row] = vec16(0.0)
+        end = start + steps[tile]
+        boxes = mat_boxes()
+        for k in range(start, end):
+            ahead = (k - start) & (AHEAD - 1)
+            if ahead == 0:
+                for j in range(wp.min(AHEAD, end - k)):
+                    near[j] = bins.splats[bins.instances[k + j]]
+                for j in range(wp.min(AHEAD, end - k)):
+                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
+            splat = near[ahead]
+            box = boxes[ahead]
+            mine = row_of_splat(rows, bins.instances[k])
+            here = vec16(float(k - start))
+            by = box[2]
+            while by <= box[3]:
+                dy = offset_y(splat.mean, y0, by)
+                bx = box[0]
+                while bx <= box[1]:
+                    block = (4 * by + bx) & (BLOCKS - 1)
+                    dx = offset_x(splat.mean, x0, bx)
+                    fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+                    alpha = opaque(fall * splat.opacity, alpha_min, here, s[WALKED + block])
+                    w = times(alpha, s[T + block])
+                    if some(w):
+                        s[T + block] = fma(-alpha, s[T + block], s[T + block])
+                        row = SUMS + block * WIDTH
+                        channel = int(0)
+                        while channel < channels:
+                            s[row + channel] = fma(w, mine[channel], s[row + channel])
+                            channel += 1
+                    bx += 1
+                by += 1
+        numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
+        pixel = int(0)
+        while pixel < TILE * TILE:
+            x, y = pixel_of(tile, bins.tiles_x, pixel)
+            if y < pixels_out.shape[0] and x < pixels_out.shape[1]:
+                place = (pixel // LANES) * WIDTH * LANES + pixel % LANES
+                for channel in range(channels):
+                    pixels_out[y, x, begin + channel] = numbers[place]
+                    place += LANES
+            pixel += 1
+
+    return blend_channels
+
+
+@functools.cache
+def _make_body(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
+    """What the reverse loop does with a Gaussian and a block: by hand, or the step that Warp differentiates.
+
+    ``lit`` is what the pixels gain by the Gaussian's channels.
+    """
+    adj_step = make_manual(variant.falloff, vec16)
+    Parcel, undo, step = make_stepwise(variant, vec16)
+
+    @wp.func
+    def manual(
+        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alpha_min: float, here: vec16, walked: vec16,
+        lit: vec16,
+    ):  # fmt: skip
+        """T in front, T dL/dT in front, the weight, and what to sum for the geometry."""
+        z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
+        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
+        part = mat_geometry()
+        adj_x = times(adj_opacity, dx)
+        adj_y = times(adj_opacity, dy)
+        part[MEAN_X] = adj_x
+        part[MEAN_Y] = adj_y
+        part[XX] = times(adj_x, dx)
+        part[XY] = times(adj_x, dy)
+        part[YY] = times(adj_y, dy)
+        part[OPACITY] = adj_opacity
+        return front, adj_front, w, part
+
+    @wp.func
+    def stepwise(
+        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alpha_min: float, here: vec16, walked: vec16,
+        lit: vec16,
+    ):  # fmt: skip
+        """T in front, dL/dT in front, the weight, and what to sum for the geometry."""
+        parcel = Parcel()
+        parcel.dx = dx
+        parcel.dy = dy
+        parcel.xx = vec16(splat.root[0])
+        parcel.xy = vec16(splat.root[1])
+        parcel.yy = vec16(splat.root[2])
+        parcel.opacity = vec16(splat.opacity)
+        parcel.red = lit
+        zero = vec16(0.0)
+        fall, front = undo(parcel, t, alpha_min, here, walked)
+        adj, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
+            parcel, fall, front, adj_t, alpha_min, here, walked, vec16(1.0), zero, zero, zero
+        )
+        part = mat_geometry()
+        part[MEAN_X] = adj.dx
+        part[MEAN_Y] = adj.dy
+        part[XX] = adj.xx
+        part[XY] = adj.xy
+        part[YY] = adj.yy
+        part[OPACITY] = adj.opacity
+        return front, adj_front, adj.red, part
+
+    @wp.func
+    def from_moments(sums: vec5, splat: Splat2D):
+        s = wp.vec2(sums[MEAN_X], sums[MEAN_Y])
+        return geometry_from_moments(s, sums[XX], sums[XY], sums[YY], splat.root, splat.opacity)
+
+    @wp.func
+    def from_root(sums: vec5, splat: Splat2D):
+        adj_root = wp.vec3(sums[XX], sums[XY], sums[YY])
+        return wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic_from_root(adj_root, splat.root)
+
+    return (manual, from_moments) if mode == "manual" else (stepwise, from_root)
+
+
+@functools.cache
+def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
+    """The adjoint of the sums, by hand or by Warp's derivative of a step.
+
+    With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
+    """
+    body, adj_geometry = _make_body(mode, variant)
+    WIDTH = most or AT_ONCE  # of a block's numbers
+    T, ADJ_T, WALKED, UP = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS
+    RANK, SUMS = UP + WIDTH * BLOCKS, UP + (2 if most else 1) * WIDTH * BLOCKS
+    GRADS = CHANNEL + (0 if most else WIDTH)
+    mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
+
+    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def adj_channels(
+        first: int,
+        bins: BinsView,
+        alpha_min: float,
+        final: wp.array2d[vec16],  # [T, BLOCKS]
+        count: wp.array2d[vec16],  # [T, BLOCKS]
+        steps: wp.array[int],  # [T]
+        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats; of weights nothing
+        ranks: wp.array3d[int],  # [H, W, most] of which Gaussians the weights are; of channels nothing
+        begin: int,  # of the group
+        channels: int,  # of the group, or weights
+        adj_pixels: wp.array3d[float],  # [H, W, C]
+        # out
+        slots_out: wp.array2d[float],  # [M, CHANNEL + channels], of weights [M, CHANNEL]
+    ):
+        tile = first + wp.tid()
+        start = bins.ranges[tile][0]
+        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
+        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
+        room = mat_room()
+        s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
+        near = wp.array(ptr=s.ptr + wp.uint64(64 * (SUMS + GRADS)), shape=(AHEAD,), dtype=Splat2D)
+        for block in range(BLOCKS):
+            s[T + block] = final[tile, block]
+            s[ADJ_T + block] = vec16(0.0)
+            s[WALKED + block] = count[tile, block]
+        numbers = wp.array(ptr=s.ptr + wp.uint64(64 * UP), shape=(2 * LANES * WIDTH * BLOCKS,), dtype=float)
+        pixel = int(0)
+        while pixel < TILE * TILE:
+            x, y = pixel_of(tile, bins.tiles_x, pixel)
+            inside = y < adj_pixels.shape[0] and x < adj_pixels.shape[1]
+            place = (pixel // LANES) * WIDTH * LANES + pixel % LANES
+            for channel in range(channels):
+                numbers[place] = 0.0
+                if inside:
+                    numbers[place] = adj_pixels[y, x, begin + channel]
+                if wp.static(most > 0):
+                    numbers[place + (RANK - UP) * LANES] = -1.0
+                    if inside:
+                        numbers[place + (RANK - UP) * LANES] = float(ranks[y, x, channel])
+                place += LANES
+            pixel += 1
+        boxes = mat_boxes()
+        sums = vec_geometry()
+        halves = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(2 * GRADS,), dtype=vec8)
+        quarters = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(4 * GRADS,), dtype=wp.vec4)
+        for back in range(steps[tile]):
+            k = start + steps[tile] - 1 - back
+            ahead = back & (AHEAD - 1)
+            if ahead == 0:
+                for j in range(wp.min(AHEAD, steps[tile] - back)):
+                    near[j] = bins.splats[bins.instances[k - j]]
+                for j in range(wp.min(AHEAD, steps[tile] - back)):
+                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
+            splat = near[ahead]
+            box = boxes[ahead]
+            mine = row_of_splat(rows, bins.instances[k])
+            here = vec16(float(k - start))
+            row = int(SUMS)
+            while row < SUMS + slots_out.shape[1]:
+                s[row] = vec16(0.0)
+                row += 1
+            by = box[2]
+            while by <= box[3]:
+                dy = offset_y(splat.mean, y0, by)
+                bx = box[0]
+                while bx <= box[1]:
+                    block = (4 * by + bx) & (BLOCKS - 1)
+                    dx = offset_x(splat.mean, x0, bx)
+                    up = UP + block * WIDTH
+                    lit = vec16(0.0)
+                    channel = int(0)
+                    while channel < channels:
+                        if wp.static(most > 0):
+                            chosen = equal(here, s[up + (RANK - UP) + channel])
+                            lit = lit + pick(chosen, s[up + channel], vec16(0.0))
+                        else:
+                            lit = fma(s[up + channel], mine[channel], lit)
+                        channel += 1
+                    front, adj_front, w, part = body(
+                        splat, dx, dy, s[T + block], s[ADJ_T + block], alpha_min, here, s[WALKED + block], lit
+                    )
+                    s[T + block] = front
+                    s[ADJ_T + block] = adj_front
+                    for grad in range(CHANNEL):
+                        s[SUMS + grad] = s[SUMS + grad] + part[grad]
+                    if wp.static(most == 0):
+                        if some(w):
+                            channel = int(0)
+                            while channel < channels:
+                                row = SUMS + CHANNEL + channel
+                                s[row] = fma(w, s[up + channel], s[row])
+                                channel += 1
+                    bx += 1
+                by += 1
+            grad = int(CHANNEL)
+            while grad < slots_out.shape[1]:
+                slots_out[k, grad] = folded(halves, quarters, grad)
+                grad += 1
+            for grad in range(CHANNEL):
+                sums[grad] = folded(halves, quarters, grad)
+            adj_mean, adj_conic = adj_geometry(vec5(sums[MEAN_X], sums[MEAN_Y], sums[XX], sums[XY], sums[YY]), splat)
+            slots_out[k, MEAN_X] = adj_mean[0]
+            slots_out[k, MEAN_Y] = adj_mean[1]
+            slots_out[k, XX] = adj_conic[0]
+            slots_out[k, XY] = adj_conic[1]
+            slots_out[k, YY] = adj_conic[2]
+            slots_out[k, OPACITY] = sums[OPACITY]
+        for k in range(start + steps[tile], bins.ranges[tile][1]):
+            for grad in range(slots_out.shape[1]):
+                slots_out[k, grad] = 0.0
+
+    return adj_channels

@@ -1,0 +1,177 @@
+"""Any number of channels on CUDA, beside the color: as :mod:`warp_splat.kernels.cpu.channels`, a thread per pixel.
+
+A Gaussian's channels are read from global memory, by all threads of the block at once.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.cuda.adjoint import row_from_moments, row_from_root
+from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
+from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.simd import fma
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import BlendVariant, exponent
+from warp_splat.kernels.step import make_manual, make_stepwise, opaque
+from warp_splat.kernels.structs import BinsView
+
+AT_ONCE = 16  # channels: registers
+vec_channels = wp.types.vector(length=AT_ONCE, dtype=float)
+
+
+@functools.cache
+def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
+    """The sums of weights times channels; nothing stands behind them."""
+    fall_at, WIDTH = make_falloff(variant.falloff).value, AT_ONCE
+
+    @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
+    def blend_channels(
+        bins: BinsView,
+        alpha_min: float,
+        count: wp.array2d[int],  # [T, THREADS]
+        steps: wp.array[int],  # [T]
+        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats
+        begin: int,  # of the group
+        channels: int,  # of the group
+        # out
+        pixels_out: wp.array3d[float],  # [H, W, C]
+    ):
+        tile, thread = wp.tid()
+        column = (tile % bins.tiles_x) * TILE + thread % TILE
+        line = (tile // bins.tiles_x) * TILE + thread // TILE
+        x = float(column) + 0.5
+        y = float(line) + 0.5
+        start = bins.ranges[tile][0]
+        walked = float(count[tile, thread])
+        t = float(1.0)
+        sums = vec_channels(0.0)
+        for batch in range((steps[tile] + THREADS - 1) // THREADS):
+            first = batch * THREADS
+            mine = vec10(0.0)
+            splat = int(0)
+            if first + thread < steps[tile]:
+                splat = bins.instances[start + first + thread]
+                mine = staged_of(bins.splats[splat])
+            staged = wp.tile(mine, preserve_type=True)
+            splats = wp.tile(splat)
+            for j in range(wp.min(THREADS, steps[tile] - first)):
+                g = staged[j]
+                splat = splats[j]
+                fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
+                alpha = opaque(fall * g[OPACITY], alpha_min, float(first + j), walked)
+                w = alpha * t
+                t = fma(-alpha, t, t)
+                for channel in range(WIDTH):
+                    sums[channel] += w * rows[splat, channel]
+        if line < pixels_out.shape[0] and column < pixels_out.shape[1]:
+            for channel in range(WIDTH):
+                if channel < channels:
+                    pixels_out[line, column, begin + channel] = sums[channel]
+
+    return blend_channels
+
+
+@functools.cache
+def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
+    """The adjoint of the sums, by hand or by Warp's derivative of a step.
+
+    With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
+    """
+    WIDTH = most or AT_ONCE
+    adj_step = make_manual(variant.falloff, float)
+    Parcel, undo, step = make_stepwise(variant, float)
+    vec_up = wp.types.vector(length=WIDTH, dtype=float)
+
+    @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
+    def adj_channels(
+        bins: BinsView,
+        alpha_min: float,
+        final: wp.array2d[float],  # [T, THREADS]
+        count: wp.array2d[int],  # [T, THREADS]
+        steps: wp.array[int],  # [T]
+        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats; of weights nothing
+        ranks: wp.array3d[int],  # [H, W, most] of which Gaussians the weights are; of channels nothing
+        begin: int,  # of the group
+        channels: int,  # of the group, or weights
+        adj_pixels: wp.array3d[float],  # [H, W, C]
+        # out
+        slots_out: wp.array2d[float],  # [M, CHANNEL + channels], of weights [M, CHANNEL]
+    ):
+        tile, thread = wp.tid()
+        column = (tile % bins.tiles_x) * TILE + thread % TILE
+        line = (tile // bins.tiles_x) * TILE + thread // TILE
+        x = float(column) + 0.5
+        y = float(line) + 0.5
+        start = bins.ranges[tile][0]
+        up = vec_up(0.0)
+        chosen = vec_up(-1.0)
+        if line < adj_pixels.shape[0] and column < adj_pixels.shape[1]:
+            for channel in range(WIDTH):
+                if channel < channels:
+                    up[channel] = adj_pixels[line, column, begin + channel]
+                    if wp.static(most > 0):
+                        chosen[channel] = float(ranks[line, column, channel])
+        t = final[tile, thread]
+        walked = float(count[tile, thread])
+        adj_t = float(0.0)
+        for back in range(steps[tile]):
+            k = start + steps[tile] - 1 - back
+            splat = bins.instances[k]
+            g = staged_of(bins.splats[splat])
+            dx = g[MEAN_X] - x
+            dy = g[MEAN_Y] - y
+            here = float(k - start)
+            lit = float(0.0)
+            for channel in range(WIDTH):
+                if wp.static(most > 0):
+                    lit += wp.where(chosen[channel] == here, up[channel], 0.0)
+                else:
+                    lit += up[channel] * rows[splat, channel]
+            if wp.static(mode == "manual"):
+                z = exponent(dx, dy, g[XX], g[XY], g[YY])
+                front, beyond, w, adj_opacity = adj_step(z, g[OPACITY], t, adj_t, alpha_min, here, walked, lit)
+                sx = adj_opacity * dx
+                sy = adj_opacity * dy
+                grads = vec10(sx, sy, sx * dx, sx * dy, sy * dy, adj_opacity, 0.0, 0.0, 0.0, 0.0)
+                adj_t = beyond
+            else:
+                parcel = Parcel()
+                parcel.dx = dx
+                parcel.dy = dy
+                parcel.xx = g[XX]
+                parcel.xy = g[XY]
+                parcel.yy = g[YY]
+                parcel.opacity = g[OPACITY]
+                parcel.red = lit
+                fall, front = undo(parcel, t, alpha_min, here, walked)
+                p, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
+                    parcel, fall, front, adj_t, alpha_min, here, walked, 1.0, 0.0, 0.0, 0.0
+                )
+                w = p.red
+                grads = vec10(p.dx, p.dy, p.xx, p.xy, p.yy, p.opacity, 0.0, 0.0, 0.0, 0.0)
+                adj_t = adj_front
+            t = front
+            sums = wp.tile_sum(wp.tile(grads, preserve_type=True))[0]
+            if wp.static(mode == "manual"):
+                row = row_from_moments(sums, g)
+            else:
+                row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
+            if thread == 0:
+                for grad in range(CHANNEL):
+                    slots_out[k, grad] = row[grad]
+            if wp.static(most == 0):
+                more = wp.tile_sum(wp.tile(w * up, preserve_type=True))[0]
+                if thread == 0:
+                    for channel in range(WIDTH):
+                        if channel < channels:
+                            slots_out[k, CHANNEL + channel] = more[channel]
+        first = start + steps[tile]
+        for batch in range((bins.ranges[tile][1] - first + THREADS - 1) // THREADS):
+            k = first + batch * THREADS + thread
+            if k < bins.ranges[tile][1]:
+                for grad in range(slots_out.shape[1]):
+                    slots_out[k, grad] = 0.0
+
+    return adj_channels

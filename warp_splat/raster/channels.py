@@ -1,0 +1,236 @@
+"""What is blended beside the color: features of the user's own, normals; and which Gaussians a pixel shows.
+
+The color is blended first. These kernels repeat its weights, from what it has found (:class:`.data.Walk`), and so cost
+nothing where they are not asked for. Channels go in groups, so that memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from warp_splat.camera import Camera
+from warp_splat.config import TILE, RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.kernels.slots import CHANNEL
+from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.data import Bins, Dropped, Gaussians, Splats2D, Walk, variant_of
+from warp_splat.raster.drivers import Driver
+from warp_splat.runtime.launch import available_memory, view
+from warp_splat.runtime.timers import stage
+
+MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them
+
+
+class Blended(NamedTuple):
+    """What is known once the color is blended; see :func:`warp_splat.raster.blend.blend`."""
+
+    bins: Bins
+    walk: Walk
+    camera: Camera
+    options: RasterOptions
+    adjoint: str
+    driver: Driver
+    dropped: Dropped
+
+
+class Strongest(NamedTuple):
+    """Which Gaussians a pixel shows."""
+
+    gaussians: torch.Tensor  # [H, W, k] int64, the strongest first, of equal ones the nearest; -1 where there is none
+    weights: torch.Tensor  # [H, W, k] opacity times transmittance; 0 where there is none
+    median_depth: torch.Tensor  # [H, W] z of the Gaussian at which half of the light is gone; 0 where it is not
+
+
+def blend_beside(
+    features: torch.Tensor | None,
+    gaussians: Gaussians,
+    splats: Splats2D,
+    camera: Camera | CameraParameters,
+    blended: Blended,
+) -> dict[str, torch.Tensor]:
+    """What is asked for beside the color, by its name in :class:`warp_splat.RenderOutput`."""
+    channels, found, options = {}, {}, blended.options
+    if features is not None:
+        channels["features"] = features
+    if options.normals:
+        channels["normals"] = normals_of(gaussians, camera.camera if isinstance(camera, CameraParameters) else camera)
+    if channels:
+        widths = [channel.shape[1] for channel in channels.values()]
+        together = torch.cat(list(channels.values()), 1) if len(channels) > 1 else next(iter(channels.values()))
+        found |= zip(channels, blend_channels(splats, together, blended).split(widths, 2), strict=True)
+    if options.strongest or options.median_depth:
+        strongest = find_strongest(splats, blended)
+        if options.strongest:
+            found |= {"strongest": strongest.gaussians, "strongest_weights": strongest.weights}
+        if options.median_depth:
+            found["median_depth"] = strongest.median_depth
+    return found
+
+
+def blend_channels(splats: Splats2D, features: torch.Tensor, blended: Blended) -> torch.Tensor:
+    """Sums of weight times ``features`` [N, C], [H, W, C]; differentiable in them and in the splats."""
+    return Channels.apply(splats.means2d, splats.conics, splats.opacities, features, blended)
+
+
+def find_strongest(splats: Splats2D, blended: Blended) -> Strongest:
+    """The ``options.strongest`` Gaussians of each pixel; weights are differentiable in the splats, the median in z."""
+    bins, camera, options = blended.bins, blended.camera, blended.options
+    shape, most, device = (camera.height, camera.width), options.strongest, splats.means2d.device
+    ranks, weights = (
+        torch.empty(*shape, most, dtype=torch.int32, device=device),
+        torch.empty(*shape, most, device=device),
+    )
+    median = torch.empty(shape, dtype=torch.int32, device=device)
+    kernel = blended.driver.channels.strongest(variant_of(options), most)
+    _, count = blended.driver.view_walk(blended.walk)
+    inputs = [bins.view(), options.alpha_min, count, view(blended.walk.steps, wp.int32)]
+    outputs = [view(ranks, wp.int32), view(weights, wp.float32), view(median, wp.int32)]
+    blended.driver.launch_tiles(kernel, bins, inputs, outputs)
+    gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
+    if most:
+        weights = Weights.apply(splats.means2d, splats.conics, splats.opacities, weights, ranks, blended)
+    # an embedding, whose adjoint sums in one order, on a GPU as well; the last row is that of no Gaussian
+    depths = torch.cat([splats.depths, splats.depths.new_zeros(1)])[:, None]
+    median_depth = torch.nn.functional.embedding(middle % len(depths), depths)
+    return Strongest(gaussians, weights, median_depth.view(shape))
+
+
+def _gaussians_of(bins: Bins, camera: Camera, ranks: torch.Tensor) -> torch.Tensor:
+    """Gaussians [H, W, k] of places in the lists of the pixels' tiles; -1 stays."""
+    begins = bins.ranges[:, 0].view(-1, bins.tiles_x).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
+    begins = begins[: camera.height, : camera.width, None]
+    none = torch.full_like(ranks, -1).long()
+    if not len(bins.instances):
+        return none
+    splats = bins.instances[(begins + ranks.clamp_min(0)).clamp_max(len(bins.instances) - 1).long()].long()
+    return torch.where(ranks >= 0, wp.to_torch(bins.gaussians)[splats].long(), none)
+
+
+def normals_of(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
+    """The shortest axis of each Gaussian in the world, turned towards the camera, [N, 3] of length 1.
+
+    Differentiable in the quaternions.
+    """
+    w, x, y, z = torch.nn.functional.normalize(gaussians.quats, dim=1).unbind(1)
+    columns = (  # of the rotation
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+    axes = torch.stack([torch.stack(column, 1) for column in columns], 1)
+    shortest = gaussians.scales.detach().argmin(1)
+    normals = axes.gather(1, shortest[:, None, None].expand(-1, 1, 3)).squeeze(1)
+    with torch.no_grad():
+        center = torch.tensor(camera.center, dtype=torch.float32, device=normals.device)
+        away = (normals * (gaussians.means - center)).sum(1, keepdim=True) > 0
+    return torch.where(away, -normals, normals)
+
+
+class Channels(torch.autograd.Function):
+    """Features to pixels; the adjoint walks the lists back to front, once for every group of channels."""
+
+    @staticmethod
+    def forward(ctx, means2d, conics, opacities, features, blended):
+        bins, walk, camera, options, _, driver, _ = blended
+        features = features.contiguous()
+        image = features.new_empty(camera.height, camera.width, features.shape[1])
+        kernel, steps = driver.channels.blend(variant_of(options)), walk.steps
+        _, count = driver.view_walk(walk)
+        for begin, rows in _groups(bins, features, driver):
+            inputs = [bins.view(), options.alpha_min, count, view(steps, wp.int32), view(rows, wp.float32)]
+            group = min(features.shape[1] - begin, driver.channels.at_once)
+            driver.launch_tiles(kernel, bins, [*inputs, begin, group], [view(image, wp.float32)])
+        ctx.save_for_backward(features)
+        ctx.blended = blended
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_image):
+        with stage("adjoint of channels"):
+            (features,) = ctx.saved_tensors
+            adj_image = _without_bad(adj_image, ctx.blended)
+            adj_features = torch.empty_like(features)
+            total: list[torch.Tensor] = []
+            for begin, rows in _groups(ctx.blended.bins, features, ctx.blended.driver):
+                group = min(features.shape[1] - begin, ctx.blended.driver.channels.at_once)
+                part = adj_features[:, begin : begin + group]
+                geometry = _differentiate(ctx.blended, rows, None, begin, group, adj_image, [part])
+                total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
+        return *total, adj_features, None
+
+
+class Weights(torch.autograd.Function):
+    """The weights of the strongest Gaussians, which a kernel has found already, tied to the splats."""
+
+    @staticmethod
+    def forward(ctx, means2d, conics, opacities, weights, ranks, blended):
+        ctx.save_for_backward(ranks)
+        ctx.blended = blended
+        return weights.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_weights):
+        with stage("adjoint of channels"):
+            (ranks,) = ctx.saved_tensors
+            rows = adj_weights.new_empty(0, 0)
+            adj_weights = _without_bad(adj_weights, ctx.blended)
+            geometry = _differentiate(ctx.blended, rows, ranks, 0, ranks.shape[2], adj_weights, [])
+        return *geometry, None, None, None
+
+
+def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
+    """For each group of channels: where it begins, and the splats' rows of it [V, at once], filled up with zeros."""
+    gaussians, size = wp.to_torch(bins.gaussians).long(), driver.channels.at_once
+    for begin in range(0, features.shape[1], size):
+        part = features[:, begin : begin + size]
+        rows = features.new_zeros(len(gaussians), size)
+        rows[:, : part.shape[1]] = part[gaussians]
+        yield begin, rows
+
+
+def _differentiate(
+    blended: Blended, rows: torch.Tensor, ranks: torch.Tensor | None, begin: int, group: int, adj_pixels, adj_features
+) -> list[torch.Tensor]:
+    """Gradients of means2d, conics and opacities by a group of channels, or by the weights of ``ranks``.
+
+    Those of the channels are written into ``adj_features``.
+    """
+    bins, walk, _, options, adjoint, driver, _ = blended
+    mode = "manual" if adjoint == "manual" else "stepwise"
+    most, columns = (0, CHANNEL + group) if ranks is None else (ranks.shape[2], CHANNEL)
+    slots = _new_slots(bins, columns)
+    kernel = driver.channels.adjoint(mode, variant_of(options), most)
+    ranks = ranks if ranks is not None else torch.empty(0, 0, 0, dtype=torch.int32, device=slots.device)
+    inputs = [bins.view(), options.alpha_min, *driver.view_walk(walk), view(walk.steps, wp.int32)]
+    inputs += [view(rows, wp.float32), view(ranks, wp.int32), begin, group, view(adj_pixels, wp.float32)]
+    driver.launch_tiles(kernel, bins, inputs, [view(slots, wp.float32)])
+    geometry = [slots.new_empty(bins.gaussian_count, width) for width in (2, 3, 1)]
+    return driver.gather(bins, slots, [*geometry, *adj_features])[:3]
+
+
+def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
+    """A row of gradients per tile instance. Raises InputError if there is no room for them."""
+    count, device = len(bins.instances), bins.instances.device
+    needed = 4 * count * columns
+    if needed > MANY and needed > (available := available_memory(device)):
+        raise InputError(
+            f"features: the gradients of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
+            f"{available / 2**30:.1f} GiB are free; render a smaller image or fewer, smaller Gaussians."
+        )
+    return torch.empty(count, columns, dtype=torch.float32, device=device)
+
+
+def _without_bad(adj_pixels: torch.Tensor, blended: Blended) -> torch.Tensor:
+    """Upstream gradients [H, W, C]; those of a pixel are dropped and counted, where one of them is not finite."""
+    adj_pixels = adj_pixels.contiguous()
+    if blended.driver.peeks and bool(adj_pixels.sum().isfinite()):
+        return adj_pixels
+    bad = ~adj_pixels.isfinite().all(2)
+    blended.dropped.pixel_count += bad.sum()
+    return torch.where(bad[..., None], 0.0, adj_pixels)
