@@ -11,7 +11,7 @@ import warp as wp
 from scenes import SCENES, cloud, make_camera
 
 import warp_splat
-from warp_splat import CameraParameters, InputError, RasterOptions, set_threads, tape
+from warp_splat import CameraParameters, InputError, RasterOptions, get_threads, set_threads, tape
 from warp_splat.config import ADJOINTS
 from warp_splat.raster.drivers import CUDA, using
 
@@ -154,13 +154,14 @@ def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mod
     """Whatever threads take part: 6,000 Gaussians are enough to share every launch."""
     scene = cloud(3, 6000, make_camera(200, 150), degree=1).to(device)
     leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
+    before = get_threads()
     set_threads(3)
     try:
         with wp.Tape() as recorded:
             out = warp_splat.rasterize(*leaves, scene.camera, adjoint=mode)
             out.image.sum().backward()
     finally:
-        set_threads(2)
+        set_threads(before)
     assert not recorded.launches and leaves[0].grad.any()
     recorded.backward()
     assert "Warp" not in "".join(capfd.readouterr()).replace("Warp CUDA warning", "")

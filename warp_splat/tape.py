@@ -22,6 +22,10 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped
 from warp_splat.runtime.timers import stage
 
+#: What has a gradient, and the type of its elements.
+PIXELS = {"image": wp.vec3, "alpha": wp.float32, "depth": wp.float32, "features": wp.float32, "normals": wp.vec3}
+PIXELS |= {"median_depth": wp.float32, "strongest_weights": wp.float32}
+
 
 @dataclass
 class TapeOutput:
@@ -33,6 +37,11 @@ class TapeOutput:
     radii: wp.array  # [N] int, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
     invalid: int  # Gaussians left out because a quaternion was zero
     dropped: Dropped  # what the adjoint refused to spread
+    features: wp.array | None = None  # [H, W, C] float, if given; the others, if asked for: see warp_splat.RenderOutput
+    normals: wp.array | None = None  # [H, W] vec3
+    median_depth: wp.array | None = None  # [H, W] float
+    strongest: wp.array | None = None  # [H, W, k] int64
+    strongest_weights: wp.array | None = None  # [H, W, k] float
 
 
 def rasterize(
@@ -47,6 +56,7 @@ def rasterize(
     options: RasterOptions | None = None,
     twist: wp.array | None = None,
     intrinsics: wp.array | None = None,
+    features: wp.array | None = None,
 ) -> TapeOutput:
     """:func:`warp_splat.rasterize` of Warp's arrays; inside ``with wp.Tape()`` it is recorded, with its adjoint.
 
@@ -66,6 +76,7 @@ def rasterize(
         options: what to compute.
         twist: see :class:`warp_splat.CameraParameters`, 6 numbers, float32 or float64.
         intrinsics: likewise, fx, fy, cx, cy.
+        features: any numbers, [N, C].
 
     Returns:
         A :class:`TapeOutput`.
@@ -77,7 +88,8 @@ def rasterize(
     pair = isinstance(sh, (tuple, list)) and len(sh) == 2
     given |= {"sh[0]": sh[0], "sh[1]": sh[1]} if pair else {"sh": sh}
     given |= {"background": background} if isinstance(background, wp.array) else {}
-    given |= {name: array for name, array in (("twist", twist), ("intrinsics", intrinsics)) if array is not None}
+    more = {"twist": twist, "intrinsics": intrinsics, "features": features}
+    given |= {name: array for name, array in more.items() if array is not None}
     named = {name: _checked(name, array) for name, array in given.items()}
     tape = wp._src.context.runtime.tape  # pyright: ignore[reportAttributeAccessIssue] - the only way to ask for it
     recorded = tape is not None and any(array.requires_grad for array in named.values())
@@ -87,18 +99,17 @@ def rasterize(
             for name, leaf in leaves.items():
                 leaf.requires_grad_(recorded and named[name].requires_grad)
         found = _render(leaves, named, camera, background, adjoint, options)
-        shown = {"image": found.image, "alpha": found.alpha} | ({} if found.depth is None else {"depth": found.depth})
+        shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
         with stage("tape"):
-            pixels = {name: _array(tensor, recorded) for name, tensor in shown.items()}
+            pixels = {name: _array(tensor, PIXELS[name], recorded) for name, tensor in shown.items()}
             if recorded:
                 wanted = [name for name in named if named[name].requires_grad]
                 inputs, outputs = [named[name] for name in wanted], list(pixels.values())
                 backward = _adjoint(inputs, [leaves[name] for name in wanted], outputs, list(shown.values()))
                 tape.record_func(backward, [array for array in (*inputs, *outputs) if array.size])
-    radii = wp.from_torch(found.radii)
-    return TapeOutput(
-        pixels["image"], pixels["alpha"], pixels.get("depth"), radii, invalid=found.invalid, dropped=found.dropped
-    )
+    others = {"strongest": None if found.strongest is None else wp.from_torch(found.strongest)}
+    others |= {"invalid": found.invalid, "dropped": found.dropped, "radii": wp.from_torch(found.radii)}
+    return TapeOutput(**{"depth": None} | pixels, **others)
 
 
 def _checked(name: str, array: Any) -> wp.array:
@@ -126,9 +137,8 @@ def _render(leaves: dict[str, torch.Tensor], named: dict[str, wp.array], camera,
     learned = {name: leaves[name].flatten() for name in ("twist", "intrinsics") if name in leaves}
     if learned:
         camera = CameraParameters(camera, **learned)
-    return api.rasterize(
-        leaves["means"], quats, leaves["scales"], leaves["opacities"], sh, camera, background, adjoint, options
-    )
+    gaussians = (leaves["means"], quats, leaves["scales"], leaves["opacities"], sh)
+    return api.rasterize(*gaussians, camera, background, adjoint, options, leaves.get("features"))
 
 
 def _adjoint(
@@ -151,9 +161,9 @@ def _adjoint(
     return backward
 
 
-def _array(tensor: torch.Tensor, requires_grad: bool) -> wp.array:
-    """An image of ``tensor``, [H, W, 3] or [H, W], in the same memory."""
-    return wp.from_torch(tensor.detach(), wp.vec3 if tensor.dim() == 3 else wp.float32, requires_grad=requires_grad)
+def _array(tensor: torch.Tensor, dtype: type, requires_grad: bool) -> wp.array:
+    """An image in the same memory."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype, requires_grad=requires_grad)
 
 
 @contextmanager

@@ -14,9 +14,9 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.raster.beside import Blended, blend_beside
 from warp_splat.raster.blend import blend
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.channels import Blended, blend_beside
 from warp_splat.raster.checks import (
     check_background,
     check_camera,

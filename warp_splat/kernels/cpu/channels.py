@@ -35,6 +35,30 @@ def pixel_of(tile: int, tiles_x: int, number: int):
 
 
 @wp.func
+def into_lanes(
+    pixels: wp.array3d[float],
+    begin: int,
+    channels: int,
+    tile: int,
+    tiles_x: int,
+    numbers: wp.array[float],
+    width: int,
+):
+    """A group's channels of a tile's pixels into rows of lanes, ``width`` rows for a block; 0 beyond the image."""
+    pixel = int(0)
+    while pixel < TILE * TILE:
+        x, y = pixel_of(tile, tiles_x, pixel)
+        inside = y < pixels.shape[0] and x < pixels.shape[1]
+        place = (pixel // LANES) * width * LANES + pixel % LANES
+        for channel in range(channels):
+            numbers[place] = 0.0
+            if inside:
+                numbers[place] = pixels[y, x, begin + channel]
+            place += LANES
+        pixel += 1
+
+
+@wp.func
 def row_of_splat(rows: wp.array2d[float], splat: int):
     """The channels of a splat, as an array whose stride is known."""
     return wp.array(ptr=rows.ptr + wp.uint64(4 * AT_ONCE) * wp.uint64(splat), shape=(AT_ONCE,), dtype=float)
@@ -209,7 +233,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         count: wp.array2d[vec16],  # [T, BLOCKS]
         steps: wp.array[int],  # [T]
         rows: wp.array2d[float],  # [V, AT_ONCE] of the splats; of weights nothing
-        ranks: wp.array3d[int],  # [H, W, most] of which Gaussians the weights are; of channels nothing
+        ranks: wp.array3d[float],  # [H, W, most] of which Gaussians the weights are; of channels nothing
         begin: int,  # of the group
         channels: int,  # of the group, or weights
         adj_pixels: wp.array3d[float],  # [H, W, C]
@@ -227,22 +251,11 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             s[T + block] = final[tile, block]
             s[ADJ_T + block] = vec16(0.0)
             s[WALKED + block] = count[tile, block]
-        numbers = wp.array(ptr=s.ptr + wp.uint64(64 * UP), shape=(2 * LANES * WIDTH * BLOCKS,), dtype=float)
-        pixel = int(0)
-        while pixel < TILE * TILE:
-            x, y = pixel_of(tile, bins.tiles_x, pixel)
-            inside = y < adj_pixels.shape[0] and x < adj_pixels.shape[1]
-            place = (pixel // LANES) * WIDTH * LANES + pixel % LANES
-            for channel in range(channels):
-                numbers[place] = 0.0
-                if inside:
-                    numbers[place] = adj_pixels[y, x, begin + channel]
-                if wp.static(most > 0):
-                    numbers[place + (RANK - UP) * LANES] = -1.0
-                    if inside:
-                        numbers[place + (RANK - UP) * LANES] = float(ranks[y, x, channel])
-                place += LANES
-            pixel += 1
+        numbers = wp.array(ptr=s.ptr + wp.uint64(64 * UP), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
+        into_lanes(adj_pixels, begin, channels, tile, bins.tiles_x, numbers, WIDTH)
+        if wp.static(most > 0):
+            chosen = wp.array(ptr=s.ptr + wp.uint64(64 * RANK), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
+            into_lanes(ranks, 0, channels, tile, bins.tiles_x, chosen, WIDTH)
         boxes = mat_boxes()
         sums = vec_geometry()
         halves = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(2 * GRADS,), dtype=vec8)
@@ -275,8 +288,8 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                     channel = int(0)
                     while channel < channels:
                         if wp.static(most > 0):
-                            chosen = equal(here, s[up + (RANK - UP) + channel])
-                            lit = lit + pick(chosen, s[up + channel], vec16(0.0))
+                            meant = equal(here, s[RANK + block * WIDTH + channel])
+                            lit = lit + pick(meant, s[up + channel], vec16(0.0))
                         else:
                             lit = fma(s[up + channel], mine[channel], lit)
                         channel += 1

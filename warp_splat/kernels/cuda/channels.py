@@ -92,7 +92,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         count: wp.array2d[int],  # [T, THREADS]
         steps: wp.array[int],  # [T]
         rows: wp.array2d[float],  # [V, AT_ONCE] of the splats; of weights nothing
-        ranks: wp.array3d[int],  # [H, W, most] of which Gaussians the weights are; of channels nothing
+        ranks: wp.array3d[float],  # [H, W, most] of which Gaussians the weights are; of channels nothing
         begin: int,  # of the group
         channels: int,  # of the group, or weights
         adj_pixels: wp.array3d[float],  # [H, W, C]
@@ -112,7 +112,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 if channel < channels:
                     up[channel] = adj_pixels[line, column, begin + channel]
                     if wp.static(most > 0):
-                        chosen[channel] = float(ranks[line, column, channel])
+                        chosen[channel] = ranks[line, column, channel]
         t = final[tile, thread]
         walked = float(count[tile, thread])
         adj_t = float(0.0)

@@ -206,9 +206,9 @@ def _differentiate(
     most, columns = (0, CHANNEL + group) if ranks is None else (ranks.shape[2], CHANNEL)
     slots = _new_slots(bins, columns)
     kernel = driver.channels.adjoint(mode, variant_of(options), most)
-    ranks = ranks if ranks is not None else torch.empty(0, 0, 0, dtype=torch.int32, device=slots.device)
+    ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
     inputs = [bins.view(), options.alpha_min, *driver.view_walk(walk), view(walk.steps, wp.int32)]
-    inputs += [view(rows, wp.float32), view(ranks, wp.int32), begin, group, view(adj_pixels, wp.float32)]
+    inputs += [view(rows, wp.float32), view(ranks, wp.float32), begin, group, view(adj_pixels, wp.float32)]
     driver.launch_tiles(kernel, bins, inputs, [view(slots, wp.float32)])
     geometry = [slots.new_empty(bins.gaussian_count, width) for width in (2, 3, 1)]
     return driver.gather(bins, slots, [*geometry, *adj_features])[:3]

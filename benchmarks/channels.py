@@ -1,0 +1,82 @@
+"""What do channels beside the color cost? 100k Gaussians at 980 x 545, whole calls on one thread.
+
+Processor seconds of the process, the least of all rounds; rounds go over all rows, so that the machine's pace hits them
+alike. Backward passes start from the gradient of what the row adds, and of the color.
+
+    python benchmarks/channels.py [--out docs/benchmarks]
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import torch
+from common import machine, write_table
+from made_up import cameras, make_gaussians
+
+from warp_splat.config import RasterOptions
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
+from warp_splat.runtime.launch import prepare
+
+COUNT, SIZE = 100_000, (980, 545)
+FEATURES = (1, 3, 8, 32, 128)
+ASKED = {
+    "normals": RasterOptions(normals=True),
+    "median depth": RasterOptions(median_depth=True),
+    "strongest, 1": RasterOptions(strongest=1),
+    "strongest, 8": RasterOptions(strongest=8),
+    "expected depth": RasterOptions(depth=True),
+}
+SHOWN = ("features", "normals", "median_depth", "strongest_weights", "depth")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, help="folder for channels.md and channels.json")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--most", type=int, default=max(FEATURES), help="leave out more channels than this")
+    arguments = parser.parse_args()
+    device = prepare("cpu", 1)
+    (camera,) = cameras(*SIZE, 1)
+    with torch.no_grad():
+        gaussians = Gaussians(*(tensor.detach() for tensor in make_gaussians(COUNT, device.type).activated()))
+    rows = {"color": (RasterOptions(), 0)}
+    rows |= {f"color, {count} channels": (RasterOptions(), count) for count in FEATURES if count <= arguments.most}
+    rows |= {f"color, {name}": (options, 0) for name, options in ASKED.items()}
+    seconds = {name: ([], []) for name in rows}
+    for repeat in range(arguments.repeats + 1):
+        for name, (options, count) in rows.items():
+            times = once(gaussians, camera, options, count)
+            for found, value in zip(seconds[name], times, strict=True):
+                found.extend([value] * (repeat > 0))
+    least = {name: [min(values) for values in both] for name, both in seconds.items()}
+    table = [
+        (
+            name,
+            *(f"{1e3 * value:.0f}" for value in both),
+            *(f"{a / b:.2f}" for a, b in zip(both, least["color"], strict=True)),
+        )
+        for name, both in least.items()
+    ]
+    headers = ("what is blended", "forward ms", "backward ms", "forward x color", "backward x color")
+    note = f"{COUNT} Gaussians, {SIZE[0]} x {SIZE[1]} px, one thread, processor time, whole calls."
+    write_table("channels", arguments.out, headers, table, note, {"seconds": least, "machine": machine()})
+
+
+def once(gaussians: Gaussians, camera, options: RasterOptions, count: int) -> tuple[float, float]:
+    """Processor seconds forward and backward."""
+    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in gaussians))
+    features = torch.rand(COUNT, count).requires_grad_() if count else None
+    start = time.process_time()
+    out = render(leaves, camera, torch.zeros(3), options, "manual", features)
+    middle = time.process_time()
+    shown = [out.image, *(tensor for name in SHOWN if (tensor := getattr(out, name)) is not None)]
+    upstream = [torch.rand_like(tensor) for tensor in shown]
+    begun = time.process_time()
+    torch.autograd.backward(shown, upstream)
+    return middle - start, time.process_time() - begun
+
+
+if __name__ == "__main__":
+    main()
