@@ -22,6 +22,7 @@ from warp_splat.raster.drivers import Driver
 from warp_splat.runtime.launch import available_memory, view
 from warp_splat.runtime.timers import stage
 
+WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
 MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them
 
 
@@ -158,8 +159,8 @@ class Channels(torch.autograd.Function):
             total: list[torch.Tensor] = []
             for begin, rows in _groups(ctx.blended.bins, features, ctx.blended.driver):
                 group = min(features.shape[1] - begin, ctx.blended.driver.channels.at_once)
-                part = adj_features[:, begin : begin + group]
-                geometry = _differentiate(ctx.blended, rows, None, begin, group, adj_image, [part])
+                geometry, part = _differentiate(ctx.blended, rows, None, begin, group, adj_image)
+                adj_features[:, begin : begin + group] = part
                 total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
         return *total, adj_features, None
 
@@ -180,7 +181,7 @@ class Weights(torch.autograd.Function):
             (ranks,) = ctx.saved_tensors
             rows = adj_weights.new_empty(0, 0)
             adj_weights = _without_bad(adj_weights, ctx.blended)
-            geometry = _differentiate(ctx.blended, rows, ranks, 0, ranks.shape[2], adj_weights, [])
+            geometry, _ = _differentiate(ctx.blended, rows, ranks, 0, ranks.shape[2], adj_weights)
         return *geometry, None, None, None
 
 
@@ -195,23 +196,24 @@ def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
 
 
 def _differentiate(
-    blended: Blended, rows: torch.Tensor, ranks: torch.Tensor | None, begin: int, group: int, adj_pixels, adj_features
-) -> list[torch.Tensor]:
-    """Gradients of means2d, conics and opacities by a group of channels, or by the weights of ``ranks``.
+    blended: Blended, rows: torch.Tensor, ranks: torch.Tensor | None, begin: int, group: int, adj_pixels: torch.Tensor
+) -> tuple[list[torch.Tensor], torch.Tensor]:
+    """Gradients of means2d, conics and opacities, and those of a group of channels [N, group].
 
-    Those of the channels are written into ``adj_features``.
+    With ``ranks``, by the weights of those Gaussians instead of channels.
     """
     bins, walk, _, options, adjoint, driver, _ = blended
     mode = "manual" if adjoint == "manual" else "stepwise"
-    most, columns = (0, CHANNEL + group) if ranks is None else (ranks.shape[2], CHANNEL)
-    slots = _new_slots(bins, columns)
+    most, width = (0, next(width for width in WIDTHS if width >= group)) if ranks is None else (group, 0)
+    slots = _new_slots(bins, CHANNEL + width)
     kernel = driver.channels.adjoint(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
     inputs = [bins.view(), options.alpha_min, *driver.view_walk(walk), view(walk.steps, wp.int32)]
     inputs += [view(rows, wp.float32), view(ranks, wp.float32), begin, group, view(adj_pixels, wp.float32)]
     driver.launch_tiles(kernel, bins, inputs, [view(slots, wp.float32)])
-    geometry = [slots.new_empty(bins.gaussian_count, width) for width in (2, 3, 1)]
-    return driver.gather(bins, slots, [*geometry, *adj_features])[:3]
+    tables = [slots.new_empty(bins.gaussian_count, columns) for columns in (2, 3, 1, width) if columns]
+    geometry = driver.gather(bins, slots, tables)[:3]
+    return geometry, tables[-1][:, :group]
 
 
 def _new_slots(bins: Bins, columns: int) -> torch.Tensor:

@@ -238,7 +238,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         channels: int,  # of the group, or weights
         adj_pixels: wp.array3d[float],  # [H, W, C]
         # out
-        slots_out: wp.array2d[float],  # [M, CHANNEL + channels], of weights [M, CHANNEL]
+        slots_out: wp.array2d[float],  # [M, CHANNEL + channels or more], of weights [M, CHANNEL]
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]

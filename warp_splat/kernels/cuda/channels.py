@@ -97,7 +97,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         channels: int,  # of the group, or weights
         adj_pixels: wp.array3d[float],  # [H, W, C]
         # out
-        slots_out: wp.array2d[float],  # [M, CHANNEL + channels], of weights [M, CHANNEL]
+        slots_out: wp.array2d[float],  # [M, CHANNEL + channels or more], of weights [M, CHANNEL]
     ):
         tile, thread = wp.tid()
         column = (tile % bins.tiles_x) * TILE + thread % TILE
@@ -165,7 +165,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 more = wp.tile_sum(wp.tile(w * up, preserve_type=True))[0]
                 if thread == 0:
                     for channel in range(WIDTH):
-                        if channel < channels:
+                        if CHANNEL + channel < slots_out.shape[1]:
                             slots_out[k, CHANNEL + channel] = more[channel]
         first = start + steps[tile]
         for batch in range((bins.ranges[tile][1] - first + THREADS - 1) // THREADS):
