@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pycolmap
@@ -190,6 +191,11 @@ def test_a_folder_in_use_stays_as_it_is(photos, scene, tmp_path):
     assert sorted(other.rglob("*")) == before
     cannot(lambda: sfm(SfmConfig(str(photos[0]), str(photos[0]))), "another folder")
     cannot(lambda: sfm(SfmConfig(str(photos[0]), str(scene), seed=1)), "begun with others")
+    flat_photos(tmp_path / "a" / "images")
+    for source, target in (("a/images", "a"), ("a", "a/images")):
+        words = "does not hold the photographs", "written over", f"{tmp_path / target}_scene"
+        config = SfmConfig(str(tmp_path / source), str(tmp_path / target))
+        cannot(partial(sfm, config), *words)
     cannot(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "x"), frames=2)), "--frames")
 
 
@@ -199,11 +205,13 @@ def test_a_damaged_database_gets_one_sentence(photos, scene, tmp_path):
     cannot(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "scene"), quiet=True)), "sfm", "remove this folder")
 
 
-def test_training_on_photographs_alone_names_the_command(photos, tmp_path):
+def test_training_on_photographs_alone_names_the_command(tmp_path, monkeypatch):
     folder = tmp_path / "my photos"
     flat_photos(folder, 4)
     sentence = cannot(lambda: load_scene(folder), "4 photographs alone", "--sfm")
     assert f"`warp-splat sfm '{folder}' '{folder}_scene'`" in sentence
+    monkeypatch.chdir(folder)
+    cannot(lambda: load_scene("."), f"`warp-splat sfm . '{folder}_scene'`")
     (tmp_path / "clip.mp4").write_bytes(b"x")
     cannot(
         lambda: load_scene(tmp_path / "clip.mp4"), "a video", f"sfm {tmp_path / 'clip.mp4'} {tmp_path / 'clip_scene'}"

@@ -19,6 +19,8 @@ from scene_files import (
 from test_scene import distorted_picture, fisheye, pattern, radial
 
 from warp_splat import InputError, Lens
+from warp_splat.inspect.subject import read_subject
+from warp_splat.inspect.verdicts import check_loading
 
 
 def test_transforms_cameras_points_and_axes(tmp_path):
@@ -153,6 +155,20 @@ def test_other_models_of_colmap(tmp_path, model, distort, params):
     assert model in lines[0]
 
 
+def test_a_photograph_with_two_frames_counts_once(tmp_path):
+    names = [f"images/{letter}.png" for letter in "abcdefghi"]
+    root = write_transforms(tmp_path / "a", names)
+    content = json.loads((root / "transforms.json").read_text())
+    content["frames"] += [{**content["frames"][1], "file_path": "./images/a"}, content["frames"][8]]
+    (root / "transforms.json").write_text(json.dumps(content))
+    scene, lines = load(root, eval=True)
+    assert [view.name for view in scene.test] == [names[0], names[8]]
+    assert [view.name for view in scene.train] == names[1:8]
+    assert lines[0] == "Leaving out 2 of 11 frames, whose photographs had one before: images/a, images/i.png."
+    found = [finding.text for finding in check_loading(read_subject(root, "images")[0], "images")]
+    assert found == ["training would accept this scene.", lines[0]]
+
+
 def broken(change=None, **values):
     def make(root):
         write_transforms(root, **values)
@@ -177,10 +193,11 @@ BAD = {
     "fisheye-p1": (broken(camera_model="OPENCV_FISHEYE", p1=0.1), ["frame 0", "p1 = 0.1"]),
     "model": (broken(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR"]),
     "model-list": (broken(camera_model=[1]), ["frame 0", "camera_model"]),
-    "focal": (broken(fl_x="wide"), ["frame 0", "fl_x as a number", "'wide'"]),
+    "focal": (broken(fl_x="wide"), ["frame 0: expected fl_x as a number between", "'wide'"]),
     "focal-0": (broken(fl_x=0), ["fx", "positive"]),
-    "focal-large": (broken(fl_x=10**400), ["frame 0", "fl_x"]),
-    "no-focal": (broken(lambda c: c.pop("fl_x")), ["frame 0", "camera_angle_x"]),
+    "focal-large": (broken(fl_x=10**400), ["frame 0: expected fl_x", "1e+09"]),
+    "size-large": (broken(w=10**9), ["frame 0: expected w as a number between -1e+09 and 1e+09, got 1000000000"]),
+    "no-focal": (broken(lambda c: c.pop("fl_x")), ["frame 0", "the key fl_x or camera_angle_x"]),
     "size": (broken(w=32, h=48), ["a.png", "32 x 48", f"{WIDTH} x {HEIGHT}"]),
     "size-half": (broken(w=1.5), ["frame 0", "w and h"]),
     "frame": (broken(lambda c: c["frames"].append(5)), ["frame 2", "file_path"]),
@@ -212,4 +229,5 @@ def test_bad_transforms_are_one_sentence(tmp_path, make, parts):
         load(tmp_path)
     message = str(caught.value)
     assert all(part in message for part in parts), message
+    assert message.count("transforms.json") <= 1, message
     assert "\n" not in message and message.endswith(".") and len(message) < 700 + 2 * len(str(tmp_path))

@@ -108,7 +108,7 @@ def check_loading(subject: Subject, folder: str) -> Iterator[Finding]:
         if subject.thumbnails:
             require_one_kind([(name, name in subject.linear) for name in subject.thumbnails], subject.source)
             require_unmasked(len(subject.photos), len(subject.black), subject.source)
-        if unread := len(subject.photos) - len(subject.thumbnails):
+        if unread := len({photo.name for photo in subject.photos}) - len(subject.thumbnails):
             raise InputError(f"{unread} images cannot be read.")
     except InputError as error:
         yield Finding("loading", "error", f"training would refuse this scene: {error}")

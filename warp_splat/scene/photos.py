@@ -42,6 +42,7 @@ def is_video(path: Path) -> bool:
 
 def scene_of(source: Path) -> Path:
     """Where ``train --sfm`` puts the scene of these photographs: beside them."""
+    source = source if source.name not in ("", "..") else source.resolve()
     return source.with_name(f"{source.stem if source.is_file() else source.name}_scene")
 
 

@@ -20,6 +20,7 @@ from warp_splat.scene import images
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses
 from warp_splat.scene.photos import ImageFinder
+from warp_splat.text import few
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
 ALL = "transforms.json"  # nerfstudio, instant-ngp
@@ -57,7 +58,7 @@ def read_transforms(
         train, test = _split(source / ALL, content, _read_photos(source / ALL, content, report, native), report)
         return train, test, *_points(source, content.get("ply_file_path"), report)
     train, test = (
-        _read_photos(path, _parse(path), report, native) if path.is_file() else []
+        [*_read_photos(path, _parse(path), report, native).values()] if path.is_file() else []
         for path in (source / TRAIN, source / TEST)
     )
     points = np.random.default_rng(0).uniform(-HALF_WIDTH, HALF_WIDTH, (POINTS, 3)).astype(np.float32)
@@ -78,7 +79,10 @@ def _parse(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], object], native: bool) -> list[Photo]:
+def _read_photos(
+    path: Path, content: dict[str, Any], report: Callable[[str], object], native: bool
+) -> dict[str, Photo]:
+    """The photo of each frame, by the frame's name; a photograph that has several frames has that of the first."""
     frames = _value(content, "frames", path)
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: expected a list of at least one frame under the key frames; correct the file.")
@@ -86,24 +90,28 @@ def _read_photos(path: Path, content: dict[str, Any], report: Callable[[str], ob
     finder = ImageFinder(path.parent)
     names = [_path(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
     paths = finder.find_all(names, f"frames of {path.name}", "copy them there", report)
-    sampling = make_sampling(native)
-    photos = [
-        _photo({**content, **frame}, found, finder, sampling, where)
-        for frame, found, where in zip(frames, paths, places, strict=True)
-    ]
-    tell_lenses(photos, report)
+    sampling, photos, seen, again = make_sampling(native), {}, set(), []
+    for name, frame, found, where in zip(names, frames, paths, places, strict=True):
+        if found in seen:  # it might be trained on and held out at once
+            again.append(name)
+            continue
+        photos[name] = _photo({**content, **frame}, found, finder, sampling, where)
+        seen.add(found)
+    if again:
+        report(f"Leaving out {len(again)} of {len(names)} frames, whose photographs had one before: {few(again)}.")
+    tell_lenses([*photos.values()], report)
     return photos
 
 
 def _split(
-    path: Path, content: dict[str, Any], photos: list[Photo], report: Callable[[str], object]
+    path: Path, content: dict[str, Any], photos: dict[str, Photo], report: Callable[[str], object]
 ) -> tuple[list[Photo], list[Photo]]:
     """Photos to train on and to hold out, by nerfstudio's lists of names; all are to train on where it has none.
 
     Held out are those of test_filenames or, without it, of val_filenames; to train on those of train_filenames or,
     without it, the rest.
     """
-    names = [Path(frame["file_path"]).as_posix() for frame in content["frames"]]
+    names = photos.keys()
     train, val, test = (_names(content, f"{key}_filenames", path) for key in ("train", "val", "test"))
     held_out = test or val
     to_train = train or {*names} - held_out
@@ -114,7 +122,7 @@ def _split(
     unused = len({*names} - to_train - held_out)
     if unused:
         report(f"Leaving out {unused} of {len(names)} images that {path.name} neither trains nor tests on.")
-    pick = lambda chosen: [photo for photo, name in zip(photos, names, strict=True) if name in chosen]  # noqa: E731
+    pick = lambda chosen: [photo for name, photo in photos.items() if name in chosen]  # noqa: E731
     return pick(to_train), pick(held_out)
 
 
@@ -130,8 +138,9 @@ def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sa
     size = images.read_size(path)
     pose = _pose(_value(values, "transform_matrix", where), where)
     name = path.relative_to(finder.root).as_posix()
+    lens = _lens(values, size, where)
     with images.named(where):
-        photo = make_photo(name, path, _lens(values, size, where), pose, size, sampling)
+        photo = make_photo(name, path, lens, pose, size, sampling)
     if values.get("mask_path") is None:
         return photo
     mask = finder.find(_path(values, "mask_path", where))
@@ -146,7 +155,8 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     def number(key: str, default: float = 0.0) -> float:
         value = values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, float | int) or not abs(value) < LARGEST:
-            raise InputError(f"{where}: expected {key} as a number, got {reprlib.repr(value)}; correct the file.")
+            expected = f"a number between -{LARGEST:g} and {LARGEST:g}"
+            raise InputError(f"{where}: expected {key} as {expected}, got {reprlib.repr(value)}; correct the file.")
         return float(value)
 
     width, height = number("w", size[0]), number("h", size[1])
@@ -157,7 +167,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     if "fl_x" in values:
         fx = number("fl_x")
     else:
-        angle = _value(values, "camera_angle_x", where)
+        angle = _value(values, "camera_angle_x", where, "fl_x or camera_angle_x")
         if not 0 < number("camera_angle_x") < np.pi:
             raise InputError(f"{where}: expected camera_angle_x between 0 and pi, got {angle!r:.80}; correct it.")
         fx = 0.5 * width / np.tan(0.5 * angle)
@@ -234,7 +244,9 @@ def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _value(content: Any, key: str, where: str | Path) -> Any:
+def _value(content: Any, key: str, where: str | Path, keys: str = "") -> Any:
     if not isinstance(content, dict) or key not in content:
-        raise InputError(f"{where}: expected the key {key} (of nerf-synthetic or nerfstudio), found none; correct it.")
+        raise InputError(
+            f"{where}: expected the key {keys or key} (of nerf-synthetic or nerfstudio), found none; correct it."
+        )
     return content[key]

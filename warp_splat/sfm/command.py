@@ -119,6 +119,12 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     if source.resolve() == scene.resolve():
         raise InputError(f"{scene}: expected another folder than that of the photographs for the scene; choose one.")
     if source.is_dir():
+        root = photo_root(source).resolve()
+        if root == scene.resolve() or scene.resolve() in root.parents:
+            raise InputError(
+                f"{scene}: expected a folder for the scene that does not hold the photographs, since its images/ would "
+                f"be written over; choose another, such as {scene_of(scene)}."
+            )
         files = [(name, photo_root(source) / name) for name in find_files(photo_root(source), PHOTOS, scene)]
         if not files:
             raise _nothing_found(source)
