@@ -19,6 +19,7 @@ from common import write_table
 
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels import sh_colors, tiles
+from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
@@ -28,6 +29,7 @@ from warp_splat.kernels.project import adj_camera, affine, ellipsoid
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.splat import BlendVariant
+from warp_splat.kernels.statistics import make_observe
 
 BLOCK = 256
 REGISTERS = 65536  # of a multiprocessor, all architectures below
@@ -47,6 +49,9 @@ def modules() -> dict[str, wp.Module]:
         "shade": sh_colors.make_shade(1).module,
         "adjoint of shade": sh_colors.make_adj_shade(1).module,
         "quarantine": quarantine.module,
+        "activate": make_activate(1).module,
+        "adjoint of activate": make_adj_activate(1).module,
+        "observe": make_observe(1).module,
         "adam": make_adam(1, True).module,
         "pack": tiles.make_pack().module,
         "tiles": tiles.list_tiles.module,

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from warp_splat.errors import InputError
 from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import GaussianModel
 from warp_splat.runtime.distributed import ALONE
@@ -253,6 +254,13 @@ def test_sparse_adam_moves_only_what_was_drawn():
         change[history] = total
     expected = torch.tensor([change[0.5, -0.2], change[-0.2,], change[0.5,], 0.0])
     assert torch.allclose(moved, expected[:, None].expand(4, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize("leaf", [torch.zeros(3, dtype=torch.float64), torch.zeros(4, 2).T])
+def test_what_a_part_learns_is_dense_float32(leaf):
+    model = GaussianModel.from_points(np.eye(3), np.zeros((3, 3), np.uint8), 0)
+    with pytest.raises(InputError, match=r"parameters of a part: expected dense float32, got gain of torch\.float"):
+        Optimizer(model, TrainConfig().learn, EXTENT, parts=[{"name": "gain", "params": [leaf], "lr": 0.1}])
 
 
 def test_rotation_against_scipy():

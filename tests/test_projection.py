@@ -172,6 +172,10 @@ def test_inputs_need_not_be_contiguous():
             (3.0,),
             "Projection.lens: expected a function of the lanes .* of 4 arguments, got 3.0; see docs/extending.md.",
         ),
+        (
+            (make_lens(16),),
+            "Projection.lens: expected a function of the lanes .* of 4 arguments, got <Function .*; see",
+        ),
         ((lambda lanes: 3.0,), "Projection.lens: expected .*, got one that makes 3.0; see"),
         ((make_outline,), "Projection.lens: expected .* of 4 arguments, got one that makes <Function"),
         (

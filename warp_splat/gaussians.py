@@ -138,8 +138,10 @@ class GaussianModel:
         )
 
     def save(self, path: Path, antialiased: bool = False) -> None:
-        """Write a file of Gaussians: a PLY file in the reference's layout, or what else the name asks for."""
-        raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}
+        """Write a file of Gaussians, arranged: a PLY file in the reference's layout, or what else the name asks for."""
+        raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}  # the device may be full
+        order = along_curve(raw["means"])
+        raw = {name: tensor[order] for name, tensor in raw.items()}
         sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
         arrays = (tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
         save_gaussians(path, SplatFile(SplatArrays(*arrays), antialiased))

@@ -41,7 +41,11 @@ def load_png(path: str | Path) -> np.ndarray:
     """
     try:
         with Image.open(path) as image:
+            if image.mode[0] in "IF":  # Pillow would cut more than 8 bits at 255
+                raise InputError(f"{path}: expected 8 bits a channel, found {image.mode}; write it again.")
             return np.array(image.convert("RGB"))
+    except InputError:
+        raise
     except Exception as error:  # Pillow raises many types, SyntaxError among them
         raise InputError(f"{path}: could not be read as an image ({reason_of(error)}); write it again.") from error
 

@@ -24,20 +24,20 @@ def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
     number = TYPES[lanes].number
 
     @wp.func
-    def drawn(radii: wp.array[int], place: int, width: int):
-        """Mask: the numbers from ``place`` on are of Gaussians that are drawn."""
-        row = place // width
+    def drawn(radii: wp.array[int], row: int, place: int, width: int):
+        """Mask: the numbers from ``place`` on, counted from ``row``, are of Gaussians that are drawn."""
+        shown = row + place // width
         if wp.static(lanes == 1):
-            return wp.where(radii[row] > 0, 1.0, 0.0)
+            return wp.where(radii[shown] > 0, 1.0, 0.0)
         else:
-            left = (row + 1) * width - place  # numbers of this row
+            left = width - place % width  # numbers of this row
             mask = number()
             for lane in range(lanes):
                 if left == 0:
-                    row += 1
+                    shown += 1
                     left = width
                 left -= 1
-                mask[lane] = wp.where(radii[row] > 0, 1.0, 0.0)
+                mask[lane] = wp.where(radii[shown] > 0, 1.0, 0.0)
             return mask
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
@@ -52,7 +52,7 @@ def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
         group = first + wp.tid()
         for table in range(tables_out.shape[0]):
             width = widths[table]
-            begin = wp.uint64(4 * lanes) * wp.uint64(group * width)
+            begin = wp.uint64(4 * lanes) * wp.uint64(group) * wp.uint64(width)
             values = wp.array(ptr=tables_out[table, 0] + begin, shape=(width,), dtype=number)
             grads = wp.array(ptr=tables_out[table, 1] + begin, shape=(width,), dtype=number)
             firsts = wp.array(ptr=tables_out[table, 2] + begin, shape=(width,), dtype=number)
@@ -64,7 +64,7 @@ def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
                 spread = root(v) * numbers[table, PER_ROOT] + fill(numbers[table, EPS], v)
                 value = values[i] - over(m * numbers[table, RATE], spread)
                 if wp.static(sparse):
-                    mask = drawn(radii, lanes * (group * width + i), width)
+                    mask = drawn(radii, lanes * group, lanes * i, width)
                     m = pick(mask, m, firsts[i])
                     v = pick(mask, v, seconds[i])
                     value = pick(mask, value, values[i])

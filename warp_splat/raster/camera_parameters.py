@@ -128,7 +128,7 @@ def _sums(
     columns: int,
     arguments: Callable[[Types, slice], list],
 ) -> np.ndarray:
-    """The columns of what a kernel writes, summed in pairs in float64: one order, and exact additions, everywhere."""
+    """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
     count = len(like)
     sums = like.new_empty(count // lanes + count % lanes, columns)
 

@@ -31,7 +31,6 @@ from warp_splat.training.record import (
     restore,
     save_model,
     save_or_warn,
-    sha256_of,
     warn,
 )
 from warp_splat.training.tensorboard import EventLog
@@ -52,7 +51,8 @@ def train(config: TrainConfig) -> int:
     1: the model could not be written into its folder and was saved elsewhere. 130: interrupted, the model saved.
 
     Raises:
-        InputError: if an option, the scene or the output folder is not usable.
+        InputError: if an option, the scene or the output folder is not usable; at the end, if the model, which is
+            saved, has not the hash that ``verify`` asks for.
     """
     check_train(config)
     with join(config.machine.device) as processes:
@@ -144,9 +144,9 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say)
     if run.iteration < end:
         return 130
     verify = trainer.config.report.verify
-    if trainer.processes.rank == 0 and not (found := sha256_of(run)).startswith(verify):
+    if trainer.processes.rank == 0 and not run.sha256.startswith(verify):
         raise InputError(
-            f"--verify: expected a model whose sha256 begins with {verify}, got {found}; another scene, version, "
+            f"--verify: expected a model whose sha256 begins with {verify}, got {run.sha256}; another scene, version, "
             "option or kind of device makes another model, see docs/platforms.md."
         )
     return 0

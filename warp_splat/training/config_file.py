@@ -16,14 +16,8 @@ from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.training.options import TrainConfig, check_train
 
 NAME = "config.toml"
-OF_ONE_RUN = (
-    "model_path",
-    "start_checkpoint",
-    "config",
-    "viewer",
-    "port",
-    "verify",
-)  # where it wrote, came from and was seen
+#: Where it wrote, came from and was seen, and what it was compared with.
+OF_ONE_RUN = ("model_path", "start_checkpoint", "config", "viewer", "port", "verify")
 KINDS = {str: "a text", bool: "true or false", int: "a whole number", float: "a number", list: "a list of numbers"}
 
 

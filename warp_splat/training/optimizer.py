@@ -14,6 +14,7 @@ import torch
 import warp as wp
 from torch.optim.adam import adam
 
+from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import make_adam
@@ -87,7 +88,10 @@ class Optimizer:
             Training"): if gradients of different images are independent, a step then moves the parameters as far,
             and forgets as much, as ``batch`` steps of one image.
         parts: groups of what parts learn, each with ``name``, ``params`` (one leaf of at least one axis) and ``lr``, a
-            number or a function of the iteration; they learn in every step. On a CPU, leaves are dense float32.
+            number or a function of the iteration; they learn in every step.
+
+    Raises:
+        InputError: if a leaf of a part is not dense float32.
     """
 
     def __init__(
@@ -95,6 +99,9 @@ class Optimizer:
     ):
         self.model, self.options, self.extent, self.scale = model, options, extent, math.sqrt(batch)
         self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
+        for name, leaf in self.parts.items():
+            if leaf.dtype != torch.float32 or not leaf.is_contiguous():
+                raise InputError(f"parameters of a part: expected dense float32, got {name} of {leaf.dtype}.")
         self._part_rates = {group["name"]: group["lr"] for group in parts}
         groups = [{"name": name, "params": [leaf]} for name, leaf in model.parameters.items()]
         betas = tuple(power(beta, batch) for beta in BETAS)
@@ -139,10 +146,13 @@ class Optimizer:
         self.adam.zero_grad()
 
     def load(self) -> None:
-        """Compile and load the kernel."""
-        device = self.model.device
-        for lanes in {driver_of(device).lanes, 1}:
-            load(make_adam(lanes, sparse=self.options.optimizer_type == "sparse_adam"), device)
+        """Compile and load what :meth:`step` launches."""
+        device, sparse = self.model.device, self.options.optimizer_type == "sparse_adam"
+        lanes = driver_of(device).lanes
+        kinds = [True] * sparse + [False] * (lanes > 1 and (not sparse or bool(self.parts)))  # else torch's
+        for kind in kinds:
+            for size in {lanes, 1}:
+                load(make_adam(size, kind), device)
 
     def _step(self, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
         """Adam on tables of ``rows`` rows.
@@ -163,8 +173,9 @@ class Optimizer:
                 )
             elif radii is None:
                 state["step"] += 1
-                biases = [1.0 - power(beta, state["step"].item()) for beta in (beta1, beta2)]
             if known and not of_torch:
+                if radii is None:
+                    biases = [1.0 - power(beta, state["step"].item()) for beta in (beta1, beta2)]
                 tables.append([parameter.detach(), grad.contiguous(), *(state[name] for name in MOMENTS)])
                 rates = [group["lr"] / biases[0], group["eps"], 1.0 / math.sqrt(biases[1])]
                 numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])

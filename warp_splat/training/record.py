@@ -44,6 +44,7 @@ class Run:
     seconds: float = 0.0  # of training steps alone, without evaluations and pictures
     preview: float = 0.0  # when last drawn
     saved: Path | None = None  # the model, at the end
+    sha256: str = ""  # of that file: equal where the bytes are (docs/platforms.md says where)
     kept: int | None = None  # iteration of the last checkpoint
     kept_at: float = 0.0  # when that was written, on time.perf_counter
     stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
@@ -61,11 +62,11 @@ def save_model(trainer: Trainer, run: Run) -> Path:
     path = model_folder.ply_path(run.folder, run.iteration)
     antialiased = trainer.config.model.antialiasing
     try:
-        trainer.model.arranged().save(path, antialiased)
+        trainer.model.save(path, antialiased)
     except InputError as error:
         warn(error)
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
-        trainer.model.arranged().save(path, antialiased)
+        trainer.model.save(path, antialiased)
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     try:
         _save_cameras(trainer, run.folder, path.parent)
@@ -150,22 +151,19 @@ def how_to_continue(folder: Path, processes: Processes) -> str:
     return shlex.join([*program, "--resume", str(folder)])
 
 
-def sha256_of(run: Run) -> str:
-    """The hash of the saved model, a .ply file: equal where the bytes are (docs/platforms.md says where)."""
-    assert run.saved
-    return hashlib.sha256(run.saved.read_bytes()).hexdigest()
-
-
 def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     """Pictures, curves and numbers of the saved model, and where they lie."""
+    assert run.saved
     wall = time.perf_counter() - run.start
+    with run.saved.open("rb") as file:
+        run.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     trainer.model = trainer.model.arranged()  # as in the file: at one depth, the first is drawn in front
     split, views = trainer.scene.evaluated
     extra = {
         "split": split,
         "iterations": run.iteration,
         "gaussians": len(trainer.model),
-        "sha256": sha256_of(run),
+        "sha256": run.sha256,
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
         "processes": trainer.processes.count,

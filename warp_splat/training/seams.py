@@ -15,8 +15,8 @@ A part is made of (options, setting). It has any of these methods; ``tests/test_
 they run in this order:
 
     needed(scene) -> Verdict                of the class: whether ``--parts auto`` takes it; without, it never does
-    parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, with a name that no other has; lr is a
-                                            number, or a function of the iteration
+    parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, dense float32, with a name that no other
+                                            has; lr is a number, or a function of the iteration
     camera(camera, step) -> camera          to render with
     background(color, step) -> color        [3], to render on
     image(image, out, step) -> image        [H, W, 3], of what was rendered, which is compared
@@ -30,6 +30,7 @@ For what is shown and saved, a part may have:
 
 Both may have:
 
+    load()                                  compile and load the kernels that they launch, before the first step
     asks(options, step) -> options          what they need of the renderer in this step: depth, ...
     state() -> {name: tensor}               what a checkpoint keeps besides ``parameters``, by names that no other has
     restore(checkpoint)                     take that back; raise InputError if it does not fit

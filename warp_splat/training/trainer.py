@@ -173,6 +173,8 @@ class Trainer:
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.adam.zero_grad()
         self.optimizer.load()
+        for load_kernels in having((self.growth, *self.parts), "load"):
+            load_kernels()
         load(quarantine, self.device)  # launched only where a gradient is not finite
 
     def check_identical(self, iteration: int) -> None:

@@ -45,12 +45,13 @@ class Projection(NamedTuple):
         """
         found = []
         for (name, count), make in zip(ARGUMENTS.items(), self[:2], strict=True):
-            made = make(lanes) if callable(make) else make
-            fits = isinstance(made, wp.Function) and len(made.input_types) == count
+            makes = callable(make) and not isinstance(make, wp.Function)
+            made = make(lanes) if makes else make
+            fits = makes and isinstance(made, wp.Function) and len(made.input_types) == count
             if not fits and (make is not None or name == "lens"):
                 raise InputError(
                     f"Projection.{name}: expected a function of the lanes that makes a wp.func of {count} arguments, "
-                    f"got {f'one that makes {made!r:.80}' if callable(make) else repr(make)}; see docs/extending.md."
+                    f"got {f'one that makes {made!r:.80}' if makes else repr(make)}; see docs/extending.md."
                 )
             found.append(made)
         return found

@@ -17,7 +17,7 @@ from warp_splat.kernels.simd import Types
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
 from warp_splat.training.growth import ReferenceOptions
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting, Step
@@ -60,6 +60,11 @@ class Reference:
         launch_in_lanes(make_observe, driver_of(grad.device).lanes, len(grad), arguments, grad.device)
         if self.options.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
+
+    def load(self) -> None:
+        """Compile and load the kernel of :meth:`observe`."""
+        for lanes in {driver_of(self.model.device).lanes, 1}:
+            load(make_observe(lanes), self.model.device)
 
     def update(self, iteration: int) -> Change | None:
         """Densify, prune and reset opacities if it is time; None if the set did not change."""
