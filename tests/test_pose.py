@@ -19,8 +19,8 @@ from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.model_folder import read_cameras
 from warp_splat.raster.api import rasterize
 from warp_splat.scene import load_scene
-from warp_splat.scene.types import View
-from warp_splat.training.parts.pose import Pose, gauge, pose_error
+from warp_splat.scene.types import View, visible
+from warp_splat.training.parts.pose import MOST, Pose, factors, gauge, inverses, orthonormal, pose_error, sensitivity
 from warp_splat.training.record import keep, restore
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -46,33 +46,59 @@ def twist_between(camera, other, extent):
 
 
 def test_the_gauge_is_what_similarities_do(scene):
-    """Seven orthonormal motions, which hold all that small similarities do to the cameras, and no more."""
+    """Seven motions, which hold all that small similarities do to the cameras, and no more."""
     given = [view.camera for view in scene.train]
-    basis = np.stack(gauge(given, scene.extent))
+    motions = gauge(given, scene.extent)
+    basis = np.stack(orthonormal(motions.reshape(7, -1)))
     np.testing.assert_allclose(basis @ basis.T, np.eye(7), atol=1e-12)
     middle = np.mean([camera.center for camera in given], axis=0)
     for numbers in 1e-6 * np.random.default_rng(0).normal(size=(9, 7)):
         moved = [similar(camera, numbers[:3], numbers[3:6], 1 + numbers[6], middle) for camera in given]
         twist = np.concatenate([twist_between(*pair, scene.extent) for pair in zip(given, moved, strict=True)])
         np.testing.assert_allclose(basis.T @ (basis @ twist), twist, atol=1e-10)
-    assert len(gauge([replace(camera, translation=np.zeros(3)) for camera in given], scene.extent)) == 6
+    still = gauge([replace(camera, translation=np.zeros(3)) for camera in given], scene.extent)
+    assert len(orthonormal(still.reshape(7, -1))) == 6
+
+
+def test_each_number_moves_the_picture_alike(scene):
+    """Against differences: the mean square over the points, damped, is that of the numbers."""
+    for view in scene.train[:3]:
+        camera, extent = view.camera, scene.extent
+        points = scene.points[visible(camera, scene.points)].astype(np.float64)
+        square = sensitivity(camera, points, extent)
+        assert len(points) < MOST
+        slopes = lambda twist, camera=camera, points=points: slopes_of(twisted(camera, twist, extent), points)
+        columns = [(slopes(step) - slopes(-step)) / 2e-6 for step in 1e-6 * np.eye(6)]
+        rows = np.stack(columns, -1) * np.array([[camera.fx], [camera.fy]]) / camera.width
+        exact = np.einsum("nij,nik->jk", rows, rows) / len(points)
+        exact += 0.01 * (np.diag(np.diag(exact)) + (camera.fx / camera.width) ** 2 * np.eye(6))
+        np.testing.assert_allclose(square, exact, atol=1e-8)
+        (lower,) = factors(square[None])
+        np.testing.assert_allclose(lower @ lower.T, square, atol=1e-12)
+        np.testing.assert_allclose(inverses(lower[None])[0], np.linalg.inv(lower), rtol=1e-9, atol=1e-12)
+
+
+def twisted(camera, twist, extent):
+    turn = Rotation.from_rotvec(twist[:3]).as_matrix()
+    translation = turn @ camera.translation + extent * twist[3:]
+    return replace(camera, rotation=turn @ camera.rotation, translation=translation)
 
 
 def test_only_what_is_seen_learns_and_the_set_stays(scene, tmp_path):
     trainer, run = begin(scene, tmp_path, **ALL)
     pose = trainer.parts[0]
     trainer.differentiate(1)
-    assert int((pose.twists.grad != 0).any(1).sum()) == 1 and pose.stretches.grad.shape == (1, 4)
+    assert int((pose.moves.grad != 0).any(1).sum()) == 1 and pose.stretches.grad.shape == (1, 4)
     assert bool((pose.stretches.grad != 0).all())
     trainer, run = begin(scene, tmp_path, **ALL)
     steps(trainer, run, 12)
     pose, moved = trainer.parts[0], trainer.refined(scene.train)
-    twists = pose.twists.detach().double().numpy()
-    assert np.abs(twists).max() > 1e-4 and len(pose.gauge) == 7
-    assert np.abs(np.stack(pose.gauge) @ twists.ravel()).max() < 1e-8 * len(twists)
-    for view, other, twist in zip(scene.train, moved, twists, strict=True):
+    numbers = pose.moves.detach().double().numpy()
+    assert np.abs(numbers).max() > 1e-4 and len(pose.gauge) == 7
+    assert np.abs(np.stack(pose.gauge) @ numbers.ravel()).max() < 1e-7
+    for view, other, way, number in zip(scene.train, moved, pose.ways, numbers, strict=True):
         found = twist_between(view.camera, other.camera, scene.extent)
-        np.testing.assert_allclose(found[:3], twist[:3], atol=1e-9)
+        np.testing.assert_allclose(found, number @ way.numpy() / [1, 1, 1, *[scene.extent] * 3], atol=1e-9)
     given = replace(scene.train[0])  # as if it were held out: the lens alone is known
     held = trainer.refined([given])[0]
     assert np.array_equal(held.camera.rotation, given.camera.rotation)

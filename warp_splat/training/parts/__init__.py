@@ -47,8 +47,8 @@ class ExposureOptions:
 class PoseOptions:
     """Poses and lenses that are learned."""
 
-    pose_lr: float = learning(0.001, "rate of --parts pose at its start, in radians and shares of the scene's extent")
-    pose_from_iter: int = learning(500, "step from which poses move", least=0)
+    pose_lr: float = learning(0.0005, "rate of --parts pose at its start, in shares of the pictures' width")
+    pose_from_iter: int = learning(0, "step from which poses move")
     pose_reg: float = learning(0.1, "weight of the squared distance from the given poses and lenses in the loss")
     pose_intrinsics: str = learning("", "what of the lens --parts pose refines, too", choices=("", "focal", "all"))
 

@@ -1,11 +1,15 @@
 """Poses that are a little off: they follow the cameras' gradients, near where structure from motion put them.
 
+A turn and a shift of a camera look much alike, and either may look like more or less. So what is learned are six
+numbers each of which moves what the picture shows by as much, and none as another does (after Park et al. 2023, CamP).
+
 Photographs cannot tell a turn, a shift or a growth of all cameras from the opposite one of the scene. So these seven
 motions are taken out of the poses after every step, to first order: the set as a whole stays where it was given.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -15,16 +19,19 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.scene.types import Scene, Sightings, View
+from warp_splat.runtime.sums import in_pairs
+from warp_splat.scene.types import Scene, Sightings, View, visible
 from warp_splat.training.optimizer import power
 from warp_splat.training.parts import PoseOptions
 from warp_splat.training.seams import Setting, Step, Verdict
 
-LENS_RATE = 0.1  # of the poses' rate: a lens learns from every photograph, a pose from its own
+LENS_RATE = 0.3  # of the poses' rate: a lens learns from every photograph, a pose from its own
 LAST_RATE = 0.01  # of the first one, at the end
 ENOUGH = 10  # points in a photograph, to tell whether its pose is right
 OFF = 0.5  # px that a pose moves its picture by: what blurs
 FLAT = 1e-9  # length of a motion that moves nothing: growth, where all cameras stand at one place
+MOST = 1000  # points of a photograph that say how a pose moves it
+DAMPING = 0.01  # of its square
 
 
 class Pose:
@@ -36,12 +43,17 @@ class Pose:
         self.places = {view: place for place, view in enumerate(scene.train)}
         self.lenses = {lens: place for place, lens in enumerate(dict.fromkeys(map(intrinsics_of, scene.train)))}
         device, numbers = setting.model.device, {"": 0, "focal": 1, "all": 4}[options.pose_intrinsics]
-        self.units = torch.tensor([1.0] * 3 + [scene.extent] * 3, dtype=torch.float64, device=device)
-        #: Radians and shares of the extent.
-        self.twists = new(len(scene.train), 6, device=device, requires_grad=True)
+        cameras, points = [view.camera for view in scene.train], scene.points.astype(np.float64)
+        lower = factors(np.stack([sensitivity(camera, points, scene.extent) for camera in cameras]))
+        ways = inverses(lower) * np.array([1.0] * 3 + [scene.extent] * 3)
+        #: Of each photograph and of each of its numbers: the twist, [V, 6, 6].
+        self.ways = torch.from_numpy(ways).to(device)
+        #: Shares of the pictures' widths.
+        self.moves = new(len(scene.train), 6, device=device, requires_grad=True)
         #: Shares of fx, fy, width and height; with "focal" one of both focal lengths.
         self.stretches = new(len(self.lenses), numbers, device=device, requires_grad=True)
-        self.gauge = gauge([view.camera for view in scene.train], scene.extent)
+        whole = [in_order(lower * motion[:, :, None]) for motion in gauge(cameras, scene.extent)]
+        self.gauge = orthonormal(np.stack(whole).reshape(len(whole), -1))
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
@@ -58,7 +70,7 @@ class Pose:
 
     def parameters(self) -> list[dict]:
         """Twists, and lenses if asked for."""
-        groups = [{"name": "pose", "params": [self.twists], "lr": self._rate}]
+        groups = [{"name": "pose", "params": [self.moves], "lr": self._rate}]
         if self.options.pose_intrinsics:
             groups.append({"name": "lens", "params": [self.stretches], "lr": lambda i: LENS_RATE * self._rate(i)})
         return groups
@@ -80,30 +92,30 @@ class Pose:
             return self._learned(camera, view).camera
 
     def _learned(self, camera: Camera, view: View) -> CameraParameters:
-        twist = self.twists[self.places[view]].double() * self.units if view in self.places else torch.zeros(6)
+        twist = torch.zeros(6)
+        if view in self.places:
+            place = self.places[view]
+            twist = in_pairs(self.ways[place] * self.moves[place].double()[:, None])
         if not self.options.pose_intrinsics or intrinsics_of(view) not in self.lenses:
             return CameraParameters(camera, twist, torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]).double())
         free = self.options.pose_intrinsics == "all"
         units = [camera.fx, camera.fy, free * camera.width, free * camera.height]
         given = [camera.fx, camera.fy, camera.cx, camera.cy]
         given, units = torch.tensor([given, units], dtype=torch.float64, device=self.stretches.device)
-        return CameraParameters(
-            camera, twist, given + units * self.stretches[self.lenses[intrinsics_of(view)]].double()
-        )
+        stretch = self.stretches[self.lenses[intrinsics_of(view)]].double()
+        return CameraParameters(camera, twist, given + units * stretch)
 
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """Add the squared distance from what was given."""
-        away = [self.twists[self.places[step.view]], self.stretches[self.lenses[intrinsics_of(step.view)]]]
-        for number in torch.cat(away).square().unbind():  # in one order
-            loss = loss + self.options.pose_reg * number
-        return loss
+        away = [self.moves[self.places[step.view]], self.stretches[self.lenses[intrinsics_of(step.view)]]]
+        return loss + (self.options.pose_reg * in_pairs(torch.cat(away).square())).to(loss.dtype)
 
     def after_step(self, iteration: int) -> None:
         """Take out what moves the set as a whole."""
-        moved = self.twists.detach().double().cpu().numpy().ravel()
+        moved = self.moves.detach().double().cpu().numpy().ravel()
         for motion in self.gauge:
-            moved = moved - math.fsum((moved * motion).tolist()) * motion
-        self.twists.detach().copy_(torch.from_numpy(moved.reshape(-1, 6)))
+            moved = moved - dot(moved, motion) * motion
+        self.moves.detach().copy_(torch.from_numpy(moved.reshape(-1, 6)))
 
 
 def intrinsics_of(view: View) -> tuple[float, ...]:
@@ -112,8 +124,8 @@ def intrinsics_of(view: View) -> tuple[float, ...]:
     return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
 
 
-def gauge(cameras: Sequence[Camera], extent: float) -> list[np.ndarray]:
-    """Orthonormal twists [6 V] of all cameras, in radians and extents, that move the set as a similarity does."""
+def gauge(cameras: Sequence[Camera], extent: float) -> np.ndarray:
+    """Seven twists of all cameras [7, V, 6], in radians and extents, that move the set as a similarity does."""
     centers = np.stack([camera.center for camera in cameras])
     arms = (centers - centers.sum(0) / len(cameras)) / extent
     rotations, still = np.stack([camera.rotation for camera in cameras]), np.zeros((len(cameras), 3))
@@ -122,16 +134,75 @@ def gauge(cameras: Sequence[Camera], extent: float) -> list[np.ndarray]:
         turn = np.broadcast_to(axis, arms.shape)
         motions += [(turn, np.cross(turn, arms)), (still, turn)]
     motions.append((still, arms))
+    axes = rotations.transpose(0, 2, 1)  # of the world; as the cameras see them, with the other sign
+    parts = [[in_order(axes * part[:, :, None]) for part in motion] for motion in motions]
+    return np.stack([np.concatenate(pair, 1) for pair in parts])
+
+
+def in_order(terms: np.ndarray) -> np.ndarray:
+    """Sum over the axis after the first, of which a sum over the last may have another order."""
+    return functools.reduce(np.add, terms.swapaxes(0, 1))
+
+
+def orthonormal(vectors: np.ndarray) -> list[np.ndarray]:
+    """A basis of ``vectors`` [K, M], whose sums are exact."""
     basis: list[np.ndarray] = []
-    for turn, shift in motions:  # of the world; as the cameras see them, with the other sign
-        seen = [(rotations * part[:, None]).transpose(2, 0, 1).sum(0) for part in (turn, shift)]  # in one order
-        motion = np.concatenate(seen, 1).ravel()
+    for vector in vectors:
+        rest = vector
         for other in basis:
-            motion = motion - math.fsum((motion * other).tolist()) * other
-        length = math.sqrt(math.fsum((motion * motion).tolist()))
-        if length > FLAT:
-            basis.append(motion / length)
+            rest = rest - dot(rest, other) * other
+        length = math.sqrt(dot(rest, rest))
+        if length > FLAT * math.sqrt(dot(vector, vector)):
+            basis.append(rest / length)
     return basis
+
+
+def dot(one: np.ndarray, other: np.ndarray) -> float:
+    """The same on every processor."""
+    return math.fsum((one * other).tolist())  # rounded once, whatever the order
+
+
+def sensitivity(camera: Camera, points: np.ndarray, extent: float) -> np.ndarray:
+    """How far a twist, in radians and extents, moves what the picture shows: squared shares of its width, [6, 6].
+
+    The mean over the points [P, 3], damped: where they say little, a pose is to move little.
+    """
+    focal = np.array([camera.fx, camera.fy]) / camera.width
+    shown = points[visible(camera, points)]
+    rows = focal[:, None, None] * slope_changes(camera, shown[:: -(-len(shown) // MOST) or 1])[1]
+    rows[:, 3:] *= extent
+    products = torch.from_numpy((rows[:, :, None] * rows[:, None]).transpose(3, 0, 1, 2))
+    across, down = in_pairs(products).numpy() / max(len(products), 1)
+    square = across + down
+    return square + DAMPING * (np.diag(np.diag(square)) + focal[0] ** 2 * np.eye(6))
+
+
+def factors(squares: np.ndarray) -> np.ndarray:
+    """Lower triangles L with L L' = ``squares`` [V, 6, 6] (Cholesky), by steps that round alike everywhere."""
+    lower = np.zeros_like(squares)
+    for j in range(squares.shape[1]):
+        for i in range(j, squares.shape[1]):
+            rest = squares[:, i, j] - sum(lower[:, i, k] * lower[:, j, k] for k in range(j))
+            lower[:, i, j] = np.sqrt(rest) if i == j else rest / lower[:, j, j]
+    return lower
+
+
+def inverses(lower: np.ndarray) -> np.ndarray:
+    """Of lower triangles [V, 6, 6]."""
+    found = np.zeros_like(lower)
+    for j in range(lower.shape[1]):
+        found[:, j, j] = 1.0 / lower[:, j, j]
+        for i in range(j + 1, lower.shape[1]):
+            found[:, i, j] = -sum(lower[:, i, k] * found[:, k, j] for k in range(j, i)) / lower[:, i, i]
+    return found
+
+
+def slope_changes(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes x / z and y / z of points [P, 3] in the camera, [2, P], and their changes with a twist, [2, 6, P]."""
+    x, y, z = (camera.rotation[:, :, None] * points.T).sum(1) + camera.translation[:, None]
+    u, v, zero, one = x / z, y / z, np.zeros_like(z), 1.0 / z
+    changes = [[-u * v, 1.0 + u * u, -v, one, zero, -u * one], [-1.0 - v * v, u * v, u, zero, one, -v * one]]
+    return np.stack([u, v]), np.array(changes)
 
 
 def pose_error(camera: Camera, seen: Sightings) -> float:
@@ -140,20 +211,16 @@ def pose_error(camera: Camera, seen: Sightings) -> float:
     A step of Gauss and Newton from the pose to where its keypoints would have it moves the points; to that comes what
     the covariance of the keypoints leaves open. Keypoints far off count less (Cauchy's weights).
     """
-    points = seen.points @ camera.rotation.T + camera.translation
-    front = points[:, 2] > 0
+    front = (seen.points @ camera.rotation.T + camera.translation)[:, 2] > 0
     if np.count_nonzero(front) < ENOUGH:
         return math.inf
-    (x, y, z), focal = points[front].T, np.array([camera.fx, camera.fy])
-    slopes, zero = np.stack([x / z, y / z], 1), np.zeros_like(z)
-    errors = focal * (seen.slopes[front] - slopes)
-    turned = np.stack([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 1, 0)  # of x, y, z by each turn
-    moved = np.concatenate([turned, np.broadcast_to(np.eye(3), turned.shape)], 2)
-    rows = focal[:, None] * (moved[:, :2] - slopes[..., None] * moved[:, 2:]) / z[:, None, None]
-    squares = (errors**2).sum(1)
+    slopes, changes = slope_changes(camera, seen.points[front])
+    focal = np.array([camera.fx, camera.fy])[:, None]
+    errors, rows = focal * (seen.slopes[front].T - slopes), focal[:, None] * changes
+    squares = (errors**2).sum(0)
     weights = 1 / (1 + squares / max(4 * np.median(squares), 1e-12))
-    normal = np.einsum("n,nij,nik->jk", weights, rows, rows)
-    step = np.linalg.lstsq(normal, np.einsum("n,nij,ni->j", weights, rows, errors), rcond=1e-12)[0]
-    left = ((errors - rows @ step) ** 2).sum(1)
-    noise = np.average(left, weights=weights) / 2
-    return math.sqrt(((rows @ step) ** 2).sum(1).mean() + 6 * noise / len(left))
+    normal = np.einsum("n,ijn,ikn->jk", weights, rows, rows)
+    step = np.linalg.lstsq(normal, np.einsum("n,ijn,in->j", weights, rows, errors), rcond=1e-12)[0]
+    moved = np.einsum("ijn,j->in", rows, step)
+    noise = np.average(((errors - moved) ** 2).sum(0), weights=weights) / 2
+    return math.sqrt((moved**2).sum(0).mean() + 6 * noise / len(squares))

@@ -1,0 +1,130 @@
+r"""Cameras of photographs that find their way back into a trained model, and where the photograph would have them.
+
+A photograph's camera is turned by 5 degrees and moved by 10 % of the scene's extent. It then follows the gradients of
+the difference to the photograph: of its pose alone, with fx and fy free as well (5 % too long at the start), and with
+cx and cy, too (2 % of the width and height off).
+
+    python benchmarks/camera_photos.py -m output/fox -m output/church [--out docs/benchmarks]
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from cameras import ANGLE, LEVELS, SHIFT, ZOOM, direction
+from common import machine, write_table
+
+from warp_splat import Camera, CameraParameters
+from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
+from warp_splat.formats.model_folder import open_model
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
+from warp_splat.rendering.command import load_trained_scene, options_of
+from warp_splat.runtime import launch
+
+FREE = {"pose": 0, "and fx, fy": 2, "and cx, cy": 4}  # intrinsics that are free
+ASIDE = 0.02  # of the principal point, in widths and heights
+STAGES = ((4, 200, 1e-2, 1e-3), (1, 120, 1e-3, 5e-5))  # how many times smaller, steps, rates of Adam at start and end
+COLORS = dict(zip(FREE, (BLUE, ORANGE, GREEN), strict=True))
+TITLES = ("direction [degrees]", "place [% of the extent]", "focal length [%]", "principal point [% of the size]")
+HEADERS = ("scene", "photograph", "free", "direction", "place", "fx, fy", "cx, cy")
+
+
+def distance(camera: Camera, right: Camera, extent: float) -> list[float]:
+    """Degrees; shares of the extent, of the focal lengths, and of the size, in per cent."""
+    turn = camera.rotation @ right.rotation.T
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    place = np.linalg.norm(camera.center - right.center) / extent
+    focal = max(abs(camera.fx / right.fx - 1), abs(camera.fy / right.fy - 1))
+    middle = max(abs(camera.cx - right.cx) / right.width, abs(camera.cy - right.cy) / right.height)
+    return [float(np.degrees(np.arcsin(sine))), *(100 * float(value) for value in (place, focal, middle))]
+
+
+def follow(draw, view, extent: float, free: int, seed: int) -> list[list[float]]:
+    """Before every step and at last: the :func:`distance` from the camera that the scene gives."""
+    generator = np.random.default_rng(seed)
+    start = np.concatenate([direction(generator, ANGLE), direction(generator, SHIFT), [ZOOM - 1] * 2, [ASIDE] * 2])
+    start[6 + free :] = 0.0
+    numbers = torch.tensor(start, requires_grad=True)
+    units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
+    kept = torch.arange(10) < 6 + free
+    errors = []
+
+    def learned(camera: Camera) -> CameraParameters:
+        given = [camera.fx, camera.fy, camera.cx, camera.cy]
+        spans = [camera.fx, camera.fy, camera.width, camera.height]
+        given, spans = torch.tensor([given, spans], dtype=torch.float64)
+        return CameraParameters(camera, numbers[:6] * units, given + spans * numbers[6:])
+
+    photo = torch.from_numpy(view.image).float().permute(2, 0, 1) / 255
+    for shrink, steps, rate, last in STAGES:
+        target = torch.nn.functional.avg_pool2d(photo, shrink)
+        camera = view.camera.resized(target.shape[2], target.shape[1])
+        adam = torch.optim.Adam([numbers], rate, betas=(0.9, 0.9))
+        scheduler = torch.optim.lr_scheduler.ExponentialLR(adam, (last / rate) ** (1 / steps))
+        for _ in range(steps):
+            errors.append(distance(learned(view.camera).camera, view.camera, extent))
+            difference = draw(learned(camera)).permute(2, 0, 1) - target
+            pooled = [torch.nn.functional.avg_pool2d(difference, level) for level in LEVELS]
+            adam.zero_grad()
+            torch.stack([picture.square().mean() for picture in pooled]).sum().backward()
+            numbers.grad *= kept
+            adam.step()
+            scheduler.step()
+    return [*errors, distance(learned(view.camera).camera, view.camera, extent)]
+
+
+def follow_all(model: Path, free: list[str]) -> dict[tuple[str, str, str], list[list[float]]]:
+    """By scene, photograph and what is free: the middle one of those for training, and of those held out."""
+    iteration, gaussians, trained = open_model(model)
+    scene = load_trained_scene(str(model), "", trained, lambda line: None, iteration)
+    activated = Gaussians(*(tensor.detach() for tensor in GaussianModel.from_splats(gaussians.splats).activated()))
+    options, background = options_of(trained), torch.zeros(3)
+    found = {}
+    for split, views in (("", scene.train), (", held out", scene.test)):
+        view = views[len(views) // 2]
+        for name in free:
+            draw = lambda camera: render(activated, camera, background, options).image  # noqa: E731
+            key = (Path(str(trained["source_path"])).name, view.name + split, name)
+            found[key] = follow(draw, view, scene.extent, FREE[name], seed=0)
+            print(*key, found[key][-1], flush=True)
+    return found
+
+
+def plot(runs: dict[tuple[str, str, str], list[list[float]]], path: Path) -> None:
+    """Errors over steps, a panel for each."""
+    figure, panels = new_panels(2.6, columns=len(TITLES))
+    for column, (axes, title) in enumerate(zip(panels[0], TITLES, strict=True)):
+        for (_, photo, free), run in runs.items():
+            style = "--" if "held out" in photo else "-"
+            axes.semilogy([max(errors[column], 1e-4) for errors in run], style, color=COLORS[free], linewidth=0.9)
+        plain_axes(axes, title, "steps")
+    save_figure(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-m", "--model", type=Path, action="append", required=True, help="a model; may come again")
+    parser.add_argument("--free", nargs="+", default=list(FREE), help=f"of {', '.join(FREE)}")
+    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for the plot")
+    arguments = parser.parse_args()
+    launch.prepare("cpu", 1)
+    torch.set_num_threads(1)
+    runs = {}
+    for model in arguments.model:
+        runs |= follow_all(model, arguments.free)
+    rows = []
+    for key, run in runs.items():
+        degrees, *shares = run[-1]
+        rows.append((*key, f"{degrees:.3f}°", *(f"{share:.3f} %" for share in shares)))
+    note = "Distance from the cameras of structure from motion; places as shares of the extent."
+    data = {"last": {" | ".join(key): run[-1] for key, run in runs.items()}, "machine": machine()}
+    if arguments.out:
+        plot(runs, arguments.out / "camera_photos.png")
+    write_table("camera_photos", arguments.out, HEADERS, rows, note, data)
+
+
+if __name__ == "__main__":
+    main()
