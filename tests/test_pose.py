@@ -64,11 +64,12 @@ def test_each_number_moves_the_picture_alike(scene):
     """Against differences: the mean square over the points, damped, is that of the numbers."""
     for view in scene.train[:3]:
         camera, extent = view.camera, scene.extent
-        points = scene.points[visible(camera, scene.points)].astype(np.float64)
+        points = scene.points[visible(camera, scene.points)][:MOST].astype(np.float64)
         square = sensitivity(camera, points, extent)
-        assert len(points) < MOST
-        slopes = lambda twist, camera=camera, points=points: slopes_of(twisted(camera, twist, extent), points)
-        columns = [(slopes(step) - slopes(-step)) / 2e-6 for step in 1e-6 * np.eye(6)]
+        columns = []
+        for step in 1e-6 * np.eye(6):
+            ends = [slopes_of(twisted(camera, sign * step, extent), points) for sign in (1, -1)]
+            columns.append((ends[0] - ends[1]) / 2e-6)
         rows = np.stack(columns, -1) * np.array([[camera.fx], [camera.fy]]) / camera.width
         exact = np.einsum("nij,nik->jk", rows, rows) / len(points)
         exact += 0.01 * (np.diag(np.diag(exact)) + (camera.fx / camera.width) ** 2 * np.eye(6))
