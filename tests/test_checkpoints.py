@@ -29,6 +29,7 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.splats import SplatFile
+from warp_splat.training.command import train as command_train
 from warp_splat.training.config_file import load_options
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import Run, keep, restore
@@ -157,6 +158,21 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
     for option, value in (("sh_degree", "2"), ("optimizer_type", "sparse_adam"), ("seed", "1"), ("preset", "fast")):
         assert f"--{option} {value}: expected" in fails(capsys, "train", "--resume", str(folder), f"--{option}", value)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_another_arithmetic_is_refused(tmp_path, monkeypatch, capsys):
+    """By the flag, and by the environment that this program was started in."""
+    for name, portable in (("with", True), ("without", False)):
+        options = TrainConfig(source_path=str(SCENE), portable=portable).flat()
+        save_checkpoint(tmp_path / name / LAST, {}, {"options": options, "iteration": 3})
+    sentence = fails(capsys, "train", "--resume", str(tmp_path / "without"), "--portable")
+    assert "--portable True: expected False, as in" in sentence
+    monkeypatch.setattr("warp_splat.training.opening.PORTABLE", True)
+    sentence = fails(capsys, "train", "--resume", str(tmp_path / "without"))
+    assert "WARP_SPLAT_PORTABLE: expected it unset, as in" in sentence
+    monkeypatch.setattr("warp_splat.training.opening.PORTABLE", False)
+    with pytest.raises(InputError, match="WARP_SPLAT_PORTABLE: expected it 1, as in"):  # --resume alone would set it
+        command_train(TrainConfig(source_path=str(SCENE), start_checkpoint=str(tmp_path / "with")))
 
 
 @pytest.mark.slow

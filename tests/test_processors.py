@@ -30,6 +30,17 @@ def hashes(changes: dict[str, str], *arguments: str) -> list[str]:
     return [line for line in done.stdout.splitlines() if line.endswith(")")]
 
 
+def test_a_misspelled_switch_is_refused():
+    command = [sys.executable, "-m", "warp_splat", "export-html", "a.ply", "a.html"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_SPLAT_PORTABLE": "yes"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "warp-splat: error: WARP_SPLAT_PORTABLE: expected 1, 0 or nothing in this environment variable, got 'yes'; "
+        "set it to one of them.\n"
+    )
+
+
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names processors of the x86-64 family")
 @pytest.mark.parametrize(
     ("here", "there", "arguments"),

@@ -42,6 +42,12 @@ COMMANDS = {
     "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }
 
+#: Flags whose default, none, is not meant by who gives them an empty text.
+NEVER_EMPTY = (
+    *("source_path", "model_path", "start_checkpoint", "start_ply", "config", "lpips_weights", "verify"),
+    *("video_output", "out"),
+)
+
 
 def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
     """A flag for each field of the configuration, with its default and help, under the heading of its group."""
@@ -101,9 +107,10 @@ def parse(arguments: list[str]) -> Any:
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
         raise InputError(f"{unknown[0]}: no such flag; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
-    for name in ("source_path", "model_path", "start_checkpoint", "config"):
+    for name in NEVER_EMPTY:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
-            raise InputError(f"--{name}: expected a path, got an empty one; leave the flag out or name one.")
+            what = "a hash" if name == "verify" else "a path"
+            raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
     if values.get("config"):
         from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
 

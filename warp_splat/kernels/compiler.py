@@ -7,11 +7,23 @@ that NaN or infinity never occur. The width is an upper bound, which AVX2 or NEO
 
 import os
 
+from warp_splat.errors import InputError
+
+
+def _is_on(variable: str) -> bool:
+    """Whether a variable of the environment is 1. Raises InputError if it is anything else than 0, 1 or nothing."""
+    value = os.environ.get(variable, "")
+    if value not in ("", "0", "1"):
+        expected = "expected 1, 0 or nothing in this environment variable"
+        raise InputError(f"{variable}: {expected}, got {value!r:.50}; set it to one of them.")
+    return value == "1"
+
+
 #: Warp's way to say "this machine", or another processor for tests: "-target-cpu x86-64-v3".
 TARGET = os.environ.get("WARP_SPLAT_TARGET", "-march=native")
 
 #: Multiplications and additions apart, where :func:`.simd.fma` fuses them: x86-64 without AVX2 has no such instruction.
-PORTABLE = os.environ.get("WARP_SPLAT_PORTABLE", "") == "1"
+PORTABLE = _is_on("WARP_SPLAT_PORTABLE")
 
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its
 #: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie.

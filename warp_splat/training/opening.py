@@ -21,8 +21,8 @@ from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
-from warp_splat.training.config_file import write_config
-from warp_splat.training.options import TrainConfig
+from warp_splat.training.config_file import load_options, write_config
+from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
 from warp_splat.training.tensorboard import writer_class
 
 Say = Callable[[str], None]
@@ -50,6 +50,12 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     begun = None
     if data.start_checkpoint:  # whole, without its arrays: beside the trainer's they would take as much memory again
         begun = replace(load_checkpoint(data.start_checkpoint), arrays={})
+    if begun and (kept := load_options(begun.path)["portable"]) != PORTABLE:
+        expected, here = ("1", "unset") if kept else ("unset", "1")
+        raise InputError(
+            f"WARP_SPLAT_PORTABLE: expected it {expected}, as in {begun.path} ({FIXED_OPTIONS['portable']}), but it is "
+            f"{here}; change it, or start anew."
+        )
     done = begun.count("iteration") if begun else 0
     if begun and done > iterations:  # at the end, what is written there is written again
         raise InputError(f"--iterations {iterations}: expected at least {done}, as in {begun.path}; name a later end.")

@@ -177,6 +177,7 @@ FIXED_OPTIONS = {
     "sh_degree": "the number of coefficients of a Gaussian is that of its start",
     "optimizer_type": "the moments of one are not those of the other",
     "growth": "the statistics of one are not those of the other",
+    "portable": "with it, kernels round otherwise",
     "seed": "random numbers continue from the checkpoint's",
     "preset": "other options are those of the checkpoint; name the ones to change",
 }
@@ -186,7 +187,7 @@ def check_train(config: TrainConfig) -> None:
     """Raise InputError if a value of ``config`` cannot be."""
     check_numbers(config)
     learn, parts = config.learn, config.model.parts
-    if (verify := config.report.verify) and (len(verify) < 8 or set(verify) - set("0123456789abcdef")):
+    if (verify := config.report.verify) and (not 8 <= len(verify) <= 64 or set(verify) - set("0123456789abcdef")):
         raise InputError(
             f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
         )
