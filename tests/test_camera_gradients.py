@@ -10,6 +10,7 @@ import pytest
 import scenes
 import torch
 from scenes import SCENES
+from scipy.spatial.transform import Rotation
 
 from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
 from warp_splat.compare import oracle, truth
@@ -228,6 +229,8 @@ def test_what_is_not_drawn_or_not_finite_says_nothing():
         ((None, torch.zeros(5)), r"twist: expected a tensor of 6 real numbers, got torch.float32 \[5\]"),
         ((None, [0.0] * 6), "twist: expected a tensor of 6 real numbers, got list"),
         ((None, None, torch.ones(4, dtype=torch.int32)), "intrinsics: expected a tensor of 4 real numbers"),
+        ((None, torch.zeros(6).to_sparse()), "twist: expected a dense tensor with numbers, got torch.sparse_coo"),
+        ((None, None, torch.ones(4, device="meta")), "intrinsics: expected a dense tensor .* got a meta tensor"),
     ],
 )
 def test_bad_input(arguments, message):
@@ -239,8 +242,19 @@ def test_numbers_that_make_no_camera():
     scene = SCENES["single"]()
     with pytest.raises(InputError, match="Camera fx: expected a positive number"):
         rasterize(*scene.parameters(), CameraParameters(scene.camera, None, torch.tensor([-1.0, 1, 1, 1])))
-    with pytest.raises(InputError, match="Camera rotation: expected finite numbers"):
-        rasterize(*scene.parameters(), CameraParameters(scene.camera, torch.full((6,), torch.nan)))
+    for twist in ([torch.nan] * 6, [0, 0, 6.29, 0, 0, 0], [0, 0, 0, torch.inf, 0, 0]):
+        with pytest.raises(InputError, match="twist: expected finite numbers, of which the rotation vector"):
+            rasterize(*scene.parameters(), CameraParameters(scene.camera, torch.tensor(twist)))
+
+
+@pytest.mark.parametrize("angle", [3.0, 6.283])
+def test_a_turn_is_that_of_scipy(angle):
+    base, axis = SCENES["single"]().camera, np.array([0.48, -0.6, 0.64])
+    twist = torch.tensor([*(angle * axis), 0.1, 0.2, 0.3], dtype=torch.float64)
+    turn = Rotation.from_rotvec(angle * axis).as_matrix()
+    found = CameraParameters(base, twist).camera
+    np.testing.assert_allclose(found.rotation, turn @ base.rotation, atol=1e-10)
+    np.testing.assert_allclose(found.translation, turn @ base.translation + [0.1, 0.2, 0.3], atol=1e-9)
 
 
 CHECKED = [

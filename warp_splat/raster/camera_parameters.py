@@ -19,7 +19,8 @@ from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.runtime.launch import lanes_of, launch_in_lanes, view
 from warp_splat.runtime.sums import in_pairs
 
-TERMS = 16  # of the power series, for turns of up to half a circle
+TERMS = 16  # of the power series: up to half a turn to the last bit, a whole turn to 3e-11
+LONGEST = 2.0 * math.pi  # rotation vector; a longer one says what a shorter one does
 
 
 class CameraParameters:
@@ -33,7 +34,7 @@ class CameraParameters:
         base: the camera to start from.
         twist: where the camera stands relative to ``base``, [6]: a rotation vector w [rad] and a translation v [world
             units], both in the camera's axes and applied on the left of camera_from_world: ``x_camera = exp(w)
-            (rotation @ x_world + translation) + v``. None: a leaf of zeros, float64.
+            (rotation @ x_world + translation) + v``; w is at most a whole turn. None: a leaf of zeros, float64.
         intrinsics: fx, fy, cx, cy [px], [4]. None: a leaf of those of ``base``, float64.
 
     Raises:
@@ -60,6 +61,11 @@ class CameraParameters:
             InputError: if the numbers make none.
         """
         twist = _numbers(self.twist)
+        if not np.isfinite(twist).all() or (twist[:3] * twist[:3]).sum() > LONGEST**2:
+            raise InputError(
+                f"twist: expected finite numbers, of which the rotation vector is at most 2 pi long, got {twist.tolist()}; "
+                "turn the base camera instead."
+            )
         pose = _turned(np.concatenate([self.base.rotation, self.base.translation[:, None]], 1), twist[:3, None], 1)
         fx, fy, cx, cy = _numbers(self.intrinsics)
         return replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, rotation=pose[:, :3], translation=pose[:, 3] + twist[3:])
@@ -72,6 +78,9 @@ def _checked(name: str, tensor: torch.Tensor | None, start: list[float]) -> torc
     if not isinstance(tensor, torch.Tensor) or tensor.shape != (len(start),) or not tensor.is_floating_point():
         got = f"{tensor.dtype} {list(tensor.shape)}" if isinstance(tensor, torch.Tensor) else type(tensor).__name__
         raise InputError(f"{name}: expected a tensor of {len(start)} real numbers, got {got}.")
+    if tensor.layout != torch.strided or tensor.is_meta:
+        kind = "a meta tensor" if tensor.is_meta else tensor.layout
+        raise InputError(f"{name}: expected a dense tensor with numbers, got {kind}; make it with torch.tensor.")
     return tensor
 
 
