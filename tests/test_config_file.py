@@ -33,6 +33,19 @@ def test_every_option_survives_the_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ("--parts random_background --no-random_background", "got --parts random_background; leave one of them out"),
+        ("--parts auto --no-random_background", "got --parts auto; name the parts to use"),
+        ("--parts floaters,floaters", "--parts floaters,floaters: expected each part once, got floaters twice"),
+    ],
+)
+def test_parts_that_contradict_each_other(capsys, flags, sentence):
+    assert main(["train", *flags.split()]) == 1
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("iteratons = 3", "iteratons: no such option; did you mean iterations?"),

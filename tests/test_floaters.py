@@ -70,6 +70,9 @@ def test_it_resumes_to_the_same_bytes(optimizer_type, scene, tmp_path):
 
 def test_without_it_nothing_changes(scene, tmp_path):
     assert choose(TrainConfig(), scene) == ([], [])
+    used, told = choose(TrainConfig(opacity_reg=9.0), scene)
+    assert not used
+    assert told == ["Warning: the part floaters is not used, without which --opacity_reg will change nothing."]
     states = []
     for options in ({}, {"opacity_reg": 9.0}):
         trainer, run = begin(scene, tmp_path, **options)

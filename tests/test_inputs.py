@@ -20,6 +20,7 @@ from splat_files import some_file
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.training.loss import image_loss
+from warp_splat.training.opening import open_scene
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -87,6 +88,15 @@ def test_start_from_a_file(tmp_path, degree):
     save_gaussians(tmp_path / "empty.ply", some_file(0))
     with pytest.raises(InputError, match=r"empty\.ply: expected at least one Gaussian to start from"):
         load(root, start=str(tmp_path / "empty.ply"))
+
+
+def test_a_limit_below_the_points_is_told(tmp_path):
+    root, lines = write_colmap(tmp_path), []
+    config = TrainConfig(source_path=str(root), max_gaussians=5)
+    count = len(open_scene(config, None, lines.append).points)
+    assert lines[-1] == f"Warning: --max_gaussians 5 bounds growth alone; training starts with all {count} points."
+    open_scene(config.changed(max_gaussians=count), None, lines.append)
+    assert "--max_gaussians" not in lines[-1]
 
 
 def seen_targets(monkeypatch, scene, steps, **options):

@@ -25,6 +25,7 @@ from warp_splat.flags import FOREIGN_FLAGS, default_of, flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
+from warp_splat.training.parts import AUTO, PARTS
 
 #: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
 COMMANDS = {
@@ -111,12 +112,17 @@ def parse(arguments: list[str]) -> Any:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
+    given = values
     if values.get("config"):
         from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
 
         values = _over(read_config(values["config"]), values)
     if values.get("start_checkpoint"):
-        return TrainConfig(**_continued(values))
+        values = _continued(values)
+    if config_type is TrainConfig:
+        _check_parts(values.get("parts", ""), given)
+    if values.get("start_checkpoint"):
+        return TrainConfig(**values)
     if config_type is TrainConfig:
         preset = values.get("preset", "")
         defaults = [PRESETS[preset]]
@@ -144,6 +150,19 @@ def _over(kept: dict, given: dict) -> dict:
     """Options of a file, and over them those that are given; ``--no-NAME`` of a part takes it out of the file's."""
     used = [name for name in kept.get("parts", "").split(",") if given.get(name) is not False]
     return {**kept, "parts": ",".join(used), **given}
+
+
+def _check_parts(parts: str, given: dict) -> None:
+    """Raise InputError if a flag takes out a part that ``--parts`` puts in, or if one is named twice."""
+    named = parts.split(",")
+    for name in PARTS:
+        if given.get(name) is False and (name in named or AUTO in named):
+            hint = "name the parts to use" if AUTO in named else "leave one of them out"
+            raise InputError(
+                f"--no-{name}: expected no other word on this part beside it, got --parts {parts}; {hint}."
+            )
+        if named.count(name) > 1:
+            raise InputError(f"--parts {parts}: expected each part once, got {name} twice; leave one out.")
 
 
 def _function_of(config: Any) -> Callable[[Any], int]:

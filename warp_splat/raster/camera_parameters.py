@@ -63,8 +63,8 @@ class CameraParameters:
         twist = _numbers(self.twist)
         if not np.isfinite(twist).all() or (twist[:3] * twist[:3]).sum() > LONGEST**2:
             raise InputError(
-                f"twist: expected finite numbers, of which the rotation vector is at most 2 pi long, got {twist.tolist()}; "
-                "turn the base camera instead."
+                "twist: expected finite numbers, of which the rotation vector is at most 2 pi long, got "
+                f"{twist.tolist()}; turn the base camera instead."
             )
         pose = _turned(np.concatenate([self.base.rotation, self.base.translation[:, None]], 1), twist[:3, None], 1)
         fx, fy, cx, cy = _numbers(self.intrinsics)

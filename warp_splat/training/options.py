@@ -81,7 +81,9 @@ class LearnOptions:
 class GrowOptions:
     """How the set grows; each growth has options of its own."""
 
-    max_gaussians: int = flag(0, "never grow beyond this many (largest gradients first); 0: no limit")
+    max_gaussians: int = flag(
+        0, "never grow beyond this many (largest gradients first), but keep all starting points; 0: no limit"
+    )
 
     growth: str = growing("reference", f"the rules: {', '.join(GROWTHS)}")
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
 
-from warp_splat.flags import learning, rendering
+from warp_splat.flags import default_of, learning, rendering
 from warp_splat.training.seams import Entry
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ PARTS: dict[str, Entry] = {
 
 
 def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
-    """The names of the parts to use, and a sentence for each that ``--parts auto`` has weighed."""
+    """The names of the parts to use, and sentences: on each that ``--parts auto`` has weighed, on idle options."""
     used, told, named = [], [], config.model.parts.split(",")
     for name, entry in PARTS.items():
         if name in named or getattr(config.plugins[name], name, False):
@@ -72,4 +72,11 @@ def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
             verdict = entry.load().needed(scene)
             told.append(f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}.")
             used += [name] * verdict.needed
+        if name not in used and (idle := _changed(config.plugins[name])):
+            told.append(f"Warning: the part {name} is not used, without which {', '.join(idle)} will change nothing.")
     return used, told
+
+
+def _changed(options: Any) -> list[str]:
+    """The flags of a part's options that have not their defaults."""
+    return [f"--{item.name}" for item in fields(options) if getattr(options, item.name) != default_of(item)]
