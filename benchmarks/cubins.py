@@ -17,12 +17,14 @@ from pathlib import Path
 import warp as wp
 from common import write_table
 
-from warp_splat.config import ADJOINTS
+from warp_splat.config import ADJOINTS, STRONGEST_MOST
 from warp_splat.kernels import sh_colors, tiles
 from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.adam import make_adam
+from warp_splat.kernels.cuda import channels
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
+from warp_splat.kernels.cuda.strongest import make_strongest
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.project import adj_camera, affine, ellipsoid
@@ -65,6 +67,12 @@ def modules() -> dict[str, wp.Module]:
             found[f"{mode}{suffix}"] = make_reverse_block(mode, variant).module
         for mode in ADJOINTS[2:]:
             found[f"{mode}{suffix}"] = make_walk_block(mode, variant).module
+    plain = BlendVariant()
+    found["channels"] = channels.make_blend_channels(plain).module
+    for mode in ADJOINTS[:2]:
+        found[f"{mode}, channels"] = channels.make_adj_channels(mode, plain).module
+        found[f"{mode}, weights"] = channels.make_adj_channels(mode, plain, STRONGEST_MOST).module
+    found["strongest"] = make_strongest(plain, STRONGEST_MOST).module
     return found
 
 
