@@ -76,7 +76,10 @@ def cloud(
 def through_lens(seed, count, lens, size, focal, most, sigma=(0.6, 6.0), degree=1):
     """Random Gaussians all around the axis of a camera with a lens, up to ``most`` degrees from it."""
     rng, base = np.random.default_rng(seed), make_camera(*size, fx=focal, fy=1.1 * focal, seed=seed)
-    camera = replace(base, cx=base.cx + 1.3, cy=base.cy - 0.8, lens=lens)
+    middle = {"cx": base.cx + 1.3, "cy": base.cy - 0.8}
+    if lens.model == "EQUIRECTANGULAR":
+        middle = {"cx": size[0] / 2, "cy": size[1] / 2, "fy": focal}
+    camera = replace(base, **middle, lens=lens)
     cosine = rng.uniform(np.cos(np.radians(most)), 1, count)
     around, sine = rng.uniform(0, 2 * np.pi, count), np.sqrt(1 - cosine**2)
     distance = distinct_depths(rng, count, 2, 8)
@@ -215,6 +218,7 @@ SCENES = {
     "subpixel": lambda: cloud(15, 300, make_camera(34, 30), degree=1, sigma=(0.001, 0.5)),
     "huge": huge,
     "opencv": lambda: through_lens(40, 150, OPENCV, (47, 35), 22.0, 75),
+    "panorama": lambda: through_lens(42, 150, Lens("EQUIRECTANGULAR"), (60, 30), 30 / np.pi, 180, sigma=(0.6, 4.0)),
     "fisheye": lambda: through_lens(41, 200, FISHEYE, (45, 43), 13.0, 180),
     "faint": faint,
     "empty": empty,

@@ -1,10 +1,17 @@
-"""Lenses: the formulas against COLMAP's, their inverse, and where they fold."""
+"""Lenses: formulas against COLMAP's, their inverse and their derivatives, where they fold, a panorama's seam."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
+import torch
+from scipy.spatial.transform import Rotation
 
+from warp_splat import Camera, CameraParameters, InputError, RasterOptions, rasterize
+from warp_splat.kernels.formula import Notes, Number
 from warp_splat.lenses import Lens
-from warp_splat.lenses.formulas import MODELS
+from warp_splat.lenses.formulas import MODELS, PINHOLE
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -49,3 +56,93 @@ def test_what_a_lens_shows_is_found_again(model):
     lens = LENSES[model]
     rays = directions(0.98 * lens.limit, least_z=-1 if lens.family.wide else 0.05)
     np.testing.assert_allclose(lens.undistorted(lens.distorted(rays)), rays, atol=1e-7)
+
+
+#: The words of kernels, in NumPy.
+WORDS = {
+    "times": np.multiply,
+    "fma": lambda a, b, c: a * b + c,
+    "inverse": lambda a: 1 / a,
+    "root": np.sqrt,
+    "angle": np.arctan2,
+    "less": np.less,
+    "pick": np.where,
+    "fill": lambda value, like: np.full_like(like, value),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_derivatives_that_are_written_down_are_those_of_the_formula(model):
+    lens = LENSES[model]
+    x, y, z = directions(0.95 * lens.limit, least_z=-1 if lens.family.wide else 0.1)[3:].T * 3.0
+    notes = Notes()
+    one = notes.given("1.0").name
+    variables = [Number(notes, "xyz"[i], tuple(one if i == j else None for j in range(3))) for i in range(3)]
+    u, v = lens.family.formula([notes.given(f"k[{i}]") for i in range(lens.family.count)], *variables)
+    known = {**WORDS, "k": lens.numbers, "x": x, "y": y, "z": z}
+    names = [notes.real(name) for name in (u.name, v.name, *u.slopes, *v.slopes)]
+    exec("\n".join(notes.lines(names, "x")), known)
+    found = np.stack([known[name] for name in names])
+    step = 1e-6
+    places = lens.distorted(np.stack([x, y, z], 1)).T
+    np.testing.assert_allclose(found[:2], places, atol=1e-12)
+    for axis in range(3):
+        ahead, back = (np.stack([x, y, z], 1) + side * step * np.eye(3)[axis] for side in (1, -1))
+        wanted = (lens.distorted(ahead) - lens.distorted(back)).T / (2 * step)
+        np.testing.assert_allclose(found[[2 + axis, 5 + axis]], wanted, rtol=1e-6, atol=1e-7)
+
+
+def test_a_panorama_that_turns_is_a_picture_that_rolls(device):
+    """At the seam nothing is lost and nothing is there twice."""
+    scene = scenes.SCENES["panorama"]().to(device)
+    camera, columns = scene.camera, 23
+    turn = Rotation.from_euler("y", 2 * np.pi * columns / camera.width).as_matrix()
+    turned = replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation)
+    options = RasterOptions(alpha_min=1e-6)
+    still, rolled = (rasterize(*scene.parameters(), view, options=options) for view in (camera, turned))
+    assert (still.image - still.image.roll(1, 1)).abs().max() > 0.1
+    torch.testing.assert_close(rolled.image.roll(-columns, 1), still.image, rtol=0, atol=2e-3)
+    assert (rolled.image.roll(-columns, 1) - still.image).abs().mean() < 1e-5
+
+
+def picture(model="OPENCV", coefficients=(0.1, 0.0, 0.0, 0.0), size=(40, 30), focal=20.0):
+    width, height = size
+    place = (width, height, focal, focal, width / 2, height / 2, np.eye(3), np.zeros(3))
+    return Camera(*place, lens=Lens(model, coefficients))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"model": "ORTHO"}, "Lens model: expected one of SIMPLE_RADIAL, .*, got 'ORTHO'"),
+        ({"coefficients": (0.1, 0.2)}, r"Lens OPENCV: expected 4 finite coefficients, got \(0.1, 0.2\)"),
+        ({"coefficients": (0.1, 0.2, 0.0, np.nan)}, "expected 4 finite coefficients"),
+        ({"coefficients": (-0.5, 0.0, 0.0, 0.0)}, "Camera lens OPENCV: expected .* fold it 39 degrees from the axis"),
+        (
+            {"model": "OPENCV_FISHEYE", "coefficients": (-0.5, 0.0, 0.0, 0.0), "focal": 9.0},
+            "Camera lens OPENCV_FISHEYE: expected .* fold it 47 degrees",
+        ),
+        ({"model": "EQUIRECTANGULAR", "coefficients": ()}, "expected a picture of 2:1 .*, got 114.6 x 85.9 degrees"),
+    ],
+)
+def test_what_is_no_lens_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        picture(**arguments)
+
+
+def test_what_knows_no_lenses_refuses_them():
+    scene, camera = scenes.SCENES["single"](), picture()
+    with pytest.raises(InputError, match=r"options\.projection: expected affine or unscented for a camera with a lens"):
+        rasterize(*scene.parameters(), camera, options=RasterOptions(projection="ellipsoid"))
+    with pytest.raises(InputError, match="base: expected a camera without distortion, got one with OPENCV"):
+        CameraParameters(camera)
+    with pytest.raises(InputError, match=r"Camera lens: expected a warp_splat\.Lens or None, got 3"):
+        replace(camera, lens=3)
+
+
+def test_a_lens_without_distortion_is_a_pinhole(device):
+    scene = scenes.SCENES["degree1"]().to(device)
+    bent = replace(scene.camera, lens=Lens("OPENCV", (0.0, 0.0, 0.0, 0.0)))
+    pinhole, drawn = (rasterize(*scene.parameters(), camera) for camera in (scene.camera, bent))
+    assert PINHOLE.count == 0 and bent.lens.limit == np.pi / 2
+    torch.testing.assert_close(drawn.image, pinhole.image, rtol=0, atol=1e-5)

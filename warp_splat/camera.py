@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,8 +91,11 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """The largest angle between the axis and what a pixel sees [rad], of a camera with a lens."""
-        return angle_of_view(self.lens, *self._picture)
+        """The largest angle between the axis and what a pixel sees [rad]."""
+        left, top, right, bottom = self._picture
+        if self.lens:
+            return angle_of_view(self.lens, left, top, right, bottom)
+        return math.atan(math.hypot(max(-left, right), max(-top, bottom)))
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions in the camera [P, 3] that are seen at ``pixels`` [P, 2]; NaN where the lens sees none."""

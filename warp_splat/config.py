@@ -36,7 +36,7 @@ PORT_HELP = "of the viewer; if it is busy, the next free one"
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
 
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
-PROJECTIONS = ("affine", "ellipsoid")  # files of kernels/project; see RasterOptions, as for all that follow
+PROJECTIONS = ("affine", "ellipsoid", "unscented")  # files of kernels/project; see RasterOptions, as all that follow
 EXTENTS = ("ellipse", "square")
 LOSS_SPACES = ("srgb", "log")
 OPTIMIZERS = ("default", "sparse_adam")
@@ -57,7 +57,8 @@ class RasterOptions:
         antialiasing: scale each opacity by the share of its area that the low-pass filter added (Mip-Splatting, Yu
             et al. 2024), so that small Gaussians do not grow brighter; by no less than 0.005, as in the reference.
         projection: "affine" (EWA splatting, Zwicker et al. 2001: linearized at the mean) or "ellipsoid" (the exact
-            outline of an ellipsoid instead of the Gaussian; Qi, Cai and Han 2024), or your own; see docs/extending.md.
+            outline of an ellipsoid instead of the Gaussian; Qi, Cai and Han 2024; not of a camera with a lens) or
+            "unscented" (seven points through the lens; Wu et al. 2025), or your own; see docs/extending.md.
         alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips nothing.
         t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 means 1e-30.
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.

@@ -5,51 +5,118 @@ import math
 import torch
 
 FIELD = 1.3  # of the angle of view: beyond, a lens that is not wide is continued as straight as it is there
-WIDE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR")
+AROUND = "EQUIRECTANGULAR"
+WIDE = ("OPENCV_FISHEYE", AROUND)
+WIDEST = 0.4  # of a panorama's width: no standard deviation is larger
+NEAR = 0.2  # points of a Gaussian are seen as if no nearer
 
 
 def bend(rays, lens):
-    """Where points [N, 3] in the camera are seen, in focal lengths from the principal point, [N, 2]."""
-    x, y, z = rays.unbind(1)
-    if lens.model == "EQUIRECTANGULAR":
-        return torch.stack([torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())], 1)
+    """Where points [..., 3] in the camera are seen, in focal lengths from the principal point, [..., 2]."""
+    x, y, z = rays.unbind(-1)
+    if lens is None:
+        return torch.stack([x / z, y / z], -1)
+    if lens.model == AROUND:
+        return torch.stack([torch.atan2(x, z), torch.atan2(y, (x * x + z * z).sqrt())], -1)
     if lens.model == "OPENCV_FISHEYE":
         radius = (x * x + y * y).sqrt()
         theta = torch.atan2(radius, z)
         length = theta + sum(k * theta ** (2 * i + 3) for i, k in enumerate(lens.coefficients))
-        return rays[:, :2] * (length / radius)[:, None]
+        return rays[..., :2] * (length / radius)[..., None]
     if lens.model == "OPENCV":
         k1, k2, p1, p2 = lens.coefficients
         x, y = x / z, y / z
         r2 = x * x + y * y
         radial = 1 + k1 * r2 + k2 * r2**2
         return torch.stack(
-            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y], 1
+            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y], -1
         )
     raise NotImplementedError(lens.model)
 
 
 def depths_of(points, lens):
     """What Gaussians are ordered by [N], and whether the lens sees them [N]."""
-    if lens.model not in WIDE:
-        return points[:, 2], points[:, 2] > 0
-    distance = points.norm(dim=1)
-    return distance, points[:, 2] > math.cos(lens.limit) * distance
+    if not is_wide(lens):
+        return points[..., 2], points[..., 2] > 0
+    distance = points.norm(dim=-1)
+    return distance, points[..., 2] > math.cos(lens.limit) * distance
+
+
+def is_wide(lens):
+    """Whether it sees beside and behind the camera."""
+    return lens is not None and lens.model in WIDE
+
+
+def held_in_view(points, camera):
+    """Points [..., 3] no farther from the axis than the lens is followed, and by how much those beyond are, [...]."""
+    if is_wide(camera.lens):
+        return points, torch.ones_like(points[..., 2])
+    slope = points[..., :2].norm(dim=-1) / points[..., 2]
+    most = min(FIELD * math.tan(camera.reach), math.tan(camera.lens.limit) if camera.lens else math.inf)
+    excess = (slope / most).clamp_min(1)
+    return torch.cat([points[..., :2] / excess[..., None], points[..., 2:]], -1), excess
+
+
+def on_image(points, camera):
+    """Where points [..., 3] in the camera are seen, [..., 2] px."""
+    held, excess = held_in_view(points, camera)
+    focal, middle = torch.tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]], dtype=torch.float64)
+    return focal * bend(held, camera.lens) * excess[..., None] + middle
 
 
 def seen(points, camera):
     """Means [N, 2] px of points in the camera [N, 3], and the derivatives [N, 2, 3] px per world unit."""
-    held = points.clone()
-    if camera.lens.model not in WIDE:
-        slope = points[:, :2].norm(dim=1) / points[:, 2]
-        most = math.tan(min(FIELD * camera.reach, camera.lens.limit))
-        shrunk = torch.where(slope > most, most / slope, torch.ones_like(slope))
-        held = torch.cat([points[:, :2] * shrunk[:, None], points[:, 2:]], 1)
+    held, _ = held_in_view(points.clone(), camera)
     wanted = held.requires_grad
     held = held if wanted else held.requires_grad_()
-    focal, middle = torch.tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]], dtype=torch.float64)
-    means = focal * bend(held, camera.lens) + middle
-    rows = [torch.autograd.grad(column.sum(), held, create_graph=True)[0] for column in means.unbind(1)]
+    focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
+    places = focal * bend(held, camera.lens)
+    rows = [torch.autograd.grad(column.sum(), held, create_graph=True)[0] for column in places.unbind(1)]
     jacobian = torch.stack(rows, 1)
-    means = means + (jacobian @ (points - held)[:, :, None])[:, :, 0]
-    return (means, jacobian) if wanted else (means.detach(), jacobian.detach())
+    return on_image(points, camera), jacobian if wanted else jacobian.detach()
+
+
+def narrowed(covariances, camera):
+    """Covariances [N, 2, 2] px^2, those wider than a panorama shows held at that width."""
+    if camera.lens.model != AROUND:
+        return covariances
+    shrunk = (WIDEST * camera.width / covariances[:, 0, 0].sqrt()).clamp_max(1)
+    factors = torch.stack([shrunk, torch.ones_like(shrunk)], 1)
+    return factors[:, :, None] * covariances * factors[:, None, :]
+
+
+def unscented(points, axes, camera):
+    """Means [N, 2] px and covariances [N, 2, 2] px^2 of Gaussians around ``points``, by Wu et al. 2025, section 4.1.
+
+    Args:
+        points: [N, 3] in the camera.
+        axes: [N, 3, 3], columns: the Gaussian's axes in the camera, a standard deviation long.
+        camera: that looks at them.
+    """
+    alpha, beta, kappa, n = 1.0, 2.0, 0.0, 3
+    scale = alpha**2 * (n + kappa) - n
+    offsets = ((n + scale) ** 0.5 * axes).transpose(1, 2)
+    sigma_points = torch.cat([points[:, None], points[:, None] + offsets, points[:, None] - offsets], 1)  # [N, 7, 3]
+    if is_wide(camera.lens):
+        _, visible = depths_of(sigma_points, camera.lens)
+        sigma_points = torch.where(visible[..., None], sigma_points, points[:, None])
+    else:
+        nearest = torch.cat([sigma_points[..., :2], sigma_points[..., 2:].clamp_min(NEAR)], -1)
+        sigma_points = nearest
+    places = on_image(sigma_points, camera)
+    if camera.lens is not None and camera.lens.model == AROUND:
+        turns = ((places[..., 0] - places[:, :1, 0]) / camera.width).detach().round()
+        places = torch.stack([places[..., 0] - camera.width * turns, places[..., 1]], -1)
+    weights = torch.full((7,), 0.5 / (n + scale), dtype=torch.float64)
+    of_mean, of_covariance = weights.clone(), weights.clone()
+    of_mean[0] = scale / (n + scale)
+    of_covariance[0] = scale / (n + scale) + 1 - alpha**2 + beta
+    mean = (of_mean[:, None] * places).sum(1)
+    off = places - mean[:, None]
+    return mean.clone(), torch.einsum("p,npi,npj->nij", of_covariance, off, off)
+
+
+def with_copies(means2d, camera):
+    """Means [3 N, 2] px of what shows once more, a turn to the left and to the right."""
+    shift = torch.tensor([[camera.width, 0]], dtype=torch.float64)
+    return torch.cat([means2d, means2d + shift, means2d - shift])

@@ -155,12 +155,15 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
     if projection == "ellipsoid":
         live = live & (z**2 > OUTLINE_REACH**2 * sigma[:, 2, 2])
         means2d, sharp = outlines(points, sigma, live, camera)
+    elif projection == "unscented":
+        axes = world_to_camera @ rotation_matrices(quats) * scales[:, None]
+        means2d, sharp = exact_lenses.unscented(points, axes, camera)
+    elif camera.lens:
+        means2d, to_pixels = exact_lenses.seen(points, camera)
+        sharp = exact_lenses.narrowed(to_pixels @ sigma @ to_pixels.transpose(1, 2), camera)
     else:
-        if camera.lens:
-            means2d, to_pixels = exact_lenses.seen(points, camera)
-        else:
-            means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
-            to_pixels = jacobians(points, camera)
+        means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+        to_pixels = jacobians(points, camera)
         sharp = to_pixels @ sigma @ to_pixels.transpose(1, 2)
     cov2d = sharp + BLUR * torch.eye(2, dtype=torch.float64)
     opacity = opacities
@@ -241,7 +244,10 @@ def exact_render(
     shape = (camera.height, camera.width) if pixels is None else (len(pixels),)
     if pixels is None:
         pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width))
-    splats = exact_splats(means, quats, scales, opacities, sh, camera, **view)
+    once = splats = exact_splats(means, quats, scales, opacities, sh, camera, **view)
+    if camera.lens and camera.lens.model == exact_lenses.AROUND:
+        again = {name: torch.cat([getattr(once, name)] * 3) for name in once.__dataclass_fields__}
+        splats = Splats(**{**again, "means2d": exact_lenses.with_copies(once.means2d, camera)})
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]
@@ -264,11 +270,11 @@ def exact_render(
         image=image.reshape(*shape, 3),
         alpha=(1 - through[:, -1]).reshape(shape),
         depth=depth.reshape(shape),
-        means2d=splats.means2d,
+        means2d=once.means2d,
         fragile=fragile.reshape(shape),
-        touches=touches,
-        near_image=near_image,
-        reach=reach,
+        touches=touches.reshape(-1, len(means)).any(0),
+        near_image=near_image.reshape(-1, len(means)).any(0),
+        reach=reach[: len(means)],
         order=order,
         weights=weight.reshape(*shape, len(order)),
         z=splats.z,

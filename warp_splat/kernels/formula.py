@@ -167,6 +167,14 @@ def _less(notes: Notes, a: Number, b: Number) -> Number:
     return Number(notes, notes.note("less", notes.real(a.name), notes.real(b.name)), (None,) * len(a.slopes))
 
 
+def _floor(notes: Notes, a: Number) -> Number:
+    return Number(notes, notes.note("rounded_down", notes.real(a.name)), (None,) * len(a.slopes))
+
+
+def _floor(notes: Notes, a: Number) -> Number:
+    return Number(notes, notes.note("rounded_down", notes.real(a.name)), (None,) * len(a.slopes))
+
+
 #: What formulas may use besides ``np.where``.
 RULES = {
     np.add: _add,
@@ -177,6 +185,8 @@ RULES = {
     np.sqrt: _sqrt,
     np.arctan2: _arctan2,
     np.less: _less,
+    np.floor: _floor,
+    np.floor: _floor,
     np.greater: lambda notes, a, b: _less(notes, b, a),
 }
 

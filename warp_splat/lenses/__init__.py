@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.lenses.formulas import MODELS, Family
+from warp_splat.lenses.formulas import MODELS, Family, ray_at
 
 STEPS = 2048  # of the angle from the axis, in which a lens is looked through
 DIRECTIONS = 16  # around the axis
@@ -71,6 +71,8 @@ class Lens:
         By Newton's method on what the lens makes of a ray, from where the lens alone around its axis would see it.
         """
         places = np.asarray(places, np.float64)
+        if self.family.around:
+            return np.stack(ray_at(*places.T), 1)
         angles, radii = self._profile
         far = np.hypot(*places.T)
         start = np.interp(far, radii, angles) / np.where(far > 0, far, 1)
@@ -99,14 +101,12 @@ class Lens:
 
         In steps of half the circle, so that rounding does not move it.
         """
-        return float(self._profile[0][-1]) if len(self._profile[0]) < self._most else self._end
-
-    @property
-    def _end(self) -> float:
-        return math.pi if self.family.wide else 0.5 * math.pi
+        angles = self._profile[0]
+        return math.pi / STEPS * (self._most if len(angles) == self._most or self.family.around else len(angles) - 1)
 
     @property
     def _most(self) -> int:
+        """Steps to straight behind, or to the side."""
         return STEPS if self.family.wide else STEPS // 2
 
     @functools.cached_property

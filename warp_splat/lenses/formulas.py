@@ -28,12 +28,14 @@ class Family:
         count: of the coefficients ``k``; a model's are filled up with zeros.
         wide: it shows what lies beside and behind the camera as well. Depth is then the distance.
         prepare: from the model's coefficients to those of the formula.
+        around: a panorama: what leaves the picture at its left comes in at its right, and nothing folds.
     """
 
     formula: Callable[[Sequence, object, object, object], tuple]
     count: int
     wide: bool
     prepare: Callable[..., tuple[float, ...]] = lambda *coefficients: coefficients
+    around: bool = False
 
 
 def pinhole(_k, x, y, z):
@@ -110,6 +112,12 @@ def equirectangular(_k, x, y, z):
     return np.arctan2(x, z), np.arctan2(y, np.sqrt(x * x + z * z))
 
 
+def ray_at(longitude, latitude):
+    """The unit direction that :func:`equirectangular` shows there."""
+    across = np.cos(latitude)
+    return across * np.sin(longitude), np.sin(latitude), across * np.cos(longitude)
+
+
 def _tangential(u, v, x, y, r2, p1, p2):
     return u + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), v + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
 
@@ -134,7 +142,7 @@ PINHOLE = Family(pinhole, 0, False)
 PERSPECTIVE = Family(perspective, 8, False)
 FISHEYE = Family(fisheye, 4, True)
 DIVISION = Family(division, 1, True)
-EQUIRECTANGULAR = Family(equirectangular, 0, True)
+EQUIRECTANGULAR = Family(equirectangular, 0, True, around=True)
 
 #: The family of each model, and how many coefficients the model has.
 MODELS: dict[str, tuple[Family, int]] = {

@@ -28,6 +28,7 @@ from warp_splat.raster.checks import (
 from warp_splat.raster.data import Dropped, Gaussians, Walk
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
+from warp_splat.raster.seam import around, find_crossing
 from warp_splat.runtime.timers import stage
 
 
@@ -176,14 +177,16 @@ def render(
         splats = project(gaussians, camera, options, driver, dropped)
     seen = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
     with stage("bin"):
-        bins = driver.bin(splats, seen, options)
+        crossing = find_crossing(splats, seen)
+        drawn = around(splats, seen, crossing)
+        bins = driver.bin(drawn, seen, options)
     with stage("blend"):
-        image, alpha, depth = blend(splats, bins, background, seen, options, adjoint, driver, dropped, walk)
+        image, alpha, depth = blend(drawn, bins, background, seen, options, adjoint, driver, dropped, walk)
     more = {}
     if features is not None or options.normals or options.median_depth or options.strongest:
         with stage("channels"):
             blended = Blended(bins, walk, seen, options, adjoint, driver, dropped)
-            more = blend_beside(features, gaussians, splats, camera, blended)
+            more = blend_beside(features, gaussians, drawn, camera, blended, crossing)
     all_valid = isinstance(bins.invalid, int) and not bins.invalid  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,

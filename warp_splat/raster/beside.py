@@ -19,6 +19,7 @@ from warp_splat.kernels.slots import CHANNEL
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Bins, Dropped, Gaussians, Splats2D, Walk, variant_of
 from warp_splat.raster.drivers import Driver
+from warp_splat.raster.seam import Crossing, with_copies
 from warp_splat.runtime.launch import available_memory, view
 from warp_splat.runtime.timers import stage
 
@@ -52,8 +53,12 @@ def blend_beside(
     splats: Splats2D,
     camera: Camera | CameraParameters,
     blended: Blended,
+    crossing: Crossing,
 ) -> dict[str, torch.Tensor]:
-    """What is asked for beside the color, by its name in :class:`warp_splat.RenderOutput`."""
+    """What is asked for beside the color, by its name in :class:`warp_splat.RenderOutput`.
+
+    ``splats`` have copies of the Gaussians that cross the seam of a panorama (:mod:`.seam`).
+    """
     channels, found, options = {}, {}, blended.options
     if features is not None:
         channels["features"] = features
@@ -62,11 +67,15 @@ def blend_beside(
     if channels:
         widths = [channel.shape[1] for channel in channels.values()]
         together = torch.cat(list(channels.values()), 1) if len(channels) > 1 else next(iter(channels.values()))
+        together = with_copies(together, crossing)
         found |= zip(channels, blend_channels(splats, together, blended).split(widths, 2), strict=True)
     if options.strongest or options.median_depth:
         strongest = find_strongest(splats, blended)
         if options.strongest:
-            found |= {"strongest": strongest.gaussians, "strongest_weights": strongest.weights}
+            owners = with_copies(torch.arange(len(gaussians.means), device=splats.means2d.device), crossing)
+            numbers = strongest.gaussians
+            numbers = torch.where(numbers < 0, numbers, owners[numbers]) if crossing else numbers
+            found |= {"strongest": numbers, "strongest_weights": strongest.weights}
         if options.median_depth:
             found["median_depth"] = strongest.median_depth
     return found

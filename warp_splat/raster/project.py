@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
+from warp_splat.errors import InputError
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.lens import LIMIT
@@ -51,23 +52,34 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
     cam.antialiasing = int(options.antialiasing)
     cam.alpha_min = options.alpha_min
-    if camera.lens:
-        cam.lens = vec16(*camera.lens.numbers, *[0.0] * (LIMIT - len(camera.lens.numbers)), lens_limit(camera))
+    if camera.lens or options.projection == "unscented":
+        numbers = camera.lens.numbers if camera.lens else ()
+        cam.lens = vec16(*numbers, *[0.0] * (LIMIT - len(numbers)), lens_limit(limits))
     return cam
 
 
 def lens_limit(camera: Camera) -> float:
-    """How far from the axis kernels follow the camera's lens."""
-    if camera.lens.family.wide:
+    """How far from the axis kernels follow the camera's lens: a cosine if it is wide, else a tangent."""
+    if camera.lens and camera.lens.family.wide:
         return math.cos(camera.lens.limit)
-    return math.tan(min((1.0 + FRUSTUM_MARGIN) * camera.reach, camera.lens.limit))
+    slope = (1.0 + FRUSTUM_MARGIN) * math.tan(camera.reach)
+    return min(slope, math.tan(camera.lens.limit)) if camera.lens else slope
 
 
 def projection_of(options: RasterOptions, lens: Lens | None = None) -> Projection:
-    """The user's own, or that of the file of that name, through the lens if there is one."""
+    """The user's own, or that of the file of that name, through the lens if there is one.
+
+    Raises:
+        InputError: if it knows no lenses.
+    """
     if isinstance(options.projection, Projection):
         return options.projection
     module = importlib.import_module(f"warp_splat.kernels.project.{options.projection}")
+    if lens and not hasattr(module, "through"):
+        raise InputError(
+            f"options.projection: expected affine or unscented for a camera with a lens, got {options.projection}; "
+            "choose one of them, or undistort the photographs."
+        )
     return module.through(lens.family) if lens else module.PROJECTION
 
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
-from warp_splat.config import RasterOptions, RenderConfig
+from warp_splat.config import PROJECTIONS, RasterOptions, RenderConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.perceptual import choose_metrics
@@ -124,7 +124,7 @@ def options_of(trained: dict) -> RasterOptions:
     """How a model is rendered that was trained with these options."""
     return RasterOptions(
         antialiasing=bool(trained.get("antialiasing")),
-        projection="ellipsoid" if trained.get("projection") == "ellipsoid" else "affine",
+        projection=str(trained["projection"]) if trained.get("projection") in PROJECTIONS else "affine",
     )
 
 

@@ -1,8 +1,11 @@
 """A lens with distortion: its formula as a projection, and its own derivative where EWA splatting is linear.
 
 Wide lenses show what lies beside and behind the camera, by its distance, up to the angle where they fold or end.
-Others show what lies in front of it. Beyond the limit of their field of view they are continued as straight as they are
-there: so nothing folds back into the picture, nor grows without bounds, and what is large still reaches in.
+Others show what lies in front of it. Beyond the limit of their field of view they are continued in proportion: so
+nothing folds back into the picture, nor grows without bounds, and what is large still reaches in.
+
+A panorama ends where it begins. A Gaussian near a pole is as wide as the picture or wider. It is held at a width whose
+copies, a turn to either side (:mod:`warp_splat.raster.seam`), add up to almost the same at all longitudes.
 """
 
 import functools
@@ -17,6 +20,8 @@ from warp_splat.lenses.formulas import Family
 
 LIMIT = 15  # place in CameraView.lens: cosine of the angle where a wide lens ends, tangent of that of another
 NOWHERE = -1.0e9  # px, of what a lens does not show: no Gaussian reaches from there
+WIDEST = 0.4  # of a panorama's width, a standard deviation: three copies add up to 1 within 9 %
+OUTLINE = ("z", "px", "py", "a10", "a11", "a12", "a20", "a21", "a22", "t0", "t1", "t2", "sx", "sy", "sz", "drawn")
 
 
 @functools.cache
@@ -26,45 +31,55 @@ def through(family: Family) -> Projection:
     @functools.cache
     def make_lens(lanes: int) -> wp.Function:
         notes = Notes()
-        place, slopes = seen_at(notes, family, *(Number(notes, name) for name in "xyz"))
-        rows = [
-            sum(
-                slope * Number(notes, notes.note("turn", "camera", str(axis), str(column), "z"))
-                for axis, slope in enumerate(row)
-            )
-            for row in slopes
+        place, slopes, seen = image_of(notes, family, *(Number(notes, name) for name in "xyz"))
+        place = [np.where(seen, number, NOWHERE) for number in place] if family.wide else place
+        turns = [
+            [Number(notes, notes.note("turn", "camera", str(axis), str(column), "z")) for axis in range(3)]
             for column in range(3)
         ]
+        rows = [sum(slope * entry for slope, entry in zip(row, turn, strict=True)) for row in slopes for turn in turns]
         return write_function(f"{family.formula.__name__}_lens", notes, "xyz", [*place, *rows], lanes)
 
-    return Projection(make_lens, wide=family.wide)
+    return Projection(make_lens, make_narrow if family.around else None, family.wide)
 
 
-def seen_at(notes: Notes, family: Family, x: Number, y: Number, z: Number) -> tuple[Sequence, Sequence]:
-    """Where a point of the camera is seen [px], and the derivative of that [2][3]."""
+def image_of(notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True) -> tuple:
+    """Where a point of the camera is seen [px], the derivative of that [2][3] if asked for, and whether it is seen."""
     limit, one = notes.given(f"camera.lens[{LIMIT}]"), notes.given("1.0")
+    seen, excess = one, one
     if family.wide:
         seen = limit * np.sqrt(x * x + y * y + z * z) < z
         x, y, z = np.where(seen, x, 0.0), np.where(seen, y, 0.0), np.where(seen, z, 1.0)
-        held = x, y
     else:
-        beyond = limit * limit * (z * z) < x * x + y * y
-        shrunk = np.where(beyond, limit * z / np.sqrt(np.where(beyond, x * x + y * y, 1.0)), 1.0)
-        held = shrunk * x, shrunk * y
+        across = x * x + y * y
+        beyond = limit * limit * (z * z) < across
+        shrunk = np.where(beyond, limit * z / np.sqrt(np.where(beyond, across, 1.0)), 1.0)
+        x, y, excess = shrunk * x, shrunk * y, 1.0 / shrunk
     variables = [
-        Number(notes, number.name, tuple(one.name if axis == other else None for other in range(3)))
-        for axis, number in enumerate((*held, z))
+        Number(notes, number.name, _unit(axis, one.name) if linear else ()) for axis, number in enumerate((x, y, z))
     ]
     coefficients = [notes.given(f"camera.lens[{index}]") for index in range(family.count)]
     found, slopes = [], []
     for axis, place in enumerate(family.formula(coefficients, *variables)):
         focal, middle = (notes.given(f"camera.{name}[{axis}]") for name in ("focal", "principal"))
-        row = [focal * Number(notes, slope) for slope in place.slopes]
-        place = focal * Number(notes, place.name) + middle
-        if family.wide:
-            place = np.where(seen, place, NOWHERE)
-        else:
-            place = place + row[0] * (x - held[0]) + row[1] * (y - held[1])
-        found.append(place)
-        slopes.append(row)
-    return found, slopes
+        slopes.append([focal * Number(notes, slope) for slope in place.slopes])
+        found.append(focal * (Number(notes, place.name) * excess) + middle)
+    return found, slopes, seen
+
+
+def _unit(axis: int, one: str | None) -> tuple[str | None, ...]:
+    return tuple(one if axis == other else None for other in range(3))
+
+
+@functools.cache
+def make_narrow(lanes: int) -> wp.Function:
+    """The outline of what a panorama shows: no wider than WIDEST."""
+    notes = Notes()
+    given = {name: Number(notes, name) for name in OUTLINE}
+    row = [given[f"a1{axis}"] for axis in range(3)]
+    square, most = sum(a * a for a in row), WIDEST * notes.given("camera.size[0]")
+    wider = most * most < square
+    shrunk = np.where(wider, most / np.sqrt(np.where(wider, square, 1.0)), 1.0)
+    given |= {f"a1{axis}": shrunk * a for axis, a in enumerate(row)}
+    results: Sequence = [given[name] for name in OUTLINE[1:9]]
+    return write_function("narrow", notes, OUTLINE, [*results, given["drawn"]], lanes)
