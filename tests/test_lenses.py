@@ -146,3 +146,16 @@ def test_a_lens_without_distortion_is_a_pinhole(device):
     pinhole, drawn = (rasterize(*scene.parameters(), camera) for camera in (scene.camera, bent))
     assert PINHOLE.count == 0 and bent.lens.limit == np.pi / 2
     torch.testing.assert_close(drawn.image, pinhole.image, rtol=0, atol=1e-5)
+
+
+def test_channels_cross_the_seam(device):
+    scene = scenes.SCENES["panorama"]().to(device)
+    features = torch.rand(len(scene.means), 3, generator=torch.Generator().manual_seed(1)).to(device).requires_grad_()
+    out = rasterize(*scene.parameters(), scene.camera, features=features, options=RasterOptions(strongest=1))
+    colors = rasterize(
+        *scene.parameters()[:4], ((features.detach() - 0.5) / 0.28209479177387814)[:, None], scene.camera
+    )
+    torch.testing.assert_close(out.features, colors.image, rtol=0, atol=1e-5)
+    assert out.strongest.max() < len(scene.means) and (out.strongest[:, [0, -1]] >= 0).any()
+    out.features.sum().backward()
+    assert features.grad.sum() == pytest.approx(3 * float(out.alpha.sum()), rel=1e-4)
