@@ -26,6 +26,7 @@ LAYERS = [
 SAME_MEANING = {
     "command",  # what runs a command, in the folder of each
     "blend",  # its kernels, its drivers, its torch function
+    "through",  # a projection through a family of lenses
     "project",  # likewise
     "rasterize",  # of torch, on a tape
 }

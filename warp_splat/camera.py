@@ -97,6 +97,11 @@ class Camera:
             return angle_of_view(self.lens, left, top, right, bottom)
         return math.atan(math.hypot(max(-left, right), max(-top, bottom)))
 
+    def pixels(self, rays: np.ndarray) -> np.ndarray:
+        """Where directions in the camera [P, 3] are seen [P, 2]; NaN where none is; a pinhole divides by z."""
+        places = self.lens.distorted(rays) if self.lens else rays[:, :2] / rays[:, 2:]
+        return places * (self.fx, self.fy) + (self.cx, self.cy)
+
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions in the camera [P, 3] that are seen at ``pixels`` [P, 2]; NaN where the lens sees none."""
         places = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]

@@ -99,6 +99,7 @@ def gains_of(scene: Scene) -> Gains:
     for view in scene.train:
         if seen := scene.tracks.get(view.name):
             camera = view.camera
-            places = (seen.slopes * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / (camera.width, camera.height)
+            rays = np.concatenate([seen.slopes, np.ones_like(seen.slopes[:, :1])], 1)
+            places = np.nan_to_num(camera.pixels(rays), nan=-1.0) / (camera.width, camera.height)
             samples[view.name] = take_sample(view.image, seen.ids, places)
     return fit_gains(samples)

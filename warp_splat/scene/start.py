@@ -55,8 +55,8 @@ def _along_rays(cameras: list[Camera], extent: float, random: np.random.Generato
         x = (pixels[mine, 0] * camera.width - camera.cx) / camera.fx
         y = (pixels[mine, 1] * camera.height - camera.cy) / camera.fy
         ahead = np.stack([x, y, np.ones_like(x)], 1)
-        if camera.lens:
-            ahead = np.nan_to_num(camera.lens.undistorted(ahead[:, :2]))  # at the camera, where it sees nothing
+        if camera.lens:  # at the camera, where it sees nothing
+            ahead = np.nan_to_num(camera.lens.undistorted(ahead[:, :2]))
         seen = ahead * depths[mine, None] - camera.translation
         points[mine] = (seen[:, :, None] * camera.rotation).sum(1)
     return points

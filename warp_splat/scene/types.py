@@ -16,11 +16,7 @@ def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Which of ``points`` [P, 3] show inside the camera's image, [P] bool: of a pinhole, those in front of it."""
     x, y, z = (camera.rotation[:, :, None] * points.T).sum(1) + camera.translation[:, None]
     if camera.lens:
-        u, v = camera.lens.distorted(np.stack([x, y, z], 1)).T
-        px, py = (
-            camera.fx * u + camera.cx,
-            camera.fy * v + camera.cy,
-        )  # NaN, and so outside, where the lens sees nothing
+        px, py = camera.pixels(np.stack([x, y, z], 1)).T  # NaN, and so outside, where the lens sees nothing
         return (px >= 0) & (px <= camera.width) & (py >= 0) & (py <= camera.height)
     in_width = (x * camera.fx + z * camera.cx >= 0) & (x * camera.fx + z * camera.cx <= z * camera.width)
     in_height = (y * camera.fy + z * camera.cy >= 0) & (y * camera.fy + z * camera.cy <= z * camera.height)
