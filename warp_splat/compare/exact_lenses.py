@@ -116,7 +116,7 @@ def unscented(points, axes, camera):
     return mean.clone(), torch.einsum("p,npi,npj->nij", of_covariance, off, off)
 
 
-def with_copies(means2d, camera):
+def shown_thrice(means2d, camera):
     """Means [3 N, 2] px of what shows once more, a turn to the left and to the right."""
     shift = torch.tensor([[camera.width, 0]], dtype=torch.float64)
     return torch.cat([means2d, means2d + shift, means2d - shift])

@@ -247,7 +247,7 @@ def exact_render(
     once = splats = exact_splats(means, quats, scales, opacities, sh, camera, **view)
     if camera.lens and camera.lens.model == exact_lenses.AROUND:
         again = {name: torch.cat([getattr(once, name)] * 3) for name in once.__dataclass_fields__}
-        splats = Splats(**{**again, "means2d": exact_lenses.with_copies(once.means2d, camera)})
+        splats = Splats(**{**again, "means2d": exact_lenses.shown_thrice(once.means2d, camera)})
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]
