@@ -32,7 +32,7 @@ from warp_splat.formats.splats import SplatFile
 from warp_splat.training.command import train as command_train
 from warp_splat.training.config_file import load_options
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.record import Run, keep, restore
+from warp_splat.training.record import Run, finish, keep, restore, save_model
 from warp_splat.training.trainer import Trainer
 
 STOP = 33  # of 60; densification has added Gaussians and the opacities were reset
@@ -158,6 +158,20 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
     for option, value in (("sh_degree", "2"), ("optimizer_type", "sparse_adam"), ("seed", "1"), ("preset", "fast")):
         assert f"--{option} {value}: expected" in fails(capsys, "train", "--resume", str(folder), f"--{option}", value)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_an_evaluation_that_fails_loses_no_history(scene, tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise InputError("no room for pictures.")
+
+    trainer, run = begin(scene, tmp_path)
+    run.history = [{"iteration": n, "loss": 0.1, "psnr": 9.0, "gaussians": 5, "seconds": 1.0} for n in (1, 2)]
+    run.saved, run.seconds = save_model(trainer, run), 1.0
+    monkeypatch.setattr("warp_splat.training.record.evaluate_views", fail)
+    with pytest.raises(InputError, match="no room"):
+        finish(trainer, run, print)
+    assert json.loads((tmp_path / "history.json").read_text()) == run.history
+    assert (tmp_path / "training.png").is_file()
 
 
 def test_another_arithmetic_is_refused(tmp_path, monkeypatch, capsys):

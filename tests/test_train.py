@@ -191,6 +191,7 @@ def test_help_answers_without_torch_or_warp():
         (("--iterations", "0"), ("--iterations", "at least 1", "0")),
         (("--save_iterations", "5", "-5"), ("--save_iterations", "at least 1", "-5")),
         (("-m", str(SCENE)), ("another folder than the scene's",)),
+        (("-m", str(SCENE / "images" / "model")), ("another folder than the scene's or its images'",)),
         (("--config", "/no/such/file"), ("/no/such/file", "TOML", "(No such file or directory)")),
         (("--device", "cpu", "--data_device", "cuda"), ("--data_device cuda", "GPU")),
         (("--start_checkpoint", "x.pth"), ("x.pth", "can run code")),

@@ -87,8 +87,12 @@ def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
     default = begun.path.parent if begun else model_folder.default_model_path()
     folder, source = Path(config.report.model_path or default), config.data.source_path
     model_folder.check_place(folder)
-    if source and folder.resolve() == Path(source).resolve():
-        raise InputError(f"-m {folder}: expected another folder than the scene's; choose a new one.")
+    if source:
+        place, scene, photographs = (
+            path.resolve() for path in (folder, Path(source), Path(source, config.data.images))
+        )
+        if place == scene or (photographs != scene and place.is_relative_to(photographs)):
+            raise InputError(f"-m {folder}: expected another folder than the scene's or its images'; choose a new one.")
     refuse_other_training(folder, begun)
     return folder
 

@@ -159,6 +159,10 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         run.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     trainer.model = trainer.model.arranged()  # as in the file: at one depth, the first is drawn in front
     split, views = trainer.scene.evaluated
+    write_json(run.folder / "history.json", run.history)  # now, since the evaluation may fail
+    plot = run.folder / "training.png"
+    if run.history:  # none, if it was stopped before the first evaluation and goes no further
+        report.plot_training(plot, run.history, split)
     extra = {
         "split": split,
         "iterations": run.iteration,
@@ -177,10 +181,6 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
     show_views(compared, run.folder, split, run.iteration, say)
     run.events.write_means(run.iteration, split, means)
-    plot = run.folder / "training.png"
-    if run.history:  # none, if it was stopped before the first evaluation and goes no further
-        report.plot_training(plot, run.history, split)
-    write_json(run.folder / "history.json", run.history)
     names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
     lines = [(what, run.folder / name) for what, name in names.items() if run.history or name != plot.name]
     if run.stages:
