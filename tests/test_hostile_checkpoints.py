@@ -67,6 +67,7 @@ def test_damage_is_found(kept, tmp_path):
     [
         (None, ("no such file",)),
         ({"name": "chkpnt7000.pth"}, ("can run code", ".ply")),
+        ({"name": "point_cloud.ply"}, ("found a model", "--start_ply")),
         ({"metadata": None}, ("other safetensors",)),
         ({"metadata": {"warp_splat": "[1"}}, ("damaged",)),
         ({"metadata": {"warp_splat": "[" * 100_000}}, ("damaged", "nested")),
@@ -88,6 +89,9 @@ def test_what_is_no_checkpoint(content, words, tmp_path, capsys):
 
 def test_a_folder_without_its_last_checkpoint(kept, tmp_path):
     with pytest.raises(InputError, match="no such file"):
+        load_options(tmp_path)
+    (tmp_path / LAST).mkdir()
+    with pytest.raises(InputError, match=f"{LAST}: expected a checkpoint .* found a folder of this name"):
         load_options(tmp_path)
     save_checkpoint(tmp_path / "chkpnt7.safetensors", kept[1].arrays, kept[1].facts)
     with pytest.raises(InputError, match=r"chkpnt7.safetensors can be named"):

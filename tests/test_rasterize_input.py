@@ -1,6 +1,7 @@
 """Bad input to the renderer: an InputError that names the argument and says what was found, before any work."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 
 import warp_splat
 from warp_splat import InputError, RasterOptions
+from warp_splat.raster.drivers import CPU, DRIVERS
 
 SCENE = scenes.cloud(0, 6, scenes.make_camera(20, 18), degree=1)
 
@@ -19,6 +21,17 @@ def call(device, **changed):
     for name, change in changed.items():
         arguments[name] = change(arguments.get(name)) if callable(change) else change
     return warp_splat.rasterize(**arguments)
+
+
+def test_memory_that_runs_out_is_explained(monkeypatch):
+    def failing(*arguments):
+        raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate much")
+
+    monkeypatch.setitem(DRIVERS, "cpu", replace(CPU, bin=failing))
+    with pytest.raises(
+        InputError, match=r"Out of memory on cpu in stage 'bin', with 6 Gaussians on 20 x 18 px; render"
+    ):
+        call("cpu")
 
 
 def put(value, *index):

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from splat_files import some_file
 
 from warp_splat.cli import main
 from warp_splat.config import CORES
 from warp_splat.evaluation.metrics import psnr
-from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.png import load_png
@@ -230,6 +231,17 @@ def test_a_folder_that_holds_a_model_is_left_alone(trained, capsys):
 def test_render_without_a_model(tmp_path, capsys):
     assert "-m" in fails(capsys, "render")
     assert str(tmp_path) in fails(capsys, "render", "-m", str(tmp_path))
+    assert "nope: expected the folder of a trained model" in fails(capsys, "render", "-m", str(tmp_path / "nope"))
+
+
+def test_films_that_cannot_be(tmp_path, capsys):
+    for name, count in (("empty.ply", 0), ("full.ply", 5)):
+        save_gaussians(tmp_path / name, some_file(count))
+    film = ("-s", str(SCENE), "--video", "path", "--frames", "2")
+    assert "at least one Gaussian to film" in fails(capsys, "render", "-m", str(tmp_path / "empty.ply"), *film)
+    output = ("--video_output", str(tmp_path / "full.ply" / "a.mp4"))
+    sentence = fails(capsys, "render", "-m", str(tmp_path / "full.ply"), *film, *output)
+    assert "full.ply: expected a folder that can be written" in sentence
 
 
 def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, capsys):

@@ -155,7 +155,7 @@ def test_small_models(fake_viser, count, coefficients):
     ("config", "message"),
     [
         (ViewConfig(), "MODEL: expected the folder"),
-        (ViewConfig("no/such/folder"), "is it a model folder"),
+        (ViewConfig("no/such/folder"), "found no such folder"),
         (ViewConfig("no/such.ply"), "no/such.ply"),
         (ViewConfig("no/such.ply", port=0), "--port: expected"),
     ],

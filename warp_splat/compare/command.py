@@ -37,6 +37,7 @@ def run(config: CompareConfig) -> int:
         raise InputError("--stability, --volume: expected one of them, got both; run the command twice.")
     if (config.stability or config.volume) and (config.scene or config.full):
         raise InputError("--scene, --full: these belong to the comparison without --stability and --volume.")
+    scenes = {} if config.stability or config.volume else named_scenes(config.scene, print)
     wanted = config.device
     if config.stability or config.volume:
         if wanted == "cuda":
@@ -59,7 +60,6 @@ def run(config: CompareConfig) -> int:
         measure.compare_with_physics(out, say)
     else:
         name, code = "compare", 0
-        scenes = named_scenes(config.scene, print)
         _compare_pixel_loops(config, scenes, device, out, say)
         trained.run_trainings(out, config.modes, scenes, config.full, say, device.type)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""

@@ -104,10 +104,11 @@ def named_scenes(scene: str, say: Callable[[str], None]) -> dict[str, Scene]:
     Raises:
         InputError: if the folder holds no scene.
     """
+    yours = load_scene(scene, eval=True, report=say) if scene else None  # first, since it may be refused
     found = {"embedded": load_scene(embedded_scene(), eval=True, report=say)}
-    if scene:
+    if yours:
         name = Path(scene).resolve().name.replace(",", " ")
-        found[name if name not in found else f"{name} (2)"] = load_scene(scene, eval=True, report=say)
+        found[name if name not in found else f"{name} (2)"] = yours
     return found
 
 

@@ -22,6 +22,7 @@ from safetensors import SafetensorError, safe_open
 from warp_splat import __version__
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.exchange import FORMATS
 from warp_splat.formats.reading import Unexpected, reading
 
 LAST = "checkpoint.safetensors"  # where the run in a model folder stands
@@ -142,7 +143,7 @@ def find_checkpoint(path: str | Path) -> Path:
     """
     path = Path(path)
     if path.is_dir():
-        others = sorted(path.glob("*.safetensors"))
+        others = sorted(other for other in path.glob("*.safetensors") if other.is_file())
         path /= LAST
         if not path.is_file() and others:
             raise InputError(f"{path}: no such file; {others[-1]} can be named instead.")
@@ -151,6 +152,13 @@ def find_checkpoint(path: str | Path) -> Path:
             f"{path}: expected {EXPECTED} ({LAST}), found one of torch's, which can run code when it is read; convert "
             "its Gaussians to .ply with the program that wrote it."
         )
+    if path.is_file() and path.suffix.lower() in FORMATS:
+        raise InputError(
+            f"{path}: expected {EXPECTED} ({LAST}), found a model; name the folder of its training, or start a new one "
+            "from it with --start_ply."
+        )
+    if path.is_dir():
+        raise InputError(f"{path}: expected {EXPECTED}, found a folder of this name; remove it or name another.")
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a model folder with {LAST}, or a checkpoint in it.")
     return path

@@ -109,6 +109,8 @@ def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     matches = (
         re.fullmatch(r"iteration_(\d+)", path.parent.name) for path in ply_path(folder, 0).parents[1].glob("*/*.ply")
     )
+    if not Path(folder).is_dir():
+        raise InputError(f"{folder}: expected the folder of a trained model, found no such folder; check the path.")
     saved = sorted({int(match[1]) for match in matches if match and ply_path(folder, int(match[1])).is_file()})
     if not saved:
         raise InputError(f"{folder}: expected point_cloud/iteration_*/*.ply, found none; is it a model folder?")

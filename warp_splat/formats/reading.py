@@ -37,7 +37,7 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
     except InputError:
         raise
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check the path and the iteration.") from error
+        raise InputError(f"{path}: no such file; check the path.") from error
     except OSError as error:
         raise InputError(f"{path}: could not be read ({error.strerror or error}).") from error
     except MemoryError as error:

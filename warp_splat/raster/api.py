@@ -29,6 +29,7 @@ from warp_splat.raster.data import Dropped, Gaussians, Walk
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing
+from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.timers import stage
 
 
@@ -99,7 +100,7 @@ def rasterize(
 
     Raises:
         InputError: if a shape, dtype, device or value is not as stated (the message names the argument), or if the
-            memory does not suffice for "stored".
+            memory does not suffice.
     """
     return _checked(means, quats, scales, opacities, sh, [camera], background, adjoint, options, features)[0]
 
@@ -156,10 +157,12 @@ def _checked(
     if features is not None:
         check_features(features, means)
     outputs = []
-    for camera in cameras:
-        outputs.append(render(gaussians, camera, background, options, adjoint, features))
-        if outputs[-1].invalid:
-            explain_invalid(outputs[-1].invalid, gaussians.quats)
+    sizes = ((base.width, base.height) for base in (getattr(camera, "base", camera) for camera in cameras))
+    with memory_explained(means.device, means, sizes, "render smaller images (Camera.resized) or fewer Gaussians"):
+        for camera in cameras:
+            outputs.append(render(gaussians, camera, background, options, adjoint, features))
+            if outputs[-1].invalid:
+                explain_invalid(outputs[-1].invalid, gaussians.quats)
     return outputs
 
 

@@ -49,6 +49,13 @@ def render_model(config: RenderConfig) -> int:
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
     folder, iteration, gaussians, trained = _open(config)
     model = GaussianModel.from_splats(gaussians.splats).arranged()
+    if (config.orbit or config.video) and not len(model):
+        raise InputError(
+            f"{config.model_path}: expected at least one Gaussian to film, found none; name another model."
+        )
+    output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
+    if output:  # before frames are drawn for it
+        model_folder.check_place(Path(output).parent if Path(output).suffix.lower() == ".mp4" else Path(output))
     scene = None
     if _needs_scene(config):
         scene = load_trained_scene(config.model_path, config.source_path, trained, say, iteration)
@@ -57,7 +64,6 @@ def render_model(config: RenderConfig) -> int:
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = make_picture(model.to(device), bool(trained.get("white_background")), options, linear)
         if config.orbit or config.video:
-            output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
             for sentence in absent:
