@@ -69,7 +69,7 @@ def rendered(adjoints: list[str]) -> dict[str, np.ndarray]:
     return {name: tensor.detach().numpy() for name, tensor in found.items()}
 
 
-def trained(steps: int) -> dict[str, np.ndarray]:
+def trained(steps: int, options: list[str]) -> dict[str, np.ndarray]:
     """The photographs of the embedded scene, small, and the parameters that ``steps`` steps make of it, if any."""
     if not steps:
         return {}
@@ -77,7 +77,7 @@ def trained(steps: int) -> dict[str, np.ndarray]:
     found = {"photographs": np.stack([view.image for view in scene.train]), "points": scene.points}
     flags = [f"--{name}={value}" for name, value in {**GROWTH, "iterations": steps, "seed": 1, "threads": 1}.items()]
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
-        if command(["train", "-m", folder, "-r", str(SMALL), "--quiet", *flags]):
+        if command(["train", "-m", folder, "-r", str(SMALL), "--quiet", *flags, *options]):
             raise RuntimeError("the training ended with an error")
         model = load_ply(Path(folder) / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply").splats
     return found | {f"trained {name}": getattr(model, name) for name in NAMES}
@@ -87,14 +87,16 @@ def main() -> None:
     """Print a line for each array: its hash, its name, its shape."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=50, help="of training; 0: none")
+    parser.add_argument("--options", nargs="*", default=[], help="of training, besides: exposure=gain")
     parser.add_argument("--adjoints", nargs="*", default=list(ADJOINTS), help="of the blend")
     parser.add_argument("--out", type=Path, help="also write the arrays there, as .npz")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     torch.set_num_threads(1)
     arrays = {}
-    for compute, how in ((rendered, arguments.adjoints), (trained, arguments.steps)):
-        found = compute(how)
+    options = [f"--{option}" for option in arguments.options]
+    for compute, how in ((rendered, [arguments.adjoints]), (trained, [arguments.steps, options])):
+        found = compute(*how)
         for name, array in found.items():
             print(hashlib.sha256(np.ascontiguousarray(array)).hexdigest()[:12], name, array.shape, flush=True)
         arrays |= found

@@ -1,5 +1,6 @@
 """Exposure: kernels against float64, the gauge, what it finds of faults that are known, and the same bytes again."""
 
+import json
 import re
 import sys
 from dataclasses import replace
@@ -16,12 +17,12 @@ from warp_splat.cli import main
 from warp_splat.color import to_srgb
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.runtime import launch
+from warp_splat.runtime import pool
 from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import choose
-from warp_splat.training.record import keep, restore
+from warp_splat.training.record import keep, restore, save_model
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 
@@ -110,15 +111,29 @@ def test_it_resumes_to_the_same_bytes(kind, scene, tmp_path):
     assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
 
 
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_the_folder_has_the_maps_in_the_layout_of_the_reference(kind, scene, tmp_path):
+    trainer, run = begin(scene, tmp_path, exposure=kind)
+    steps(trainer, run, 9)
+    save_model(trainer, run)
+    maps = json.loads((tmp_path / "exposure.json").read_text())
+    assert list(maps) == [view.name for view in scene.train]
+    view, image = scene.train[5], torch.rand(5, 7, 3)
+    image_map = torch.tensor(maps[view.name])
+    expected = image @ image_map[:3, :3] + image_map[:3, 3]
+    assert not torch.allclose(expected, image, atol=1e-4)
+    torch.testing.assert_close(trainer.parts[0].image(image, None, SimpleNamespace(view=view)), expected)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_threads_change_nothing(kind, scene, tmp_path):
-    part, before, found = part_of(scene, tmp_path, exposure=kind, vignetting=True), launch.get_threads(), []
+    part, before, found = part_of(scene, tmp_path, exposure=kind, vignetting=True), pool.get_threads(), []
     image = torch.rand(130, 131, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
     for threads in (1, 2, 3):
-        launch.set_threads(threads)
+        pool.set_threads(threads)
         made = part.image(image, None, SimpleNamespace(view=scene.train[0]))
         found.append(torch.autograd.grad(made.square().sum(), [image, part.maps, part.falloff]))
-    launch.set_threads(before)
+    pool.set_threads(before)
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
 

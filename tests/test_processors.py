@@ -48,6 +48,16 @@ def test_a_misspelled_switch_is_refused():
         pytest.param({}, AVX2, ["--adjoints", "manual", "--steps", "50"], marks=pytest.mark.slow, id="AVX2"),
         pytest.param({}, AVX2, ["--steps", "300"], marks=pytest.mark.long, id="AVX2, all of it"),
         pytest.param(PORTABLE, SSE2, ["--steps", "300"], marks=pytest.mark.long, id="SSE2"),
+        *[
+            pytest.param(
+                {},
+                AVX2,
+                ["--steps", "60", "--options", f"exposure={kind}", "vignetting"],
+                marks=pytest.mark.long,
+                id=kind,
+            )
+            for kind in ("gain", "affine", "bilateral")
+        ],
     ],
 )
 def test_same_bytes(here, there, arguments):

@@ -26,6 +26,7 @@ from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.text import format_table
 from warp_splat.training.config_file import OF_ONE_RUN
+from warp_splat.training.seams import having
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
 
@@ -70,6 +71,9 @@ def save_model(trainer: Trainer, run: Run) -> Path:
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     try:
         _save_cameras(trainer, run.folder, path.parent)
+        for files in having(trainer.parts, "files"):
+            for name, value in files().items():
+                write_json(run.folder / name, value)
     except InputError as error:
         warn(error)
     return path

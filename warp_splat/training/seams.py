@@ -27,6 +27,7 @@ they run in this order:
 For what is shown and saved, a part may have:
 
     refined(camera, view) -> camera         of a photograph, held out or not, as it is learned by now
+    files() -> {name: value}                JSON files of the model's folder
 
 Both may have:
 

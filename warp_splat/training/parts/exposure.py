@@ -8,6 +8,8 @@ the mean is taken off. So the scene keeps its colors, and images without a map a
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
@@ -16,7 +18,7 @@ from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, v
 from warp_splat.kernels.simd import Types
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import GREEN, NEEDED, gains_of
@@ -72,6 +74,13 @@ class Exposure:
         start, final = self.options.exposure_lr_init, self.options.exposure_lr_final
         return start * power(final / start, min(iteration, self.end), self.end) if start else 0.0
 
+    def load(self) -> None:
+        """Compile and load the kernels, for many pixels at once and for those left over."""
+        device = self.maps.device
+        for lanes in {driver_of(device).lanes, 1} if self.kind != "bilateral" else ():
+            load(make_map_colors(lanes), device)
+            load(make_adj_map_colors(lanes), device)
+
     def image(self, image: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """As the camera of this view would have shown it."""
         with stage("exposure"):
@@ -116,6 +125,14 @@ class Exposure:
             steps = [torch.diff(cells, dim=axis).reshape(-1) for axis in (1, 2, 3)]
             price = price + SMOOTHNESS / count * in_pairs(torch.cat([change * change for change in steps]))
         return loss + (self.options.exposure_reg * price).to(loss.dtype)
+
+    @torch.no_grad()
+    def files(self) -> dict[str, Any]:
+        """The maps [3, 4] of gains and affine maps as the reference writes them: color @ map[:, :3] + map[:, 3]."""
+        if self.kind == "bilateral":
+            return {}
+        whole = {view.name: self._whole(self.maps[place]).cpu().view(4, 3) for view, place in self.places.items()}
+        return {"exposure.json": {name: torch.cat([w[:3], w[3:].T], 1).tolist() for name, w in whole.items()}}
 
     @torch.no_grad()
     def after_step(self, iteration: int) -> None:
