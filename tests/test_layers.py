@@ -14,7 +14,7 @@ LAYERS = [
     {"kernels", "runtime", "camera", "color"},
     {"raster"},
     {"formats"},
-    {"scene", "evaluation", "gaussians", "tape"},
+    {"scene", "evaluation", "gaussians", "tape", "gsplat"},
     {"rendering", "sfm", "viewer"},
     {"training"},
     {"compare", "inspect", "export_html"},

@@ -1,0 +1,217 @@
+"""gsplat's function: its projection and harmonics in torch are the truth, for pixels our float64 oracle is."""
+
+import inspect
+
+import pytest
+import torch
+from scenes import SCENES
+from test_rasterize import IMAGE_MAX, relative_error
+
+from warp_splat import InputError
+from warp_splat.compare import oracle
+from warp_splat.gsplat import harmonics_torch, rasterization
+from warp_splat.raster.drivers import CUDA, using
+
+gsplat = pytest.importorskip("gsplat")
+from gsplat.cuda import _torch_impl as theirs  # noqa: E402
+
+GRADIENT = 1e-5
+SKEWLESS = torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]])  # its torch code knows a skew, its kernels do not
+MODELS = ("pinhole", "ortho", "fisheye")
+
+
+def call_of(name="degree2", cameras=2, **more):
+    """The tensors of a scene, seen by cameras side by side, and the size of the image."""
+    scene = SCENES[name]()
+    camera = scene.camera
+    viewmats = torch.eye(4).repeat(cameras, 1, 1)
+    viewmats[:, :3, :3], viewmats[:, :3, 3] = torch.tensor(camera.rotation), torch.tensor(camera.translation)
+    viewmats[:, 0, 3] += 0.3 * torch.arange(cameras)
+    intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]).float()
+    names = ("means", "quats", "scales", "opacities")
+    call = {name: getattr(scene, name).clone().requires_grad_() for name in names}
+    call |= {"colors": scene.sh.clone().requires_grad_(), "viewmats": viewmats.requires_grad_()}
+    call |= {"Ks": intrinsics.repeat(cameras, 1, 1).requires_grad_(), "width": camera.width, "height": camera.height}
+    return call | {"sh_degree": int(scene.sh.shape[1] ** 0.5) - 1} | more
+
+
+def test_parameters_are_those_of_gsplat():
+    mine, other = (inspect.signature(f).parameters for f in (rasterization, gsplat.rasterization))
+    assert list(mine) == list(other)
+    for name in mine:
+        if name != "rolling_shutter":  # theirs is an enumeration of their own; None is its GLOBAL
+            assert mine[name].default == other[name].default, name
+    shutter = other["rolling_shutter"].default
+    assert rasterization(**call_of(rolling_shutter=shutter))[0].isfinite().all()
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("model", MODELS)
+def test_projection_and_its_gradients(model, mode):
+    call = call_of(packed=False, camera_model=model, rasterize_mode=mode, eps2d=0.4, near_plane=2.5, far_plane=7.0)
+    meta = rasterization(**call)[2]
+    names = ("means", "quats", "scales", "viewmats", "Ks")
+    leaves = [call[name] for name in names]
+    exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    covariances, _ = theirs._quat_scale_to_covar_preci(exact[1], exact[2], compute_preci=False)
+    _, means2d, depths, conics, share = theirs._fully_fused_projection(
+        *(exact[0], covariances, exact[3], exact[4], call["width"], call["height"], 0.4, 2.5, 7.0),
+        calc_compensations=True,
+        camera_model=model,
+    )
+    opacities = call["opacities"].detach() * (share if mode == "antialiased" else torch.ones_like(share))
+    drawn = (meta["radii"] > 0).all(-1)
+    assert drawn.sum() > 20
+    truth = {"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities}
+    for name, expected in truth.items():
+        found, generator = meta[name], torch.Generator().manual_seed(1)
+        upstream = torch.randn(found.shape, generator=generator) * drawn.view(*drawn.shape, *[1] * (found.dim() - 2))
+        assert relative_error((found * upstream).detach(), (expected * upstream).detach()) < GRADIENT, name
+        if not expected.requires_grad:
+            continue
+        gradients = torch.autograd.grad(found, leaves, upstream, retain_graph=True, allow_unused=True)
+        wanted = torch.autograd.grad(expected, exact, upstream.double(), retain_graph=True, allow_unused=True)
+        for leaf, one, other in zip(names, gradients, wanted, strict=True):
+            if one is None or other is None:
+                assert one is None or not one.any() or name == "opacities"
+                continue
+            kept = other * SKEWLESS if leaf == "Ks" else other
+            assert relative_error(one, kept) < GRADIENT, (name, leaf)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_harmonics(degree):
+    rays = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1).requires_grad_()
+    found = torch.stack(harmonics_torch._basis(*rays.unbind(1), degree), 1)
+    expected = theirs._eval_sh_bases_fast((degree + 1) ** 2, rays)
+    assert torch.allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("driver", ["lanes", "blocks"])
+@pytest.mark.parametrize("name", ["degree2", "near_and_behind"])
+def test_pixels_against_the_oracle(name, driver, monkeypatch):
+    monkeypatch.setattr(oracle, "NEAR", 0.01)
+    call, scene = call_of(name, cameras=1), SCENES[name]()
+    leaves = {key: call[key] for key in ("means", "quats", "scales", "opacities", "colors")}
+    exact = {key: leaf.detach().double().requires_grad_() for key, leaf in leaves.items()}
+    truth = oracle.exact_render(*exact.values(), scene.camera, background=(0.1, 0.2, 0.3))
+    if driver == "blocks":
+        with using(CUDA):
+            image, alpha, _ = rasterization(**call, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]))
+    else:
+        image, alpha, _ = rasterization(**call, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]))
+    assert (image[0] - truth.image)[~truth.fragile].abs().max() < IMAGE_MAX
+    assert (alpha[0, ..., 0] - truth.alpha)[~truth.fragile].abs().max() < IMAGE_MAX
+    if driver == "lanes":
+        upstream = torch.randn(image.shape[1:], generator=torch.Generator().manual_seed(0))
+        upstream[truth.fragile] = 0
+        found = torch.autograd.grad(image[0], list(leaves.values()), upstream)
+        wanted = torch.autograd.grad(truth.image, list(exact.values()), upstream.double())
+        for key, one, other in zip(leaves, found, wanted, strict=True):
+            assert relative_error(one, other) < 1e-4, key
+
+
+@pytest.mark.parametrize("mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+@pytest.mark.parametrize("channels", [1, 3, 6])
+def test_modes_channels_and_batches(mode, channels):
+    """Two scenes of two cameras; each view as if it were alone."""
+    call = call_of("degree1")
+    colors = torch.rand(len(call["means"]), channels)
+    backgrounds = torch.rand(2, 2, channels)
+    single = {key: call[key].detach() for key in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
+    single |= {key: call[key] for key in ("width", "height")} | {"render_mode": mode}
+    both = {key: torch.stack([single[key]] * 2) for key in ("means", "quats", "scales", "opacities", "viewmats", "Ks")}
+    both["means"][1] += 0.1
+    image, alpha, meta = rasterization(
+        **single | both, colors=torch.stack([colors] * 2), backgrounds=backgrounds, packed=False
+    )
+    depth = mode != "RGB"
+    shown = depth + (0 if mode in ("D", "ED") else channels)
+    assert image.shape == (2, 2, call["height"], call["width"], shown) and alpha.shape == (*image.shape[:-1], 1)
+    assert (meta["n_batches"], meta["n_cameras"]) == (2, 2) and meta["means2d"].shape == (2, 2, len(colors), 2)
+    assert meta["isect_offsets"].shape == (2, 2, meta["tile_height"], meta["tile_width"])
+    alone = single | {key: single[key][1:] for key in ("viewmats", "Ks")} | {"means": both["means"][1]}
+    expected, _, packed = rasterization(**alone, colors=colors[None], backgrounds=backgrounds[1, 1:])
+    assert torch.equal(image[1, 1], expected[0])
+    seen = (meta["radii"][1, 1] > 0).all(-1)
+    assert torch.equal(packed["gaussian_ids"], seen.nonzero()[:, 0]) and not packed["camera_ids"].any()
+    assert torch.equal(packed["means2d"], meta["means2d"][1, 1][seen])
+    order = packed["gaussian_ids"][packed["flatten_ids"].long()]
+    assert torch.equal(order, meta["flatten_ids"][meta["isect_offsets"][1, 1, 0, 0] :].long() - 3 * len(colors))
+    assert (packed["isect_ids"].diff() >= 0).all() and packed["tiles_per_gauss"].sum() == len(order)
+
+
+def test_gradients_of_what_meta_shows_and_sparse_ones():
+    found = []
+    for packed in (False, True):
+        call = call_of(packed=packed, sparse_grad=packed)
+        image, _, meta = rasterization(**call)
+        meta["means2d"].retain_grad()
+        image.square().sum().backward()
+        grads = [call[name].grad for name in ("means", "quats", "scales", "viewmats", "Ks")]
+        assert all(grad.is_sparse == (packed and index < 3) for index, grad in enumerate(grads))
+        around = meta["means2d"].grad if packed else meta["means2d"].grad[(meta["radii"] > 0).all(-1)]
+        found.append([grad.to_dense() for grad in (*grads, around)])
+    assert all(torch.allclose(one, other, rtol=1e-5, atol=1e-5) for one, other in zip(*found, strict=True))
+    clipped = rasterization(**call_of(radius_clip=8.0))[2]
+    assert (clipped["radii"] > 8).any(-1).all() and len(clipped["radii"]) > 0
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("steps", [60, pytest.param(300, marks=pytest.mark.long)])
+def test_its_strategy_grows_a_model(packed, steps):
+    """gsplat's own, on our meta."""
+    target = rasterization(**call_of())[0].detach()
+    call = call_of(packed=packed)
+    names = ("means", "quats", "scales", "opacities", "colors")
+    raw = {name: call[name].detach()[::3] for name in names}
+    raw |= {"scales": raw["scales"].log(), "opacities": torch.logit(raw["opacities"])}
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(tensor.clone()) for name, tensor in raw.items()})
+    optimizers = {name: torch.optim.Adam([params[name]], lr=0.005) for name in names}
+    strategy = gsplat.DefaultStrategy(refine_start_iter=10, refine_every=20, grow_grad2d=1e-6, refine_stop_iter=200)
+    strategy.check_sanity(params, optimizers)
+    state, losses, before = strategy.initialize_state(), [], len(params["means"])
+    cameras = {name: call[name] for name in ("viewmats", "Ks", "width", "height", "sh_degree")}
+    for step in range(steps):
+        activated = {**params, "scales": params["scales"].exp(), "opacities": params["opacities"].sigmoid()}
+        image, _, meta = rasterization(**activated, **cameras, packed=packed)
+        strategy.step_pre_backward(params, optimizers, state, step, meta)
+        loss = (image - target).square().mean()
+        losses.append(float(loss))
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        strategy.step_post_backward(params, optimizers, state, step, meta, packed=packed)
+    assert len(params["means"]) > 1.5 * before and losses[-1] < 0.5 * losses[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"distributed": True}, "distributed: warp_splat.gsplat does not carry it; render in each process"),
+        ({"with_ut": True}, "with_ut: .* does not carry"),
+        ({"with_eval3d": True}, "with_eval3d: .* does not carry"),
+        ({"covars": torch.zeros(120, 3, 3)}, "covars: .* give quats and scales"),
+        ({"radial_coeffs": torch.zeros(2, 6)}, "radial_coeffs: .* undistort"),
+        ({"rolling_shutter": "ROLLING"}, "rolling_shutter: .*the shutter is global"),
+        ({"camera_model": "ftheta"}, "camera_model: expected one of pinhole, ortho, fisheye, got 'ftheta'"),
+        ({"render_mode": "depth"}, "render_mode: expected one of RGB, D"),
+        ({"rasterize_mode": "fast"}, "rasterize_mode: expected one of classic"),
+        ({"width": 0}, "width: expected a whole number, at least 1, got 0"),
+        ({"tile_size": 8}, "tile_size: expected 16, got 8"),
+        ({"eps2d": -1.0}, "eps2d: expected a number, at least 0"),
+        ({"sh_degree": 5}, "sh_degree: expected 0 to 4 or None, got 5"),
+        ({"sh_degree": 3}, "colors: expected 16 or more coefficients"),
+        ({"sh_degree": None}, r"colors: expected shape \[..., N, D\]"),
+        ({"means": torch.zeros(3)}, r"means: expected a tensor \[..., N, 3\]"),
+        ({"viewmats": torch.zeros(4, 4)}, r"viewmats: expected a tensor \[..., C, 4, 4\]"),
+        ({"Ks": torch.zeros(3, 3, 3)}, r"Ks: expected a tensor \[2, 3, 3\]"),
+        ({"backgrounds": torch.zeros(2, 4)}, "backgrounds: expected a tensor"),
+        ({"opacities": torch.full((120,), torch.nan)}, "opacities: expected finite numbers"),
+        ({"scales": torch.ones(120, 3).double()}, "scales: expected float32, got float64"),
+    ],
+)
+def test_bad_input(changes, found):
+    with pytest.raises(InputError, match=found):
+        rasterization(**call_of() | changes)

@@ -1,0 +1,137 @@
+"""What :func:`warp_splat.gsplat.rasterization` demands of its arguments, said in one sentence when it is not met."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from typing import Any, NamedTuple
+
+import torch
+
+from warp_splat.config import CHANNELS_MOST, TILE
+from warp_splat.errors import InputError
+from warp_splat.raster.drivers import DRIVERS
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
+#: What gsplat has and this does not, and what to do instead.
+NOT_CARRIED = {
+    "absgrad": "leave it False",
+    "distributed": "render in each process by itself",
+    "covars": "give quats and scales",
+    "with_ut": "leave it False: Gaussians are projected by their linearization",
+    "with_eval3d": "leave it False: Gaussians are evaluated on the image",
+    "radial_coeffs": "undistort the photographs",
+    "tangential_coeffs": "undistort the photographs",
+    "thin_prism_coeffs": "undistort the photographs",
+    "ftheta_coeffs": "undistort the photographs",
+    "viewmats_rs": "leave it None: the shutter is global",
+}
+
+
+class Request(NamedTuple):
+    """The arguments that are carried, the scenes' dimensions flattened to S."""
+
+    means: torch.Tensor  # [S, N, 3]
+    quats: torch.Tensor  # [S, N, 4]
+    scales: torch.Tensor  # [S, N, 3]
+    opacities: torch.Tensor  # [S, N]
+    colors: torch.Tensor  # [S, C or 1, N, D], or [S, C or 1, N, K, 3]
+    viewmats: torch.Tensor  # [S, C, 4, 4]
+    Ks: torch.Tensor  # [S, C, 3, 3]
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int | None
+    packed: bool
+    backgrounds: torch.Tensor | None  # [S, C, D]
+    render_mode: str
+    sparse_grad: bool
+    absgrad: bool
+    rasterize_mode: str
+    camera_model: str
+    batch: tuple[int, ...] = ()  # the scenes' dimensions
+
+
+def check_request(request: Request, given: dict[str, Any]) -> Request:
+    """The request with flat scenes. Raises InputError for the first argument that is not as it should be."""
+    _check_choices(request, given)
+    means, viewmats = request.means, request.viewmats
+    if not isinstance(means, torch.Tensor) or means.dim() < 2:
+        raise InputError(f"means: expected a tensor [..., N, 3], got {_found(means)}.")
+    if not isinstance(viewmats, torch.Tensor) or viewmats.dim() < 3:
+        raise InputError(f"viewmats: expected a tensor [..., C, 4, 4], got {_found(viewmats)}.")
+    batch, count, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
+    scenes = math.prod(batch)
+    shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+    shapes |= {"viewmats": (cameras, 4, 4), "Ks": (cameras, 3, 3)}
+    flat = {}
+    for name, shape in shapes.items():
+        _check_tensor(name, given[name], (*batch, *shape), means.device)
+        flat[name] = given[name].reshape(scenes, *shape)
+    colors = request.colors
+    _check_tensor("colors", colors, None, means.device)
+    tail = 1 if request.sh_degree is None else 2
+    for shape in ((*batch, count), (*batch, cameras, count)):
+        if tuple(colors.shape[:-tail]) == shape:
+            per_view = cameras if len(shape) > len(batch) + 1 else 1
+            break
+    else:
+        wanted = "[..., N, D] or [..., C, N, D]" if tail == 1 else "[..., N, K, 3] or [..., C, N, K, 3]"
+        raise InputError(f"colors: expected shape {wanted}, got {list(colors.shape)}.")
+    least = ((request.sh_degree or 0) + 1) ** 2
+    if tail == 2 and (colors.shape[-1] != 3 or colors.shape[-2] < least):
+        raise InputError(f"colors: expected {least} or more coefficients of 3 colors, got {list(colors.shape[-2:])}.")
+    if tail == 1 and not 1 <= colors.shape[-1] <= CHANNELS_MOST:
+        raise InputError(f"colors: expected 1 to {CHANNELS_MOST} channels, got {colors.shape[-1]}.")
+    flat["colors"] = colors.reshape(scenes, per_view, count, *colors.shape[-tail:])
+    if request.backgrounds is not None:
+        shape = (cameras, colors.shape[-1])
+        _check_tensor("backgrounds", request.backgrounds, (*batch, *shape), means.device)
+        flat["backgrounds"] = request.backgrounds.reshape(scenes, *shape)
+    return request._replace(**flat, batch=batch)
+
+
+def _check_choices(request: Request, given: dict[str, Any]) -> None:
+    """Raise InputError for what is not carried, or out of range."""
+    for name, instead in NOT_CARRIED.items():
+        if given[name] is not None and given[name] is not False:
+            raise InputError(f"{name}: warp_splat.gsplat does not carry it; {instead}.")
+    shutter = given["rolling_shutter"]
+    if shutter is not None and getattr(shutter, "name", "") != "GLOBAL":
+        raise InputError(f"rolling_shutter: warp_splat.gsplat does not carry {shutter!r:.60}; the shutter is global.")
+    choices = {"render_mode": RENDER_MODES, "camera_model": CAMERA_MODELS}
+    choices["rasterize_mode"] = ("classic", "antialiased")
+    for name, values in choices.items():
+        if given[name] not in values:
+            raise InputError(f"{name}: expected one of {', '.join(values)}, got {given[name]!r:.60}.")
+    for name in ("width", "height", "channel_chunk"):
+        if isinstance(given[name], bool) or not isinstance(given[name], numbers.Integral) or given[name] < 1:
+            raise InputError(f"{name}: expected a whole number, at least 1, got {given[name]!r:.60}.")
+    if given["tile_size"] != TILE:
+        raise InputError(f"tile_size: expected {TILE}, got {given['tile_size']!r:.60}.")
+    for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
+        if not isinstance(given[name], numbers.Real) or not float(given[name]) >= 0.0:
+            raise InputError(f"{name}: expected a number, at least 0, got {given[name]!r:.60}.")
+    degree = request.sh_degree
+    if degree is not None and (isinstance(degree, bool) or degree not in range(5)):
+        raise InputError(f"sh_degree: expected 0 to 4 or None, got {degree!r:.60}.")
+
+
+def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device: torch.device) -> None:
+    if not isinstance(tensor, torch.Tensor) or (shape is not None and tuple(tensor.shape) != shape):
+        wanted = "a tensor" if shape is None else f"a tensor {list(shape)}"
+        raise InputError(f"{name}: expected {wanted}, got {_found(tensor)}.")
+    if tensor.dtype != torch.float32:
+        raise InputError(f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}.")
+    if tensor.device != device or device.type not in DRIVERS:
+        raise InputError(f"{name}: expected a tensor on one CPU or NVIDIA GPU with the means, got {tensor.device}.")
+    if not bool(tensor.detach().isfinite().all()):
+        raise InputError(f"{name}: expected finite numbers, got some that are not.")
+
+
+def _found(value: Any) -> str:
+    return str(list(value.shape)) if isinstance(value, torch.Tensor) else type(value).__name__

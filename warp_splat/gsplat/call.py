@@ -1,0 +1,108 @@
+"""``rasterization`` as gsplat 1.5.3 has it: its parameters in its order, its three results."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from warp_splat.gsplat.arguments import Request, check_request
+from warp_splat.gsplat.harmonics_torch import colors_of
+from warp_splat.gsplat.meta import show, tell, thin
+from warp_splat.gsplat.pixels import draw
+from warp_splat.gsplat.seen import see
+
+
+def rasterization(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: torch.Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: torch.Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: torch.Tensor | None = None,
+    tangential_coeffs: torch.Tensor | None = None,
+    thin_prism_coeffs: torch.Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Images of N Gaussians through C cameras, for each of any number of scenes (the dimensions "...").
+
+    Differentiable in every tensor, ``viewmats`` and ``Ks`` included. The projection is computed by torch, which gives
+    each of their entries its gradient; lists and pixels by this package's kernels. Alpha is clamped to 0.99.
+
+    Args:
+        means: [..., N, 3] float32, world units, like all tensors on one device.
+        quats: [..., N, 4], w first, any norm but zero.
+        scales: [..., N, 3], positive.
+        opacities: [..., N], 0 to 1.
+        colors: [..., (C,) N, D], D from 1 to 512; or with ``sh_degree`` coefficients [..., (C,) N, K, 3].
+        viewmats: world to camera, [..., C, 4, 4].
+        Ks: intrinsics [px], [..., C, 3, 3]; without skew.
+        width: of the images [px].
+        height: of the images [px].
+        near_plane: Gaussians whose center is nearer are left out [world units].
+        far_plane: or farther.
+        radius_clip: Gaussians whose radius on the image is at most this are left out [px].
+        eps2d: added to both variances on the image [px^2].
+        sh_degree: of the harmonics that are used, 0 to 4; None: ``colors`` are colors.
+        packed: what meta holds per Gaussian are only those that are seen, [nnz, ...]; else all, [..., C, N, ...].
+        tile_size: 16.
+        backgrounds: [..., C, D].
+        render_mode: "RGB", "D" (sum of weight times z), "ED" (mean z), "RGB+D" or "RGB+ED".
+        sparse_grad: the gradients of means, quats and scales are sparse tensors; only where ``packed``.
+        absgrad: ``meta["means2d"].absgrad`` gets the sums of the gradients' magnitudes.
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk: of no effect: how many channels go at once is the kernels' choice.
+        distributed: must be False.
+        camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
+        segmented: of no effect: it chooses how gsplat sorts.
+        covars: must be None.
+        with_ut: must be False.
+        with_eval3d: must be False.
+        radial_coeffs: must be None, like those that follow.
+        tangential_coeffs: of a lens.
+        thin_prism_coeffs: of a lens.
+        ftheta_coeffs: of a lens.
+        rolling_shutter: None, or gsplat's ``RollingShutterType.GLOBAL``.
+        viewmats_rs: of a rolling shutter.
+
+    Returns:
+        Images [..., C, H, W, D, and 1 more with a depth], alphas [..., C, H, W, 1], and a dictionary as gsplat's.
+
+    Raises:
+        InputError: if an argument is not as stated; the message names it.
+    """
+    given = dict(locals())
+    drawn: list[torch.Tensor] = []
+    if sparse_grad and packed:
+        given |= {name: thin(given[name], drawn) for name in ("means", "quats", "scales")}
+    request = check_request(Request(**{name: given[name] for name in Request._fields[:-1]}), given)
+    seen = see(request)
+    drawn.append(seen.drawn)
+    shown, seen = show(request, seen)
+    images, alphas, bins = draw(request, seen, colors_of(request, seen))
+    return images, alphas, shown | tell(request, seen, bins)

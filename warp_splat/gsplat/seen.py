@@ -1,0 +1,127 @@
+"""What cameras see of Gaussians, in torch, which gives every entry of ``viewmats`` and ``Ks`` its gradient.
+
+The kernels' projection (``kernels/project``) knows a camera of one pose and a few numbers, not matrices of any entries.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
+from warp_splat.gsplat.arguments import Request
+
+TINY = 1e-14  # squared distance from the axis, below which a fisheye's formula takes it for this
+
+
+class Seen(NamedTuple):
+    """Gaussians on the images; what follows from one that is not drawn is 0."""
+
+    means2d: torch.Tensor  # [S, C, N, 2] px
+    conics: torch.Tensor  # [S, C, N, 3] 1/px^2
+    opacities: torch.Tensor  # [S, C, N] after antialiasing
+    depths: torch.Tensor  # [S, C, N] z in the camera
+    extents: torch.Tensor  # [S, C, N, 2] px, half sides of the box where alpha >= 1/255
+    radii: torch.Tensor  # [S, C, N, 2] int32, extents rounded up
+    drawn: torch.Tensor  # [S, C, N] bool
+
+
+def see(request: Request) -> Seen:
+    """Project (Zwicker et al. 2001): linearized at the mean, W' = J V R S, covariance W' W''."""
+    turn, shift = request.viewmats[..., :3, :3], request.viewmats[..., :3, 3]
+    points = torch.einsum("scij,snj->scni", turn, request.means) + shift[:, :, None]
+    z = points[..., 2]
+    ahead = (z > request.near_plane) & (z < request.far_plane) & (request.quats != 0).any(-1)[:, None]
+    points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
+    places, to_x, to_y = _LENSES[request.camera_model](request, points)
+    axes = _rotations(request.quats) * request.scales[:, :, None]
+    a, b = (torch.einsum("scni,scij,snjk->scnk", row, turn, axes) for row in (to_x, to_y))
+    xx, xy, yy = (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1)
+    sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
+    wide = sharp + request.eps2d * (xx + yy) + request.eps2d**2
+    xx, yy = xx + request.eps2d, yy + request.eps2d
+    opacities = request.opacities[:, None].expand_as(z)
+    if request.rasterize_mode == "antialiased":
+        share = torch.where(ahead & (sharp > 0), sharp / wide.clamp_min(1e-30), 1.0)
+        opacities = torch.where(sharp > 0, opacities * share.sqrt(), 0.0)
+    with torch.no_grad():
+        reach = (2 * (opacities / ALPHA_MIN).clamp_min(1.0).log()).sqrt()
+        extents = reach[..., None] * torch.stack([xx, yy], -1).sqrt()
+        radii = extents.ceil().clamp_max(2**30)
+        size = radii.new_tensor([request.width, request.height])
+        on_image = ((places + radii > 0) & (places - radii < size)).all(-1)
+        drawn = ahead & on_image & (wide > 0) & (opacities >= ALPHA_MIN)
+        drawn &= (radii > 0).all(-1) & (radii > request.radius_clip).any(-1)
+        extents = torch.where(drawn[..., None], extents, 0.0)
+        radii = torch.where(drawn[..., None], radii, 0.0).int()
+    per_det = 1 / torch.where(drawn, wide, 1.0)
+    conics = torch.stack([yy * per_det, -xy * per_det, xx * per_det], -1)
+    return Seen(
+        torch.where(drawn[..., None], places, 0.0),
+        torch.where(drawn[..., None], conics, 0.0),
+        torch.where(drawn, opacities, 0.0),
+        torch.where(drawn, z, 0.0),
+        extents,
+        radii,
+        drawn,
+    )
+
+
+def _rotations(quats: torch.Tensor) -> torch.Tensor:
+    """Matrices [S, N, 3, 3] of quaternions w first, any norm."""
+    nothing = (quats == 0).all(-1, keepdim=True)
+    quats = torch.where(nothing, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    vector = torch.stack([x, y, z], -1)
+    none = torch.zeros_like(w)
+    across = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
+    outer = vector[..., :, None] * vector[..., None, :]
+    scalar = (w * w - (vector * vector).sum(-1))[..., None, None] * torch.eye(3, device=w.device)
+    return scalar + 2 * outer + 2 * w[..., None, None] * across  # Rodrigues' formula
+
+
+def _numbers(request: Request) -> tuple[torch.Tensor, ...]:
+    """Focal lengths and principal points, [S, C, 1] each."""
+    Ks = request.Ks
+    return Ks[..., 0, 0, None], Ks[..., 1, 1, None], Ks[..., 0, 2, None], Ks[..., 1, 2, None]
+
+
+def _pinhole(request: Request, points: torch.Tensor):
+    """Where points are seen, and the rows of the derivative; x/z in it stays near the image."""
+    fx, fy, cx, cy = _numbers(request)
+    x, y, z = points.unbind(-1)
+    u, v = x / z, y / z
+    places = torch.stack([fx * u + cx, fy * v + cy], -1)
+    held = []
+    for slope, focal, middle, size in ((u, fx, cx, request.width), (v, fy, cy, request.height)):
+        margin = FRUSTUM_MARGIN * 0.5 * size
+        held.append(slope.minimum((size - middle + margin) / focal).maximum(-(middle + margin) / focal))
+    none = torch.zeros_like(z)
+    to_x = torch.stack([fx / z, none, -fx * held[0] / z], -1)
+    return places, to_x, torch.stack([none, fy / z, -fy * held[1] / z], -1)
+
+
+def _ortho(request: Request, points: torch.Tensor):
+    """Parallel rays; focal lengths are pixels per world unit."""
+    fx, fy, cx, cy = _numbers(request)
+    x, y, z = points.unbind(-1)
+    none, one = torch.zeros_like(z), torch.ones_like(z)
+    to_x, to_y = torch.stack([fx * one, none, none], -1), torch.stack([none, fy * one, none], -1)
+    return torch.stack([fx * x + cx, fy * y + cy], -1), to_x, to_y
+
+
+def _fisheye(request: Request, points: torch.Tensor):
+    """Equidistant: the distance from the principal point is the angle to the axis (Kannala and Brandt 2006)."""
+    fx, fy, cx, cy = _numbers(request)
+    x, y, z = points.unbind(-1)
+    square = (x * x + y * y).clamp_min(TINY)
+    beside, per_ray = square.sqrt(), 1 / (square + z * z)
+    share = torch.atan2(beside, z) / beside
+    bend = (z * per_ray - share) / square
+    to_x = torch.stack([fx * (share + x * x * bend), fx * x * y * bend, -fx * x * per_ray], -1)
+    to_y = torch.stack([fy * x * y * bend, fy * (share + y * y * bend), -fy * y * per_ray], -1)
+    return torch.stack([fx * x * share + cx, fy * y * share + cy], -1), to_x, to_y
+
+
+_LENSES = {"pinhole": _pinhole, "ortho": _ortho, "fisheye": _fisheye}
