@@ -1,6 +1,7 @@
 """A step of Adam (Kingma and Ba 2015) for several tables at once: N rows each, of any width. Forward only.
 
-Memory limits it: for a number that is learned, four are read and three written. Tried:
+Memory limits it: for a number that is learned, four are read and three written. Moments may be kept in 16 bits
+(``halves.py``); a step of the second moment is a thousandth of it, which rounding to the nearest would lose. Tried:
 
 - 3 x the time: a loop over the numbers of a row, which LLVM does not vectorize
 """
@@ -10,6 +11,7 @@ import functools
 import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.halves import HALF, noise, rounded, widened
 from warp_splat.kernels.simd import TYPES, fill, over, pick, root, times
 
 wp.set_module_options(FORWARD_ONLY)
@@ -19,9 +21,10 @@ RATE, EPS, PER_ROOT, BETA1, REST1, BETA2, REST2 = (wp.constant(column) for colum
 
 
 @functools.cache
-def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
-    """For ``lanes`` rows at once; ``sparse``: only those of Gaussians that are drawn."""
+def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
+    """For ``lanes`` rows at once; ``sparse``: only of Gaussians that are drawn; ``halves``: moments in 16 bits."""
     number = TYPES[lanes].number
+    moment = HALF[lanes] if halves else number
 
     @wp.func
     def drawn(radii: wp.array[int], row: int, place: int, width: int):
@@ -40,10 +43,19 @@ def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
                 mask[lane] = wp.where(radii[shown] > 0, 1.0, 0.0)
             return mask
 
+    @wp.func
+    def wide(x: moment):
+        if wp.static(halves):
+            return widened(x)
+        else:
+            return x
+
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adam(
         first: int,  # group of rows of this slice
+        start: int,  # row of the first group
         widths: wp.array[int],  # [T] numbers in a row
+        keys: wp.array[int],  # [T] for rounding at random
         numbers: wp.array2d[float],  # [T, 7] see RATE
         radii: wp.array[int],  # [N] px, or nothing
         # out
@@ -53,23 +65,31 @@ def make_adam(lanes: int, sparse: bool) -> wp.Kernel:
         for table in range(tables_out.shape[0]):
             width = widths[table]
             begin = wp.uint64(4 * lanes) * wp.uint64(group) * wp.uint64(width)
+            begin_moments = wp.uint64(wp.static(2 if halves else 4) * lanes) * wp.uint64(group) * wp.uint64(width)
             values = wp.array(ptr=tables_out[table, 0] + begin, shape=(width,), dtype=number)
             grads = wp.array(ptr=tables_out[table, 1] + begin, shape=(width,), dtype=number)
-            firsts = wp.array(ptr=tables_out[table, 2] + begin, shape=(width,), dtype=number)
-            seconds = wp.array(ptr=tables_out[table, 3] + begin, shape=(width,), dtype=number)
+            firsts = wp.array(ptr=tables_out[table, 2] + begin_moments, shape=(width,), dtype=moment)
+            seconds = wp.array(ptr=tables_out[table, 3] + begin_moments, shape=(width,), dtype=moment)
             for i in range(width):
                 grad = grads[i]
-                m = firsts[i] * numbers[table, BETA1] + grad * numbers[table, REST1]
-                v = seconds[i] * numbers[table, BETA2] + times(grad * numbers[table, REST2], grad)
+                before = wide(firsts[i])
+                before2 = wide(seconds[i])
+                m = before * numbers[table, BETA1] + grad * numbers[table, REST1]
+                v = before2 * numbers[table, BETA2] + times(grad * numbers[table, REST2], grad)
                 spread = root(v) * numbers[table, PER_ROOT] + fill(numbers[table, EPS], v)
                 value = values[i] - over(m * numbers[table, RATE], spread)
                 if wp.static(sparse):
                     mask = drawn(radii, lanes * group, lanes * i, width)
-                    m = pick(mask, m, firsts[i])
-                    v = pick(mask, v, seconds[i])
+                    m = pick(mask, m, before)
+                    v = pick(mask, v, before2)
                     value = pick(mask, value, values[i])
                 values[i] = value
-                firsts[i] = m
-                seconds[i] = v
+                if wp.static(halves):
+                    bits = noise((start + lanes * group) * width + lanes * i, keys[table], grad)
+                    firsts[i] = rounded(m, bits, 0)
+                    seconds[i] = rounded(v, bits, 16)
+                else:
+                    firsts[i] = m
+                    seconds[i] = v
 
     return adam

@@ -40,7 +40,13 @@ def pixel_floats(masked: bool, composited: bool, linear: bool) -> int:
 
 
 def step_memory(
-    gaussians: int, coefficients: int, instances: int, pixels: int, adjoint: str = "manual", per_pixel: int = PER_PIXEL
+    gaussians: int,
+    coefficients: int,
+    instances: int,
+    pixels: int,
+    adjoint: str = "manual",
+    per_pixel: int = PER_PIXEL,
+    half_moments: bool = False,
 ) -> int:
     """Bytes that training steps take on the CPU, beyond what the process takes before the first.
 
@@ -51,9 +57,10 @@ def step_memory(
         pixels: of a view.
         adjoint: one of ADJOINTS.
         per_pixel: see :func:`pixel_floats`.
+        half_moments: whether Adam's are kept in 16 bits.
     """
     parameters = 3 + 4 + 3 + 1 + 3 * coefficients  # means, quats, scales, opacities, sh
-    of_gaussian = PER_PARAMETER * parameters + PER_GAUSSIAN
+    of_gaussian = (PER_PARAMETER - half_moments) * parameters + PER_GAUSSIAN
     of_instance = PER_INSTANCE + (STATES if adjoint == "stored" else 0)
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
@@ -70,7 +77,8 @@ def describe(trainer: Trainer) -> str:
 
     def step(gaussians: int) -> int:
         coefficients, instances = (config.model.sh_degree + 1) ** 2, INSTANCES * gaussians
-        return step_memory(gaussians, coefficients, instances, pixels, config.model.adjoint, per_pixel)
+        adjoint, halves = config.model.adjoint, config.learn.half_moments
+        return step_memory(gaussians, coefficients, instances, pixels, adjoint, per_pixel, halves)
 
     base, needed = psutil.Process().memory_info().rss, step(count)
     each = f" in each of {processes} processes" if processes > 1 else ""

@@ -26,6 +26,8 @@ from warp_splat.training.options import LearnOptions
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
 MOMENTS = ("exp_avg", "exp_avg_sq")
+HALF = torch.bfloat16
+KEY = 0x9E3779B1  # odd: what differs stays different times it
 SETTINGS = {"fused": True, "amsgrad": False, "weight_decay": 0.0, "maximize": False}
 
 
@@ -39,23 +41,30 @@ def _root(base: float, degree: int) -> Decimal:
     return Decimal(base) ** (Decimal(1) / degree)
 
 
-def move(tables: list[list[torch.Tensor]], numbers: list, count: int, radii: torch.Tensor | None) -> None:
+def move(
+    tables: list[list[torch.Tensor]], numbers: list, count: int, radii: torch.Tensor | None, iteration: int
+) -> None:
     """Launch the kernel of :mod:`warp_splat.kernels.adam` on tables of ``count`` rows."""
     device = tables[0][0].device
     sizes = [table[0].numel() // count for table in tables]
     widths = torch.tensor(sizes, dtype=torch.int32, device=device)
     of_tables = torch.tensor(numbers, dtype=torch.float32, device=device)
+    keys = torch.tensor([KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))])
+    keys = keys.to(torch.int32).to(device)
 
     def arguments(_types: Types, rows: slice) -> tuple[list, list]:
         places = [
-            [t.data_ptr() + 4 * size * rows.start for t in table] for table, size in zip(tables, sizes, strict=True)
+            [t.data_ptr() + t.element_size() * size * rows.start for t in table]
+            for table, size in zip(tables, sizes, strict=True)
         ]
         addresses = torch.tensor(places, device=device)
         shown = widths if radii is None else radii[rows]
-        inputs = [view(widths, wp.int32), view(of_tables, wp.float32), view(shown, wp.int32)]
+        inputs = [rows.start, view(widths, wp.int32), view(keys, wp.int32), view(of_tables, wp.float32)]
+        inputs.append(view(shown, wp.int32))
         return inputs, [view(addresses, wp.uint64)]
 
-    launch_in_lanes(partial(make_adam, sparse=radii is not None), driver_of(device).lanes, count, arguments, device)
+    make = partial(make_adam, sparse=radii is not None, halves=tables[0][-1].dtype == HALF)
+    launch_in_lanes(make, driver_of(device).lanes, count, arguments, device)
 
 
 class Tables:
@@ -114,7 +123,7 @@ class Optimizer:
 
         In the last ``cooldown`` steps all fall to a tenth as well, which settles what constant rates keep in motion.
         """
-        options = self.options
+        self.iteration, options = iteration, self.options
         steps, fall = options.position_lr_max_steps, options.position_lr_final / options.position_lr_init
         rate = options.position_lr_init * power(fall, min(iteration, steps), steps)
         rates = {
@@ -147,12 +156,13 @@ class Optimizer:
 
     def load(self) -> None:
         """Compile and load what :meth:`step` launches."""
-        device, sparse = self.model.device, self.options.optimizer_type == "sparse_adam"
-        lanes = driver_of(device).lanes
-        kinds = [True] * sparse + [False] * (lanes > 1 and (not sparse or bool(self.parts)))  # else torch's
+        device, halves = self.model.device, self.options.half_moments
+        sparse, lanes = self.options.optimizer_type == "sparse_adam", driver_of(device).lanes
+        kinds = [(sparse, halves)] * (lanes > 1 or sparse or halves)  # else torch's
+        kinds += [(False, False)] * (lanes > 1 and bool(self.parts))
         for kind in kinds:
             for size in {lanes, 1}:
-                load(make_adam(size, kind), device)
+                load(make_adam(size, *kind), device)
 
     def _step(self, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
         """Adam on tables of ``rows`` rows.
@@ -165,7 +175,7 @@ class Optimizer:
             parameter, (beta1, beta2), biases = group["params"][0], group["betas"], (1.0, 1.0)
             state, grad = self._state(parameter), parameter.grad
             known = grad is not None and parameter.numel() > 0  # degree 0: zeros would change nothing but the count
-            of_torch = known and lanes == 1 and radii is None
+            of_torch = known and lanes == 1 and radii is None and state[MOMENTS[0]].dtype == parameter.dtype
             if of_torch:
                 lists = ([tensor] for tensor in (parameter.detach(), grad, *(state[name] for name in MOMENTS)))
                 adam(
@@ -180,22 +190,28 @@ class Optimizer:
                 rates = [group["lr"] / biases[0], group["eps"], 1.0 / math.sqrt(biases[1])]
                 numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])
         if tables:
-            move(tables, numbers, rows, radii)
+            move(tables, numbers, rows, radii, self.iteration)
 
     def _state(self, parameter: torch.Tensor) -> dict:
         """Moments and number of steps, as torch's Adam keeps them."""
         state = self.adam.state[parameter]
         if not state:
             step = torch.zeros((), dtype=torch.float32, device=parameter.device)
-            state.update({name: torch.zeros_like(parameter) for name in MOMENTS}, step=step)
+            zeros = {name: torch.zeros_like(parameter, dtype=self._kept_as(parameter)) for name in MOMENTS}
+            state.update(zeros, step=step)
         return state
+
+    def _kept_as(self, parameter: torch.Tensor) -> torch.dtype:
+        """The type of a parameter's moments."""
+        of_part = any(parameter is leaf for leaf in self.parts.values())
+        return HALF if self.options.half_moments and not of_part else parameter.dtype
 
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
         """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""
         for name in self.model.NAMES:
             rows, nothing = added[name], torch.zeros_like(added[name])
             self._swap(name, torch.cat([self.model.parameters[name].detach()[kept], rows]))
-            self._change_moments(name, lambda moment, nothing=nothing: torch.cat([moment[kept], nothing]))
+            self._change_moments(name, lambda moment, nothing=nothing: torch.cat([moment[kept], nothing.to(moment)]))
 
     def arrange(self, order: torch.Tensor) -> None:
         """Put the rows in ``order`` (indices), moments and all."""
@@ -224,7 +240,7 @@ class Optimizer:
             if leaf.grad is not None:
                 found[f"gradients.{name}"] = leaf.grad
             if state := self.adam.state.get(leaf):
-                found |= {f"{moment}.{name}": state[moment] for moment in MOMENTS}
+                found |= {f"{moment}.{name}": state[moment].to(leaf) for moment in MOMENTS}
                 found[f"images.{name}"] = state["step"].double() * self.batch
         return found
 
@@ -252,7 +268,10 @@ class Optimizer:
             if moments:
                 images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
                 step = torch.tensor(float(images / self.batch), dtype=torch.float32, device=leaf.device)
-                self.adam.state[leaf] = {"step": step, **{moment: tables[moment] for moment in MOMENTS}}
+                self.adam.state[leaf] = {
+                    "step": step,
+                    **{moment: tables[moment].to(self._kept_as(leaf)) for moment in MOMENTS},
+                }
 
     def part_gradients(self) -> list[torch.Tensor]:
         """The gradients of what parts learn, zeros where there are none."""
