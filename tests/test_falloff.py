@@ -2,15 +2,18 @@
 
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+import warp as wp
 from heavy_tails import fall, heavy_tails, reach
 from scenes import SCENES
 
 from warp_splat import Falloff, InputError, RasterOptions, check_gradients, rasterize
 from warp_splat.config import ALPHA_MAX
 from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.gradcheck import _check_falloff
 
 OPTIONS = RasterOptions(falloff=heavy_tails, alpha_min=0.02, t_min=0.0, depth=True)
 
@@ -80,6 +83,50 @@ def test_manual_refuses_another_falloff_where_a_gradient_is_asked_for():
 def test_what_is_no_falloff_is_refused(arguments, message):
     with pytest.raises(InputError, match=message):
         Falloff(*arguments)
+
+
+@wp.func
+def misspelled(q: Any):
+    return wp.expp(-q)
+
+
+@wp.func
+def doubled(q: Any):
+    return fall(q) + fall(q)
+
+
+@wp.func
+def rising(q: Any):
+    return fall(-q)
+
+
+@wp.func
+def too_near(x: float):
+    return 0.5 * reach(x)
+
+
+@pytest.mark.parametrize(
+    ("falloff", "message"),
+    [
+        (heavy_tails, None),
+        (Falloff(doubled, reach), "options.falloff.fall: expected 1 at q = 0, got 2;"),
+        (
+            Falloff(rising, reach),
+            "options.falloff.fall: expected a finite number, at most 1 as nearer to the mean, at q",
+        ),
+        (Falloff(fall, too_near), "options.falloff.reach: expected the q where fall .* got 0.5 for x = 2, around"),
+    ],
+    ids=["right", "doubled", "rising", "too near"],
+)
+def test_what_is_none_is_found(falloff, message):
+    with pytest.raises(InputError, match=message) if message else nullcontext():
+        _check_falloff(falloff, torch.device("cpu"))
+
+
+def test_what_does_not_compile_is_one_sentence():
+    options = RasterOptions(falloff=Falloff(misspelled, reach))
+    with pytest.raises(InputError, match=r'options\.falloff: .* function "misspelled" .* see docs/extending.md\.$'):
+        rasterize(*SCENES["single"]().parameters(), SCENES["single"]().camera, options=options)
 
 
 def test_it_is_the_one_of_the_page():

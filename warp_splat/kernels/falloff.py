@@ -94,6 +94,27 @@ def make_falloff(falloff: Falloff | int | None) -> FalloffFunctions:
 
 
 @functools.cache
+def make_evaluate(falloff: Falloff) -> wp.Kernel:
+    """What a user's falloff is at some places, to see whether it is one."""
+    fall, reach = falloff.fall, falloff.reach
+
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
+    def evaluate(
+        first: int,  # place of this slice
+        q: wp.array[float],  # [M]
+        x: wp.array[float],  # [M]
+        # out
+        falls_out: wp.array[float],  # [M] at q
+        reaches_out: wp.array[float],  # [M] of x
+    ):
+        i = first + wp.tid()
+        falls_out[i] = fall(q[i])
+        reaches_out[i] = reach(x[i])
+
+    return evaluate
+
+
+@functools.cache
 def make_exp(degree: int | None) -> wp.Function:
     """2^-z for z >= 0 by a polynomial of ``degree`` (3 to 6), or by the C library (None).
 

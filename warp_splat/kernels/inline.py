@@ -91,6 +91,11 @@ def _inlined(
         )
     targets = target.elts if isinstance(target, ast.Tuple) else [target]
     values = answer.value.elts if isinstance(answer.value, ast.Tuple) else [answer.value]
+    if len(values) != len(targets):
+        raise InputError(
+            f"{part} {function.__name__}: expected a function that returns {len(targets)} values, one after another, "
+            f"found {len(values)}; Projection.{part} says which."
+        )
     read = {node.id for value in values for node in ast.walk(value) if isinstance(node, ast.Name)}
     if read.isdisjoint({place.id for place in targets}):
         return body + [ast.Assign([place], value) for place, value in zip(targets, values, strict=True)]

@@ -24,6 +24,7 @@ from warp_splat.raster.checks import (
     check_gaussians,
     check_options,
     explain_invalid,
+    own_explained,
 )
 from warp_splat.raster.data import Dropped, Gaussians, Walk
 from warp_splat.raster.drivers import driver_of
@@ -158,7 +159,8 @@ def _checked(
         check_features(features, means)
     outputs = []
     sizes = ((base.width, base.height) for base in (getattr(camera, "base", camera) for camera in cameras))
-    with memory_explained(means.device, means, sizes, "render smaller images (Camera.resized) or fewer Gaussians"):
+    advice = "render smaller images (Camera.resized) or fewer Gaussians"
+    with own_explained(options), memory_explained(means.device, means, sizes, advice):
         for camera in cameras:
             outputs.append(render(gaussians, camera, background, options, adjoint, features))
             if outputs[-1].invalid:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -18,7 +19,7 @@ from warp_splat.config import (
     STRONGEST_MOST,
     RasterOptions,
 )
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.project import Projection
 from warp_splat.raster.camera_parameters import CameraParameters
@@ -36,6 +37,22 @@ def check_camera(camera: Camera | CameraParameters) -> None:
     if camera.width * camera.height > CAMERA_PIXELS_MOST:
         most, size = CAMERA_PIXELS_MOST, f"{camera.width} x {camera.height}"
         raise InputError(f"camera: expected at most {most} pixels, got {size}; resize it with .resized().")
+
+
+@contextmanager
+def own_explained(options: RasterOptions) -> Iterator[None]:
+    """Turn Warp's words on functions of the user's own that do not compile into an InputError."""
+    try:
+        yield
+    except Exception as error:
+        words, functions = str(error.args[:1]), {"projection": options.projection, "falloff": options.falloff}
+        own = [f"options.{name}" for name, value in functions.items() if not isinstance(value, str | None)]
+        if not own or not any(found in words for found in ("while parsing function", "kernel build failed")):
+            raise
+        reason = reason_of("; ".join(str(error.args[0]).split("\n;")[-2:]))
+        raise InputError(
+            f"{' and '.join(own)}: expected functions that Warp compiles, but it says: {reason}; see docs/extending.md."
+        ) from error
 
 
 def is_one_of(value: object, choices: Collection) -> bool:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from numbers import Integral
 
 import torch
+import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.kernels.falloff import Falloff, make_evaluate
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.checks import (
     check_background,
@@ -23,6 +25,7 @@ from warp_splat.raster.checks import (
     check_options,
     explain_invalid,
     is_one_of,
+    own_explained,
 )
 from warp_splat.raster.differences import (
     CAMERA,
@@ -34,9 +37,12 @@ from warp_splat.raster.differences import (
     try_direction,
     try_directions,
 )
+from warp_splat.runtime.launch import launch, view
 from warp_splat.text import format_table
 
 MODES = (*ADJOINTS, "generated", "plain")  # the last two, which rasterize refuses, are there to be compared
+PLACES = 14  # at which a falloff is tried: powers of 2
+ASIDE, SLACK = 0.01, 1e-3  # from a reach to either side; what rounding and a polynomial may be off by
 PEAKS = 5  # Gaussians of the largest gradients that are looked at alone
 
 
@@ -144,14 +150,18 @@ def check_gradients(
         A :class:`GradientReport`: ``ok``, ``rows``, and a table by ``print``.
 
     Raises:
-        InputError: as for :func:`warp_splat.rasterize`; if a parameter has no such name; if a number is out of range.
+        InputError: as for :func:`warp_splat.rasterize`; if a parameter has no such name; if a number is out of range;
+            if the falloff of ``options`` is none.
     """
     options = _check(adjoint, options, camera, parameters, directions, tolerance, seed)
     inputs = INPUTS + CAMERA if isinstance(camera, CameraParameters) else INPUTS
     names = inputs if parameters is None else tuple(parameters)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = check_background(background, means.device)
-    scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
+    with own_explained(options):
+        scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
+    if options.falloff:
+        _check_falloff(options.falloff, means.device)
     if scene.out.invalid:
         explain_invalid(scene.out.invalid, quats)
     trials = {name: try_directions(scene, name, directions, tolerance) for name in names}
@@ -162,6 +172,34 @@ def check_gradients(
         name = max(off, key=lambda row: row.error).name
         worst = _find_worst(scene, name, trials[name])
     return GradientReport(adjoint, tolerance, rows, worst)
+
+
+def _check_falloff(falloff: Falloff, device: torch.device) -> None:
+    """Raise InputError if it does not start at 1, is not finite, rises, or if its reach is not its inverse.
+
+    The inverse is looked at from both sides, since a falloff may end by a jump.
+    """
+    exponents = torch.arange(PLACES, device=device, dtype=torch.float32)
+    x, places = torch.exp2(exponents), torch.cat([exponents[:1], torch.exp2(exponents[1:] - PLACES / 2)])
+
+    def at(q: torch.Tensor) -> tuple[list[float], torch.Tensor]:
+        found = torch.empty_like(q), torch.empty_like(q)
+        arrays = [view(tensor, wp.float32) for tensor in (q, x, *found)]
+        launch(make_evaluate(falloff), len(q), arrays[:2], arrays[2:], device=device)
+        return found[0].tolist(), found[1]
+
+    falls, reaches = at(places)
+    for q, value, before in zip(places.tolist(), falls, [1.0, *falls], strict=False):
+        expected = "1" if q == 0 else f"a finite number, at most {before:.6g} as nearer to the mean,"
+        if not (abs(value - 1.0) < SLACK if q == 0 else -math.inf < value < before + SLACK):
+            raise InputError(f"options.falloff.fall: expected {expected} at q = {q:g}, got {value:g}; correct it.")
+    nearer, farther = ((reaches * (1 + side) + side).clamp_min(0.0) for side in (-ASIDE, ASIDE))
+    for number, reach, above, below in zip(x.tolist(), reaches.tolist(), at(nearer)[0], at(farther)[0], strict=True):
+        if not (reach < math.inf and above * number > 1 - SLACK and below * number < 1 + SLACK):
+            raise InputError(
+                f"options.falloff.reach: expected the q where fall has come down to 1 / x, got {reach:g} for x = "
+                f"{number:g}, around which fall goes from {above:g} to {below:g}; give the inverse of fall."
+            )
 
 
 def _check(adjoint, options, camera, parameters, directions, tolerance, seed) -> RasterOptions:
