@@ -59,6 +59,16 @@ def one(value: float) -> str:
     return f"{value:.1f}"
 
 
+WAYS = ("affine", "unscented")  # through a lens
+
+
+def footprint(camera: str, projection: str, size: str, key: str = "psnr", per: str = "") -> float:
+    """A figure of compare/cameras.csv, of the camera whose name begins so; divided by another."""
+    wanted = (row for row in rows("cameras") if (row["projection"], row["size"]) == (projection, size))
+    row = next(row for row in wanted if row["camera"].startswith(camera))
+    return float(row[key]) / (float(row[per]) if per else 1.0)
+
+
 def worst(table: str, scene: str, variant: str) -> float:
     """The largest of the six gradients' relative errors."""
     found = (row for row in rows(table) if (row["scene"], row["variant"]) == (scene, variant))

@@ -202,6 +202,26 @@ def sentences() -> dict[str, list[tuple]]:
                 *(f.small(unit * max(f.data("cameras")["last"][of])) for of, unit in f.CAMERA_ERRORS.items()),
             ),
             (
+                "footprints of `affine` reach {} dB, those of `unscented` {} dB; through a wide lens {} and {} dB.",
+                *(f.one(f.footprint(lens, way, "0.03")) for lens in ("OPENCV_FISHEYE", "OPENCV,") for way in f.WAYS),
+            ),
+            (
+                "7 degrees: {} and {} dB through the fisheye, {} and {} dB through the wide lens",
+                *(f.one(f.footprint(lens, way, "0.12")) for lens in ("OPENCV_FISHEYE", "OPENCV,") for way in f.WAYS),
+            ),
+            (
+                "both are wrong, by up to {} of a color of 1",
+                f.two(max(f.footprint("EQUI", way, size, "max") for way in f.WAYS for size in ("0.03", "0.12"))),
+            ),
+            (
+                "take {} times as long through the fisheye as a pinhole's, `unscented` {} times",
+                *(f.two(f.footprint("OPENCV_F", w, "0.03", "seconds", "pinhole")) for w in f.WAYS),
+            ),
+            (
+                "are off by {} at most, relative to float64, over all",
+                f"{max(float(row['error']) for row in f.rows('cameras_gradients')):.1e}".replace("e-0", "e-"),
+            ),
+            (
                 "takes {} % longer with a camera that learns (one thread, {}).",
                 f.one(100 * f.data("cameras")["added"] / f.data("cameras")["step"]),
                 f.data("cameras")["machine"],

@@ -167,8 +167,9 @@ def test_stored_that_does_not_fit_is_a_row(monkeypatch):
         (["--modes"], "got none"),
         (["--scene", "nowhere"], "nowhere"),
         pytest.param(["--device", "cuda"], "--device cuda", marks=WITHOUT_GPU),
-        (["--device", "cuda", "--volume"], "--device cuda: --stability and --volume compute on the CPU only"),
-        (["--device", "cuda", "--stability"], "--device cuda: --stability and --volume compute on the CPU only"),
+        (["--device", "cuda", "--volume"], "--device cuda: --volume computes on the CPU only"),
+        (["--device", "cuda", "--stability"], "--device cuda: --stability computes on the CPU only"),
+        (["--cameras", "--volume"], "--volume, --cameras: expected one of them, got 2"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, message, tmp_path, capsys):
@@ -190,9 +191,10 @@ def test_command_runs_what_it_is_asked_for(what, failed, code, tmp_path, monkeyp
 
 @pytest.mark.long
 def test_whole_commands(tmp_path, capsys):
-    """The three commands at their default size, but for the number of trainings, which has a test of its own."""
+    """The commands at their default size, but for the number of trainings, which has a test of its own."""
     for arguments, files in (
         (["--volume"], ("volume.csv", "volume.json", "volume_stiff.png", "volume_maps.png")),
+        (["--cameras"], ("cameras.csv", "cameras_gradients.csv", "cameras.png")),
         (["--stability", "--modes", "manual"], ("stability.csv", "stability.json", "stability.png")),
     ):
         assert cli.main(["compare", *arguments, "--out", str(tmp_path)]) == 0

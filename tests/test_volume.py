@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.volume import light as physics
-from warp_splat.compare.volume import measure, media
+from warp_splat.compare.volume import measure, media, through_lenses
 from warp_splat.compare.volume.light import Volume
 from warp_splat.errors import InputError
 
@@ -231,3 +231,18 @@ def test_run_writes_its_files(tmp_path, monkeypatch):
     assert len(lines) == 1 + sum(map(len, results.values()))
     for name in ("volume_stiff.png", "volume_maps.png"):
         assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", through_lenses.CAMERAS)
+def test_footprints_through_lenses_are_exact_in_the_limit(name):
+    """The smaller Gaussians are, the better lines and planes describe what the lens makes of them."""
+    camera, most = through_lenses.CAMERAS[name]
+    errors = {projection: [] for projection in through_lenses.PROJECTED}
+    for size in (0.08, 0.02):
+        volume = through_lenses.made_volume(camera, min(most, 60.0), size)  # away from the poles of a panorama
+        images = through_lenses.footprint_images(volume, camera)
+        light = np.nansum(np.abs(images["truth"] - volume.background))
+        for projection, found in errors.items():
+            found.append(np.nansum(np.abs(images[projection] - images["truth"])) / light)
+    for projection, (large, small) in errors.items():
+        assert small < 0.4 * large and small < 0.03, (projection, large, small)

@@ -177,13 +177,14 @@ class ExportHtmlConfig:
 
 @dataclass
 class CompareConfig:
-    """Options of the comparison; without ``--stability`` or ``--volume``: adjoints, knobs and training."""
+    """Options of the comparison; without ``--stability``, ``--volume``, ``--cameras``: adjoints, knobs, training."""
 
     scene: str = flag("", "scene (COLMAP, nerf-synthetic, transforms.json) to measure on, besides our own", "-s")
     out: str = flag("output/compare", "folder for tables (CSV, JSON) and plots", "-o")
     modes: list[str] = flag(list(ADJOINTS), "adjoints to compare", many=str)
     stability: bool = flag(False, "the catalog of stiff and extreme cases instead")
     volume: bool = flag(False, "the physics underneath instead: quadratures, and what splatting approximates")
+    cameras: bool = flag(False, "lenses instead: what projections through them cost, against rays in float64")
     full: bool = flag(False, "train by the whole schedule instead of 300 steps")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores")

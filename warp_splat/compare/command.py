@@ -10,7 +10,7 @@ import torch
 
 from warp_splat.compare import adjoints, knobs, plots, trained
 from warp_splat.compare.stability import cases
-from warp_splat.compare.volume import measure
+from warp_splat.compare.volume import measure, through_lenses
 from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
@@ -33,15 +33,16 @@ def run(config: CompareConfig) -> int:
     unknown = [mode for mode in config.modes if mode not in ADJOINTS]
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
-    if config.stability and config.volume:
-        raise InputError("--stability, --volume: expected one of them, got both; run the command twice.")
-    if (config.stability or config.volume) and (config.scene or config.full):
-        raise InputError("--scene, --full: these belong to the comparison without --stability and --volume.")
-    scenes = {} if config.stability or config.volume else named_scenes(config.scene, print)
+    chosen = [f"--{name}" for name in ("stability", "volume", "cameras") if getattr(config, name)]
+    if len(chosen) > 1:
+        raise InputError(f"{', '.join(chosen)}: expected one of them, got {len(chosen)}; run the command for each.")
+    if chosen and (config.scene or config.full):
+        raise InputError(f"--scene, --full: these belong to the comparison without {chosen[0]}.")
+    scenes = {} if chosen else named_scenes(config.scene, print)
     wanted = config.device
-    if config.stability or config.volume:
+    if chosen:
         if wanted == "cuda":
-            raise InputError("--device cuda: --stability and --volume compute on the CPU only; use --device cpu.")
+            raise InputError(f"--device cuda: {chosen[0]} computes on the CPU only; use --device cpu.")
         wanted = "cpu"
     device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
     out, log = Path(config.out), []
@@ -58,6 +59,9 @@ def run(config: CompareConfig) -> int:
     elif config.volume:
         name, code = "volume", 0
         measure.compare_with_physics(out, say)
+    elif config.cameras:
+        name, code = "cameras", 0
+        through_lenses.compare_cameras(out, say)
     else:
         name, code = "compare", 0
         _compare_pixel_loops(config, scenes, device, out, say)

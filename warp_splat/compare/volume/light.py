@@ -194,7 +194,10 @@ def _march(keep: np.ndarray, light: np.ndarray, background: np.ndarray) -> np.nd
 
 
 def camera_rays(camera: Camera) -> np.ndarray:
-    """Unit directions in the world through the pixel centers, [H * W, 3]."""
+    """Unit directions in the world through the pixel centers, [H * W, 3]; NaN where a lens sees nothing."""
+    if camera.lens:
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        return camera.rays(np.stack([x.ravel(), y.ravel()], 1)) @ camera.rotation
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     directions = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
@@ -236,7 +239,7 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
     order = np.argsort(volume.means @ camera.forward, kind="stable")
 
     def footprint(projection: str, blur: float) -> np.ndarray:
-        return peak * _falloff(oracle.exact_splats(*scene, camera, projection=projection), camera, blur)
+        return peak * falloff_at(oracle.exact_splats(*scene, camera, projection=projection), camera, blur)
 
     alphas = {
         "no overlap": -np.expm1(-exact),
@@ -246,21 +249,25 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
         "ellipsoid": -np.expm1(-footprint("ellipsoid", 0.0)),
         "affine + blur": -np.expm1(-footprint("affine", oracle.BLUR)),
     }
-    images = {name: _composite(alpha[:, order], volume, order, camera) for name, alpha in alphas.items()}
+    images = {name: composite(alpha[:, order], volume, order, camera) for name, alpha in alphas.items()}
     images["3DGS"] = oracle.exact_render(*scene, camera, background=torch.from_numpy(volume.background)).image.numpy()
     return images
 
 
-def _falloff(splats: oracle.Splats, camera: Camera, blur: float) -> np.ndarray:
+def falloff_at(splats: oracle.Splats, camera: Camera, blur: float) -> np.ndarray:
     """exp(-d' cov2d^-1 d / 2) at each pixel, [H * W, N], with ``blur`` px^2 in place of the oracle's."""
     covariance = splats.cov2d.numpy() + (blur - oracle.BLUR) * np.eye(2)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    offset = np.stack([x, y], -1).reshape(-1, 1, 2) - splats.means2d.numpy()
-    exponent = np.einsum("pni,nij,pnj->pn", offset, np.linalg.inv(covariance), offset)
-    return np.exp(-0.5 * exponent) * splats.live.numpy()
+    offset, sharp = np.stack([x, y], -1).reshape(-1, 1, 2) - splats.means2d.numpy(), np.linalg.inv(covariance)
+    around = camera.lens is not None and camera.lens.family.around
+    falloff = 0.0
+    for shift in (0, camera.width, -camera.width) if around else (0,):  # a panorama's copies
+        moved = offset + np.array([shift, 0])
+        falloff = falloff + np.exp(-0.5 * np.einsum("pni,nij,pnj->pn", moved, sharp, moved))
+    return falloff * splats.live.numpy()
 
 
-def _composite(alpha: np.ndarray, volume: Volume, order: np.ndarray, camera: Camera) -> np.ndarray:
+def composite(alpha: np.ndarray, volume: Volume, order: np.ndarray, camera: Camera) -> np.ndarray:
     """Front to back, ``alpha`` [H * W, N] being in ``order``."""
     through = np.cumprod(np.concatenate([np.ones_like(alpha[:, :1]), 1 - alpha], 1), axis=1)
     image = (through[:, :-1] * alpha) @ volume.colors[order] + through[:, -1:] * volume.background
