@@ -12,6 +12,9 @@ from warp_splat import Camera, CameraParameters, InputError, RasterOptions, rast
 from warp_splat.kernels.formula import Notes, Number
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS, PINHOLE
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import CPU
+from warp_splat.raster.project import project
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -159,3 +162,26 @@ def test_channels_cross_the_seam(device):
     assert out.strongest.max() < len(scene.means) and (out.strongest[:, [0, -1]] >= 0).any()
     out.features.sum().backward()
     assert features.grad.sum() == pytest.approx(3 * float(out.alpha.sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "projection"),
+    [
+        ("fisheye", "affine"),
+        *(
+            pytest.param(name, projection, marks=pytest.mark.long)
+            for name, projection in (("opencv", "affine"), ("panorama", "affine"), ("fisheye", "unscented"))
+        ),
+    ],
+)
+def test_one_at_a_time_as_on_a_gpu_is_the_same(name, projection):
+    """The kernels of a GPU, against sixteen Gaussians at once."""
+    scene, options = scenes.SCENES[name](), RasterOptions(projection=projection)
+    found = []
+    for driver in (CPU, replace(CPU, lanes=1)):
+        given = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
+        splats = project(Gaussians(*given[:4], given[4][:, :1], given[4][:, 1:]), scene.camera, options, driver)
+        upstream = [torch.ones_like(part) for part in splats[:5]]
+        found.append([*splats[:6], *torch.autograd.grad(splats[:5], given, upstream)])
+    for sixteen, one in zip(*found, strict=True):
+        torch.testing.assert_close(sixteen, one, rtol=5e-5, atol=1e-5 * max(float(one.abs().max()), 1e-9))

@@ -22,6 +22,7 @@ from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
+from warp_splat.sfm import stages
 from warp_splat.sfm.command import scene_for, sfm
 from warp_splat.sfm.video import sample_frames
 
@@ -74,6 +75,17 @@ def test_the_cameras_are_found(photos, scene):
     assert errors.max() < 0.01  # the camera goes along 2 units
     for view in views:
         assert abs(view.camera.fx / room.FOCAL - 1) < 0.01 and abs(view.camera.fy / room.FOCAL - 1) < 0.01
+
+
+def test_photographs_may_keep_their_lens(photos, scene, tmp_path):
+    config = SfmConfig(str(photos[0]), str(tmp_path), keep_lens=True, quiet=True)
+    stages.write_scene(scene / "sfm" / "models" / "0", photos[0], tmp_path, tmp_path / "part", COUNT, config)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "sparse"]
+    lines = []
+    views = load_scene(tmp_path, lens="native", report=lines.append).train
+    assert len(views) == COUNT and all(view.camera.lens for view in views) and "Keeping" in lines[-1]
+    for view in views:
+        assert (tmp_path / "images" / view.name).read_bytes() == (photos[0] / view.name).read_bytes()
 
 
 def test_the_scene_is_said_to_be_complete(photos, scene, capsys):

@@ -2,6 +2,7 @@
 
 import itertools
 import socket
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from warp_splat.camera import Camera
 from warp_splat.config import NEAR
 from warp_splat.errors import InputError
+from warp_splat.lenses import Lens
 from warp_splat.viewer import server
 from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
 from warp_splat.viewer.pace import FEWEST, MOST, Pace
@@ -152,3 +154,13 @@ def test_free_port():
         port = taken.getsockname()[1]
         assert port < server.free_port(port) < port + server.PORTS
     assert server.free_port(port) == port
+
+
+@pytest.mark.parametrize(("model", "kept"), [("OPENCV_FISHEYE", True), ("EQUIRECTANGULAR", False)])
+def test_photographs_show_through_their_own_lens(model, kept):
+    """A window that is wider than a panorama is a pinhole's."""
+    lens = Lens(model, (0.02, 0.0, 0.0, 0.0) if kept else ())
+    numbers = {"fx": 300 / np.pi, "fy": 300 / np.pi, "cx": 300, "cy": 150, "width": 600, "height": 300}
+    wide, box = framed(replace(PHOTO, **numbers, lens=lens), 900, 300)
+    assert wide.lens == (lens if kept else None) and (wide.width, wide.height) == (900, 300)
+    assert box == Box(150, 0, 600, 300) and (wide.cx, wide.cy) == (450, 150)

@@ -137,6 +137,7 @@ class SfmConfig:
 
     photos: str = argument("folder of photographs, or a video")
     scene: str = argument("the folder to write: images/ without distortion, sparse/0, and the work in sfm/")
+    keep_lens: bool = flag(False, "images/ as they are, with their lenses, for train --lens native")
     frames: int = flag(150, "frames to take from a video: the sharpest of each of as many equal spans", least=3)
     matching: str = flag(
         "auto",

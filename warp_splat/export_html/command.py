@@ -56,6 +56,8 @@ def export_html(config: ExportHtmlConfig) -> int:
     write_text(path, page)
     size, total = len(page) / 1e6, len(splats.means)
     print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
+    if bent := sum(camera.lens is not None for _, camera in cameras):
+        print(f"  {bent} cameras have lenses with distortion; the page shows what pinholes would see from there.")
     if size > LARGE:
         print("  This is large, and phones lack the memory; --max_gaussians N keeps the N that matter most.")
     return 0

@@ -116,6 +116,7 @@ def _check_source(source: Path) -> None:
 def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     """The folder of the work in ``scene``, which is new, or was begun on the same input with the same options."""
     work, options = scene / WORK, {name: getattr(config, name) for name in ("frames", "matching", "seed")}
+    options |= {"keep_lens": True} if config.keep_lens else {}
     if source.resolve() == scene.resolve():
         raise InputError(f"{scene}: expected another folder than that of the photographs for the scene; choose one.")
     if source.is_dir():
@@ -203,7 +204,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         )
     model = models[best]
     registered = {model.image(index).name for index in model.reg_image_ids()}
-    stages.write_undistorted(work / "models" / str(best), root, scene, work / "scene.part", sizes[best], config)
+    stages.write_scene(work / "models" / str(best), root, scene, work / "scene.part", sizes[best], config)
     return {
         "photographs": len(names) + len(broken),
         "unreadable": broken,
@@ -214,6 +215,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         "reprojection_error_px": model.compute_mean_reprojection_error(),
         "track_length": model.compute_mean_track_length(),
         "threads": config.threads,
+        "keep_lens": config.keep_lens,
     }
 
 
@@ -252,4 +254,5 @@ def _summarize(scene: Path, summary: dict[str, Any]) -> None:
         print(f"  the photographs fall apart into {len(others) + 1} models; others have {', '.join(map(str, others))}")
     if registered < FEW * count:
         print(f"  warning: only {registered} of {count} photographs registered; {ADVICE}.")
-    print(f"  train on it: {shlex.join(['warp-splat', 'train', '-s', str(scene), '--eval'])}")
+    lens = ["--lens", "native"] if summary.get("keep_lens") else []
+    print(f"  train on it: {shlex.join(['warp-splat', 'train', '-s', str(scene), '--eval', *lens])}")

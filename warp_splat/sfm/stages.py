@@ -127,19 +127,35 @@ def reconstruct(database: Path, root: Path, models: Path, config: SfmConfig) -> 
     return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir() if folder.is_dir()}
 
 
-def write_undistorted(model: Path, root: Path, scene: Path, part: Path, count: int, config: SfmConfig) -> None:
-    """Write the photographs without distortion to ``scene``/images and their pinhole cameras to ``scene``/sparse/0."""
+def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, config: SfmConfig) -> None:
+    """Write the photographs to ``scene``/images and their cameras to ``scene``/sparse/0.
+
+    Without distortion, and pinholes; with ``config.keep_lens`` as they are.
+    """
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
-    work = partial(pycolmap.undistort_images, part, model, root, num_threads=config.threads)
+    if config.keep_lens:
+        title, work = "copies", partial(_copy, part, model, root)
+    else:
+        work = partial(pycolmap.undistort_images, part, model, root, num_threads=config.threads)
+        title = "undistortion"
 
     def written() -> int:
         return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
 
-    run_watched("undistortion", count, work, written, config.quiet)
+    run_watched(title, count, work, written, config.quiet)
     if written() < count:
         raise InputError(f"{part}: only {written()} of {count} images could be written; free some space and run again.")
     os.replace(part / "images", scene / "images")
     os.renames(part / "sparse", part / "model" / "0")
     os.replace(part / "model", scene / "sparse")  # the last step: where sparse/ is, all is
     shutil.rmtree(part, ignore_errors=True)
+
+
+def _copy(part: Path, model: Path, root: Path, cancellation_token: object) -> None:
+    """Photographs and model as they are, to where undistortion puts its own; too short to be canceled."""
+    shutil.copytree(model, part / "sparse")
+    found = pycolmap.Reconstruction(model)
+    for name in (found.image(index).name for index in found.reg_image_ids()):
+        (part / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(root / name, part / "images" / name)

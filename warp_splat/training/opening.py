@@ -69,6 +69,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         from warp_splat.sfm.command import scene_for  # noqa: PLC0415 - only photographs without cameras need it
 
         options = {"threads": machine.threads, "seed": config.learn.seed % 2**31, "quiet": quiet}
+        options["keep_lens"] = data.lens == "native"
         source = scene_for(source, processes.count, **options)
     config = config.changed(
         quiet=quiet,

@@ -66,12 +66,17 @@ def sized(camera: Camera, pixels: float) -> Camera:
 def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
     """A photograph's camera for a window of ``width`` x ``height`` px, and where the photograph lies in it.
 
-    The photograph is as large as fits, in the middle; around it the camera sees on.
+    The photograph is as large as fits, in the middle; around it the camera sees on. Where its lens cannot, as that of a
+    panorama, a pinhole takes its place.
     """
     scale = min(width / camera.width, height / camera.height)
     inner = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
     left, top = (width - inner.width) // 2, (height - inner.height) // 2
-    wide = replace(inner, width=width, height=height, cx=inner.cx + left, cy=inner.cy + top)
+    size = {"width": width, "height": height, "cx": inner.cx + left, "cy": inner.cy + top}
+    try:
+        wide = replace(inner, **size)
+    except InputError:
+        wide = replace(inner, **size, lens=None)
     return wide, Box(left, top, inner.width, inner.height)
 
 
