@@ -1,5 +1,6 @@
 """gsplat's function: its projection and harmonics in torch are the truth, for pixels our float64 oracle is."""
 
+import contextlib
 import inspect
 
 import pytest
@@ -157,6 +158,38 @@ def test_gradients_of_what_meta_shows_and_sparse_ones():
     assert (clipped["radii"] > 8).any(-1).all() and len(clipped["radii"]) > 0
 
 
+@pytest.mark.parametrize("driver", ["lanes", "blocks"])
+@pytest.mark.parametrize(("mode", "channels"), [pytest.param("RGB", 3, marks=pytest.mark.long), ("RGB+ED", 5)])
+def test_sums_of_magnitudes(mode, channels, driver):
+    """Each pixel's own gradient of the 2D means, by float64."""
+    call = call_of("degree1", sh_degree=None, render_mode=mode, absgrad=True)
+    generator = torch.Generator().manual_seed(3)
+    call["colors"] = torch.rand(len(call["means"]), channels, generator=generator)
+    behind = torch.rand(2, channels, generator=generator)
+    weights = torch.randn(2, call["height"], call["width"], channels + ("D" in mode) + 1, generator=generator)
+    with using(CUDA) if driver == "blocks" else contextlib.nullcontext():
+        image, alpha, meta = rasterization(**call, backgrounds=behind)
+        assert not meta["means2d"].absgrad.any()
+        (torch.cat([image, alpha], -1) * weights).sum().backward()
+    pixels = torch.cartesian_prod(torch.arange(call["height"]), torch.arange(call["width"])).flip(1) + 0.5
+    for view in range(2):
+        mine = meta["camera_ids"] == view
+        order = meta["depths"][mine].argsort(stable=True)
+        ids, depths = meta["gaussian_ids"][mine][order], meta["depths"][mine][order].detach().double()
+        means2d = meta["means2d"][mine][order].detach().double()[None].repeat(len(pixels), 1, 1).requires_grad_()
+        dx, dy = (means2d - pixels[:, None]).unbind(2)
+        xx, xy, yy = meta["conics"][mine][order].detach().double().unbind(1)
+        raw = call["opacities"][ids].detach() * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+        solid = torch.where(raw >= 1 / 255, raw.clamp_max(0.99), 0.0)
+        after = torch.cumprod(1 - solid, 1)
+        share = solid * torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+        light, total = share @ call["colors"][ids].double() + after[:, -1:] * behind[view], share.sum(1, keepdim=True)
+        parts = [light, *([share @ depths[:, None] / total.clamp_min(1e-10)] if "D" in mode else []), total]
+        (torch.cat(parts, 1) * weights[view].flatten(0, 1)).sum().backward()
+        expected = means2d.grad.abs().sum(0)
+        assert relative_error(meta["means2d"].absgrad[mine][order], expected) < 1e-3
+
+
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("steps", [60, pytest.param(300, marks=pytest.mark.long)])
 def test_its_strategy_grows_a_model(packed, steps):
@@ -177,7 +210,7 @@ def test_its_strategy_grows_a_model(packed, steps):
         image, _, meta = rasterization(**activated, **cameras, packed=packed)
         strategy.step_pre_backward(params, optimizers, state, step, meta)
         loss = (image - target).square().mean()
-        losses.append(float(loss))
+        losses.append(loss.item())
         loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
@@ -189,6 +222,7 @@ def test_its_strategy_grows_a_model(packed, steps):
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
+        ({"absgrad": True, "sh_degree": None, "colors": torch.zeros(120, 31)}, "absgrad: expected at most 30 channels"),
         ({"distributed": True}, "distributed: warp_splat.gsplat does not carry it; render in each process"),
         ({"with_ut": True}, "with_ut: .* does not carry"),
         ({"with_eval3d": True}, "with_eval3d: .* does not carry"),

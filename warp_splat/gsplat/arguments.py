@@ -10,13 +10,12 @@ import torch
 
 from warp_splat.config import CHANNELS_MOST, TILE
 from warp_splat.errors import InputError
-from warp_splat.raster.drivers import DRIVERS
+from warp_splat.raster.drivers import DRIVERS, driver_of
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 #: What gsplat has and this does not, and what to do instead.
 NOT_CARRIED = {
-    "absgrad": "leave it False",
     "distributed": "render in each process by itself",
     "covars": "give quats and scales",
     "with_ut": "leave it False: Gaussians are projected by their linearization",
@@ -87,6 +86,9 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
         raise InputError(f"colors: expected {least} or more coefficients of 3 colors, got {list(colors.shape[-2:])}.")
     if tail == 1 and not 1 <= colors.shape[-1] <= CHANNELS_MOST:
         raise InputError(f"colors: expected 1 to {CHANNELS_MOST} channels, got {colors.shape[-1]}.")
+    most = driver_of(means.device).channels.at_once - 2  # the depth and alpha are two more
+    if request.absgrad and colors.shape[-1] > most:
+        raise InputError(f"absgrad: expected at most {most} channels in colors with it, got {colors.shape[-1]}.")
     flat["colors"] = colors.reshape(scenes, per_view, count, *colors.shape[-tail:])
     if request.backgrounds is not None:
         shape = (cameras, colors.shape[-1])

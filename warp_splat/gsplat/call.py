@@ -74,7 +74,8 @@ def rasterization(
         backgrounds: [..., C, D].
         render_mode: "RGB", "D" (sum of weight times z), "ED" (mean z), "RGB+D" or "RGB+ED".
         sparse_grad: the gradients of means, quats and scales are sparse tensors; only where ``packed``.
-        absgrad: ``meta["means2d"].absgrad`` gets the sums of the gradients' magnitudes.
+        absgrad: ``backward`` writes the sums of the magnitudes of the pixels' gradients to ``meta["means2d"].absgrad``
+            (Ye et al. 2024); at most 30 channels of color then, 14 on a GPU.
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: of no effect: how many channels go at once is the kernels' choice.
         distributed: must be False.
@@ -104,5 +105,9 @@ def rasterization(
     seen = see(request)
     drawn.append(seen.drawn)
     shown, seen = show(request, seen)
-    images, alphas, bins = draw(request, seen, colors_of(request, seen))
+    magnitudes = None
+    if absgrad:
+        magnitudes = torch.zeros_like(shown["means2d"].detach())
+        setattr(shown["means2d"], "absgrad", magnitudes)  # noqa: B010 - which a tensor does not have
+    images, alphas, bins = draw(request, seen, colors_of(request, seen), magnitudes)
     return images, alphas, shown | tell(request, seen, bins)

@@ -40,7 +40,9 @@ class _Thinned(torch.autograd.Function):
     @staticmethod
     def backward(ctx, adj):
         seen = ctx.drawn[0].any(1).view(adj.shape[:-1])
-        return torch.sparse_coo_tensor(seen.nonzero().T, adj[seen], adj.shape, is_coalesced=True), None
+        return torch.sparse_coo_tensor(
+            seen.nonzero().T, adj[seen], adj.shape, is_coalesced=True, check_invariants=True
+        ), None
 
 
 def thin(tensor: torch.Tensor, drawn: list[torch.Tensor]) -> torch.Tensor:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.gsplat.arguments import Request
 from warp_splat.gsplat.seen import Seen
-from warp_splat.raster.beside import Blended, blend_channels
+from warp_splat.raster.beside import Blended, absolute_gradients, blend_channels
 from warp_splat.raster.blend import blend
 from warp_splat.raster.data import Bins, Dropped, Splats2D, Walk
 from warp_splat.raster.drivers import driver_of
@@ -17,15 +18,48 @@ from warp_splat.raster.drivers import driver_of
 LEAST = 1e-10  # alpha that a mean depth is divided by
 
 
-def draw(request: Request, seen: Seen, colors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, list[Bins]]:
-    """Images [..., C, H, W, channels], alphas [..., C, H, W, 1], and the lists of each view."""
+class _Magnitudes(torch.autograd.Function):
+    """Pixels as they are; their adjoint also writes what :func:`absolute_gradients` finds into ``into`` [N or nnz, 2].
+
+    Image and background, other channels, depth and alpha are one group: alpha is the sum of the weights times 1.
+    """
+
+    @staticmethod
+    def forward(ctx, image, others, depth, alpha, channels, background, into, drawn, blended):
+        ctx.save_for_backward(channels, background)
+        ctx.into, ctx.drawn, ctx.blended = into, drawn, blended
+        return image.clone(), others.clone(), depth.clone(), alpha.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_image, adj_others, adj_depth, adj_alpha):
+        channels, background = ctx.saved_tensors
+        adj_alpha_alone = adj_alpha - (adj_image * background).sum(-1, keepdim=True)
+        parts = [adj_image, adj_others, *([adj_depth] if adj_depth.numel() else []), adj_alpha_alone]
+        found = absolute_gradients(channels, torch.cat(parts, -1), ctx.blended)
+        ctx.into.copy_(found if len(ctx.into) == len(found) else found[ctx.drawn])
+        return adj_image, adj_others, adj_depth, adj_alpha, *[None] * 5
+
+
+def draw(
+    request: Request, seen: Seen, colors: torch.Tensor, magnitudes: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor, list[Bins]]:
+    """Images [..., C, H, W, channels], alphas [..., C, H, W, 1], and the lists of each view.
+
+    The adjoint fills ``magnitudes``, of the shape of meta's means2d, if asked for.
+    """
+    sizes = (
+        seen.drawn.sum(2).flatten().tolist() if request.packed else [seen.drawn.shape[2]] * seen.drawn[..., 0].numel()
+    )
+    into = [None] * len(sizes) if magnitudes is None else magnitudes.view(-1, 2).split(sizes)
     scenes, cameras = seen.drawn.shape[:2]
     images, alphas, lists = [], [], []
     for scene in range(scenes):
         for camera in range(cameras):
             mine = colors[scene, camera % colors.shape[1]]
             behind = None if request.backgrounds is None else request.backgrounds[scene, camera]
-            image, alpha, bins = _draw_view(request, Seen(*(part[scene, camera] for part in seen)), mine, behind)
+            view = Seen(*(part[scene, camera] for part in seen))
+            image, alpha, bins = _draw_view(request, view, mine, behind, into[scene * cameras + camera])
             images.append(image)
             alphas.append(alpha)
             lists.append(bins)
@@ -33,7 +67,9 @@ def draw(request: Request, seen: Seen, colors: torch.Tensor) -> tuple[torch.Tens
     return torch.stack(images).unflatten(0, shape), torch.stack(alphas).unflatten(0, shape), lists
 
 
-def _draw_view(request: Request, seen: Seen, colors: torch.Tensor, behind: torch.Tensor | None):
+def _draw_view(
+    request: Request, seen: Seen, colors: torch.Tensor, behind: torch.Tensor | None, into: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor, Bins]:
     """An image [H, W, channels], its alpha [H, W, 1] and its lists. Three channels and the depth are the color's."""
     device, count = colors.device, len(colors)
     wanted = request.render_mode.split("+")
@@ -49,11 +85,17 @@ def _draw_view(request: Request, seen: Seen, colors: torch.Tensor, behind: torch
     driver, options = driver_of(device), RasterOptions(depth=wanted[-1] in ("D", "ED"))
     bins, walk, dropped = driver.bin(splats, frame, options), Walk(), Dropped()
     image, alpha, depth = blend(splats, bins, background, frame, options, "manual", driver, dropped, walk)
-    alpha, parts = alpha[..., None], [image[..., : 3 - spare]]
+    blended = Blended(bins, walk, frame, options, "manual", driver, dropped)
+    alpha, depth, others = alpha[..., None], depth[..., None], image[..., :0]
     if colors.shape[1] > 3:
-        blended = Blended(bins, walk, frame, options, "manual", driver, dropped)
-        parts.append(blend_channels(splats, colors[:, 3:], blended) + (1 - alpha) * behind[3:])
+        others = blend_channels(splats, colors[:, 3:], blended)
+    if into is not None:
+        channels = [first, colors[:, 3:], *([seen.depths[:, None]] if options.depth else []), first.new_ones(count, 1)]
+        channels = torch.cat(channels, 1)
+        image, others, depth, alpha = _Magnitudes.apply(
+            image, others, depth, alpha, channels, background, into, seen.drawn, blended
+        )
+    parts = [image[..., : 3 - spare], others + (1 - alpha) * behind[3:]]
     if options.depth:
-        depth = depth[..., None]
         parts.append(depth / alpha.clamp_min(LEAST) if wanted[-1] == "ED" else depth)
     return torch.cat(parts, -1), alpha, bins

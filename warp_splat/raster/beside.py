@@ -204,16 +204,34 @@ def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
         yield begin, rows
 
 
+def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blended: Blended) -> torch.Tensor:
+    """Sums over pixels of the magnitudes of the 2D means' gradients, [N, 2].
+
+    By all that a pixel blends: ``channels`` [N, C] of one group, with their upstream gradients [H, W, C].
+    """
+    ((_, rows),) = _groups(blended.bins, channels, blended.driver)
+    adj_pixels = adj_pixels.contiguous()
+    (means2d, *_), _ = _differentiate(blended, rows, None, 0, channels.shape[1], adj_pixels, "absolute")
+    return means2d
+
+
 def _differentiate(
-    blended: Blended, rows: torch.Tensor, ranks: torch.Tensor | None, begin: int, group: int, adj_pixels: torch.Tensor
+    blended: Blended,
+    rows: torch.Tensor,
+    ranks: torch.Tensor | None,
+    begin: int,
+    group: int,
+    adj_pixels: torch.Tensor,
+    mode: str = "",
 ) -> tuple[list[torch.Tensor], torch.Tensor]:
     """Gradients of means2d, conics and opacities, and those of a group of channels [N, group].
 
     With ``ranks``, by the weights of those Gaussians instead of channels.
     """
     bins, walk, _, options, adjoint, driver, _ = blended
-    mode = "manual" if adjoint == "manual" else "stepwise"
+    mode = mode or ("manual" if adjoint == "manual" else "stepwise")
     most, width = (0, next(width for width in WIDTHS if width >= group)) if ranks is None else (group, 0)
+    width = 0 if mode == "absolute" else width
     slots = _new_slots(bins, CHANNEL + width)
     kernel = driver.channels.adjoint(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()

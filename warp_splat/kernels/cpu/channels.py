@@ -13,7 +13,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.adjoint import folded, vec5, vec8
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
-from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.falloff import LN_2, make_falloff
 from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
@@ -199,6 +199,27 @@ def _make_body(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp.Functi
         return front, adj_front, adj.red, part
 
     @wp.func
+    def absolute(
+        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alpha_min: float, here: vec16, walked: vec16,
+        lit: vec16,
+    ):  # fmt: skip
+        """As ``manual``; what is summed are the magnitudes of what each pixel says of the mean."""
+        z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
+        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
+        adj_u = times(fma(dx, splat.root[0], times(dy, splat.root[1])), adj_opacity)
+        adj_v = times(times(dy, splat.root[2]), adj_opacity)
+        adj_x = times(adj_u, splat.root[0])
+        adj_y = fma(adj_u, splat.root[1], times(adj_v, splat.root[2]))
+        part = mat_geometry()
+        part[MEAN_X] = wp.max(adj_x, -adj_x)
+        part[MEAN_Y] = wp.max(adj_y, -adj_y)
+        return front, adj_front, w, part
+
+    @wp.func
+    def from_magnitudes(sums: vec5, splat: Splat2D):
+        return 2.0 * LN_2 * splat.opacity * wp.vec2(sums[MEAN_X], sums[MEAN_Y]), wp.vec3(0.0)
+
+    @wp.func
     def from_moments(sums: vec5, splat: Splat2D):
         s = wp.vec2(sums[MEAN_X], sums[MEAN_Y])
         return geometry_from_moments(s, sums[XX], sums[XY], sums[YY], splat.root, splat.opacity)
@@ -208,20 +229,23 @@ def _make_body(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp.Functi
         adj_root = wp.vec3(sums[XX], sums[XY], sums[YY])
         return wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic_from_root(adj_root, splat.root)
 
-    return (manual, from_moments) if mode == "manual" else (stepwise, from_root)
+    bodies = {"manual": (manual, from_moments), "stepwise": (stepwise, from_root)}
+    return {**bodies, "absolute": (absolute, from_magnitudes)}[mode]
 
 
 @functools.cache
 def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
     """The adjoint of the sums, by hand or by Warp's derivative of a step.
 
-    With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
+    By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others (Ye et
+    al. 2024). With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
     body, adj_geometry = _make_body(mode, variant)
     WIDTH = most or AT_ONCE  # of a block's numbers
+    geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     T, ADJ_T, WALKED, UP = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS
     RANK, SUMS = UP + WIDTH * BLOCKS, UP + (2 if most else 1) * WIDTH * BLOCKS
-    GRADS = CHANNEL + (0 if most else WIDTH)
+    GRADS = CHANNEL + (0 if geometric else WIDTH)
     mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(IN_LANES))
@@ -238,7 +262,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         channels: int,  # of the group, or weights
         adj_pixels: wp.array3d[float],  # [H, W, C]
         # out
-        slots_out: wp.array2d[float],  # [M, CHANNEL + channels or more], of weights [M, CHANNEL]
+        slots_out: wp.array2d[float],  # [M, CHANNEL + channels or more], geometric [M, CHANNEL]
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
@@ -300,7 +324,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                     s[ADJ_T + block] = adj_front
                     for grad in range(CHANNEL):
                         s[SUMS + grad] = s[SUMS + grad] + part[grad]
-                    if wp.static(most == 0):
+                    if wp.static(not geometric):
                         if some(w):
                             channel = int(0)
                             while channel < channels:

@@ -14,7 +14,7 @@ from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import fma
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, exponent
-from warp_splat.kernels.step import make_manual, make_stepwise, opaque
+from warp_splat.kernels.step import geometry_from_moments, make_manual, make_stepwise, opaque
 from warp_splat.kernels.structs import BinsView
 
 AT_ONCE = 16  # channels: registers
@@ -77,9 +77,11 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
 def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
     """The adjoint of the sums, by hand or by Warp's derivative of a step.
 
-    With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
+    By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others (Ye et
+    al. 2024). With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
     WIDTH = most or AT_ONCE
+    geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     adj_step = make_manual(variant.falloff, float)
     Parcel, undo, step = make_stepwise(variant, float)
     vec_up = wp.types.vector(length=WIDTH, dtype=float)
@@ -97,7 +99,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         channels: int,  # of the group, or weights
         adj_pixels: wp.array3d[float],  # [H, W, C]
         # out
-        slots_out: wp.array2d[float],  # [M, CHANNEL + channels or more], of weights [M, CHANNEL]
+        slots_out: wp.array2d[float],  # [M, CHANNEL + channels or more], geometric [M, CHANNEL]
     ):
         tile, thread = wp.tid()
         column = (tile % bins.tiles_x) * TILE + thread % TILE
@@ -129,13 +131,18 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                     lit += wp.where(chosen[channel] == here, up[channel], 0.0)
                 else:
                     lit += up[channel] * rows[splat, channel]
-            if wp.static(mode == "manual"):
+            if wp.static(mode != "stepwise"):
                 z = exponent(dx, dy, g[XX], g[XY], g[YY])
                 front, beyond, w, adj_opacity = adj_step(z, g[OPACITY], t, adj_t, alpha_min, here, walked, lit)
                 sx = adj_opacity * dx
                 sy = adj_opacity * dy
                 grads = vec10(sx, sy, sx * dx, sx * dy, sy * dy, adj_opacity, 0.0, 0.0, 0.0, 0.0)
                 adj_t = beyond
+                if wp.static(mode == "absolute"):
+                    mean, _conic = geometry_from_moments(
+                        wp.vec2(sx, sy), 0.0, 0.0, 0.0, wp.vec3(g[XX], g[XY], g[YY]), g[OPACITY]
+                    )
+                    grads = vec10(wp.abs(mean[0]), wp.abs(mean[1]), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             else:
                 parcel = Parcel()
                 parcel.dx = dx
@@ -154,14 +161,15 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 adj_t = adj_front
             t = front
             sums = wp.tile_sum(wp.tile(grads, preserve_type=True))[0]
+            row = sums
             if wp.static(mode == "manual"):
                 row = row_from_moments(sums, g)
-            else:
+            if wp.static(mode == "stepwise"):
                 row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
             if thread == 0:
                 for grad in range(CHANNEL):
                     slots_out[k, grad] = row[grad]
-            if wp.static(most == 0):
+            if wp.static(not geometric):
                 more = wp.tile_sum(wp.tile(w * up, preserve_type=True))[0]
                 if thread == 0:
                     for channel in range(WIDTH):
