@@ -25,6 +25,7 @@ SHUTTER, APERTURE, SPEED = 1 / 60, 4.0, 200  # of a photograph that nothing was 
 FALLOFF = 0.35  # of light in the corners
 ANGLE, SHIFT = 0.5, 0.01  # root mean squares: of a turn [degrees], of a place, as a share of the cameras' extent
 FOCAL = 0.01  # of the focal lengths
+CORNER = np.array((-4.8, 4.8, 0.0))  # where two walls meet
 
 
 class Fault:
@@ -79,7 +80,18 @@ def focal(fault: Fault, images: dict, model) -> float:
     return 1 + FOCAL
 
 
-FAULTS = {make.__name__: make for make in (exposure, vignetting, pose, focal)}
+def corner(fault: Fault, images: dict, model) -> list[str]:
+    """Of the photographs that see a corner of the room all but two are left out: their masks are black."""
+    seeing = []
+    for image in [model.image(i) for i in model.reg_image_ids()]:
+        place = image.project_point(CORNER)
+        if image.name in fault.names and place is not None and (0 <= place).all():
+            if (place < (image.camera.width, image.camera.height)).all():
+                seeing.append(image.name)
+    return sorted(fault.random.permutation(sorted(seeing))[2:].tolist())
+
+
+FAULTS = {make.__name__: make for make in (exposure, vignetting, pose, focal, corner)}
 
 
 def make_faulty(out: pathlib.Path, faults: list[str], seed: int = 0) -> dict:
@@ -96,6 +108,9 @@ def make_faulty(out: pathlib.Path, faults: list[str], seed: int = 0) -> dict:
     (out / "images").mkdir(parents=True)
     (out / "sparse" / "0").mkdir(parents=True)
     model.write_binary(str(out / "sparse" / "0"))
+    for name in truth.get("corner", []):  # left out of the model, they would change which ones are held out
+        (out / "masks").mkdir(exist_ok=True)
+        write_photograph(out / "masks" / name, np.zeros_like(images[name]), None)
     changes = truth.get("exposure", {})
     for index, name in enumerate(names):
         if name in images:

@@ -14,7 +14,7 @@ from test_checkpoints import begin, state_of, steps
 from test_train import SCENE
 
 from warp_splat.cli import main
-from warp_splat.color import to_srgb
+from warp_splat.color import from_srgb, to_srgb
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime import pool
@@ -152,6 +152,51 @@ def test_gains_are_found_from_the_tracks_and_decide_what_auto_takes(faulty):
     assert np.median(np.abs(2 ** (errors - errors.mean(0)) - 1)) < 0.01
     assert abs(sum(gains.values())).max() < 1e-12
     assert choose(TrainConfig(parts="auto"), replace(changed, find_tracks=dict))[0] == []
+
+
+@pytest.mark.slow
+def test_faults_are_what_they_say(tmp_path):
+    """Of all kinds at once: poses, focal lengths, falling light, photographs left out; none of what is held out."""
+    truth = make_faulty(tmp_path / "scene", ["vignetting", "pose", "focal", "corner"], seed=3)
+    clean, changed = (load_scene(path, eval=True, report=str) for path in (SCENE, tmp_path / "scene"))
+    assert len(truth["corner"]) == 2 and len(changed.train) == 41
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(clean.test, changed.test, strict=True))
+    whole, angles, shifts = {view.name: view for view in clean.train}, [], []
+    for view in changed.train:
+        before = whole[view.name].camera
+        assert view.camera.fx == pytest.approx(1.01 * before.fx)
+        turn = view.camera.rotation @ before.rotation.T
+        angles.append(np.degrees(np.arccos((np.trace(turn) - 1) / 2)))
+        shifts.append(np.linalg.norm(view.camera.center - before.center) / clean.extent)
+        corner, middle = (view.image[p] / whole[view.name].image[p].clip(1) for p in ((0, 0), (124, 132)))
+        assert (middle > 0.97).all() and (corner < 0.9).all()
+    assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(0.5, rel=0.15)
+    assert np.sqrt(np.mean(np.square(shifts))) == pytest.approx(0.01, rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_it_learns_gains_to_two_percent_of_light(kind, scene, tmp_path):
+    """Of photographs that are what the Gaussians show, brighter or darker; these do not learn."""
+    still = dict.fromkeys(("feature_lr", "opacity_lr", "scaling_lr", "rotation_lr"), 0.0)
+    still |= {
+        "position_lr_init": 1e-12,
+        "position_lr_final": 1e-12,
+        "densify_from_iter": 999,
+        "opacity_reset_interval": 999,
+    }
+    few, gains = scene.train[::6], np.random.default_rng(5).permutation(np.linspace(-0.45, 0.45, 9))
+    shown, _ = begin(replace(scene, train=few), tmp_path)
+    light = [from_srgb(shown.picture(v.camera) / 255, np.where) * 2**gain for v, gain in zip(few, gains, strict=True)]
+    images = [np.rint(255 * to_srgb(image, np.where).clip(0, 1)).astype(np.uint8) for image in light]
+    changed = replace(scene, train=[replace(v, image=image) for v, image in zip(few, images, strict=True)])
+    trainer, run = begin(changed, tmp_path, exposure=kind, iterations=300, **still)
+    steps(trainer, run, 300)
+    gray = torch.full((1, 1, 3), 0.4)
+    found = [trainer.parts[0].image(gray, None, SimpleNamespace(view=view)).mean().item() for view in changed.train]
+    stops = 2.4 * np.log2((np.array(found) + 0.055) / 0.455)
+    errors = stops - stops.mean() - (gains - gains.mean())
+    assert np.abs(2**errors - 1).max() < 0.02
 
 
 def test_light_times_a_number_is_a_gain_of_what_a_screen_shows():
