@@ -71,7 +71,7 @@ def modules() -> dict[str, wp.Module]:
     found["channels"] = channels.make_blend_channels(plain).module
     for mode in ADJOINTS[:2]:
         found[f"{mode}, channels"] = channels.make_adj_channels(mode, plain).module
-        found[f"{mode}, weights"] = channels.make_adj_channels(mode, plain, STRONGEST_MOST).module
+    found["weights"] = channels.make_adj_channels("manual", plain, STRONGEST_MOST).module
     found["magnitudes"] = channels.make_adj_channels("absolute", plain).module
     found["strongest"] = make_strongest(plain, STRONGEST_MOST).module
     return found

@@ -190,7 +190,7 @@ def test_sums_of_magnitudes(mode, channels, driver):
         assert relative_error(meta["means2d"].absgrad[mine][order], expected) < 1e-3
 
 
-@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("packed", [True, pytest.param(False, marks=pytest.mark.long)])
 @pytest.mark.parametrize("steps", [60, pytest.param(300, marks=pytest.mark.long)])
 def test_its_strategy_grows_a_model(packed, steps):
     """gsplat's own, on our meta."""
