@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat import Camera, CameraParameters, InputError, RasterOptions, rasterize
 from warp_splat.kernels.formula import Notes, Number
+from warp_splat.kernels.project import affine
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS, PINHOLE
 from warp_splat.raster.data import Gaussians
@@ -139,6 +140,8 @@ def test_what_knows_no_lenses_refuses_them():
         rasterize(*scene.parameters(), camera, options=RasterOptions(projection="ellipsoid"))
     with pytest.raises(InputError, match="base: expected a camera without distortion, got one with OPENCV"):
         CameraParameters(camera)
+    with pytest.raises(InputError, match="for a camera with a lens, got one of your own"):
+        rasterize(*scene.parameters(), camera, options=RasterOptions(projection=affine.PROJECTION))
     with pytest.raises(InputError, match=r"Camera lens: expected a warp_splat\.Lens or None, got 3"):
         replace(camera, lens=3)
 
@@ -149,6 +152,35 @@ def test_a_lens_without_distortion_is_a_pinhole(device):
     pinhole, drawn = (rasterize(*scene.parameters(), camera) for camera in (scene.camera, bent))
     assert PINHOLE.count == 0 and bent.lens.limit == np.pi / 2
     torch.testing.assert_close(drawn.image, pinhole.image, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("projection", ["affine", pytest.param("unscented", marks=pytest.mark.long)])
+def test_a_panorama_shows_what_is_straight_behind(projection, device):
+    """Half of it at either end of the picture."""
+    camera = scenes.SCENES["panorama"]().camera
+    camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))
+    means = torch.tensor([[0.0, 0.0, -3.0]], device=device)
+    one = torch.ones(1, 1, device=device)
+    shapes = (one * torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device), 0.3 * one.expand(1, 3), 0.9 * one[0])
+    sh = torch.full((1, 1, 3), 1.0, device=device)
+    out = rasterize(means, *shapes, sh, camera, options=RasterOptions(projection=projection))
+    assert out.alpha[:, [0, -1]].max() > 0.7 and out.alpha[:, camera.width // 2].max() == 0
+    torch.testing.assert_close(out.alpha, out.alpha.flip(1), rtol=0, atol=1e-4)
+    torch.testing.assert_close(out.alpha, out.alpha.flip(0), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("model", "coefficients"), [("FOV", (0.0,)), ("DIVISION", (-0.1,)), ("DIVISION", (0.1,))])
+def test_lenses_at_their_ends(model, coefficients, device):
+    """Without an angle of view a pinhole; and no number overflows near the direction that is infinitely far out."""
+    scene = scenes.SCENES["single"]().to(device)
+    camera = replace(scene.camera, lens=Lens(model, coefficients))
+    around = torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1e-3, 1e-3, 1.0])
+    means = (around - torch.from_numpy(camera.translation)) @ torch.from_numpy(camera.rotation)
+    rows = [tensor[:1].expand(4000, *tensor.shape[1:]) for tensor in scene.parameters()[1:]]
+    rasterize(means.float().to(device), *rows, camera)
+    if model == "FOV":
+        pinhole, drawn = (rasterize(*scene.parameters(), view) for view in (scene.camera, camera))
+        torch.testing.assert_close(drawn.image, pinhole.image, rtol=0, atol=1e-5)
 
 
 def test_channels_cross_the_seam(device):

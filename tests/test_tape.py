@@ -125,6 +125,17 @@ def test_arrays_that_want_no_gradient(wanted, device):
     ]
 
 
+def test_features_alone_may_want_a_gradient(device):
+    """What no gradient reaches, the image, is left alone; that of a sum of features is the weight of each Gaussian."""
+    scene, _, _ = scene_of(device)
+    arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]
+    features = wp.from_torch(torch.ones(len(scene.means), 1).to(device), requires_grad=True)
+    with wp.Tape() as recorded:
+        out = tape.rasterize(*arrays, scene.camera, features=features)
+    recorded.backward(grads={out.features: wp.full_like(out.features, 1.0)})
+    assert features.grad.numpy().sum() == pytest.approx(out.alpha.numpy().sum(), rel=1e-4)
+
+
 def test_without_gradients_or_a_tape_nothing_is_recorded(device):
     scene, _, _ = scene_of(device)
     arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]

@@ -104,8 +104,11 @@ def rasterize(
             pixels = {name: _array(tensor, PIXELS[name], recorded) for name, tensor in shown.items()}
             if recorded:
                 wanted = [name for name in named if named[name].requires_grad]
-                inputs, outputs = [named[name] for name in wanted], list(pixels.values())
-                backward = _adjoint(inputs, [leaves[name] for name in wanted], outputs, list(shown.values()))
+                reached = [name for name, tensor in shown.items() if tensor.requires_grad]
+                inputs, outputs = [named[name] for name in wanted], [pixels[name] for name in reached]
+                backward = _adjoint(
+                    inputs, [leaves[name] for name in wanted], outputs, [shown[name] for name in reached]
+                )
                 tape.record_func(backward, [array for array in (*inputs, *outputs) if array.size])
     others = {"strongest": None if found.strongest is None else wp.from_torch(found.strongest)}
     others |= {"invalid": found.invalid, "dropped": found.dropped, "radii": wp.from_torch(found.radii)}
@@ -147,7 +150,7 @@ def _adjoint(
     """What the tape calls on its way back."""
 
     def backward() -> None:
-        with _torch_on(inputs[0].device, True):
+        with _torch_on(outputs[0].device, True):
             upstream = [wp.to_torch(array.grad, requires_grad=False) for array in outputs]
             grads = torch.autograd.grad(shown, leaves, upstream, retain_graph=True, allow_unused=True)
             with stage("adjoint of tape"):

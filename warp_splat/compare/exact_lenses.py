@@ -39,7 +39,8 @@ def depths_of(points, lens):
     if not is_wide(lens):
         return points[..., 2], points[..., 2] > 0
     distance = points.norm(dim=-1)
-    return distance, points[..., 2] > math.cos(lens.limit) * distance
+    least = -math.inf if lens.model == AROUND else math.cos(lens.limit)
+    return distance, points[..., 2] > least * distance
 
 
 def is_wide(lens):

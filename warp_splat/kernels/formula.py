@@ -171,10 +171,6 @@ def _floor(notes: Notes, a: Number) -> Number:
     return Number(notes, notes.note("rounded_down", notes.real(a.name)), (None,) * len(a.slopes))
 
 
-def _floor(notes: Notes, a: Number) -> Number:
-    return Number(notes, notes.note("rounded_down", notes.real(a.name)), (None,) * len(a.slopes))
-
-
 #: What formulas may use besides ``np.where``.
 RULES = {
     np.add: _add,
@@ -185,7 +181,6 @@ RULES = {
     np.sqrt: _sqrt,
     np.arctan2: _arctan2,
     np.less: _less,
-    np.floor: _floor,
     np.floor: _floor,
     np.greater: lambda notes, a, b: _less(notes, b, a),
 }

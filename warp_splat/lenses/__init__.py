@@ -13,6 +13,8 @@ from warp_splat.lenses.formulas import MODELS, Family, ray_at
 
 STEPS = 2048  # of the angle from the axis, in which a lens is looked through
 DIRECTIONS = 16  # around the axis
+FARTHEST = 1e3  # focal lengths: a wide lens is followed no farther out, nor is any picture so large
+SEAM = 1e-4  # of half a panorama's width: its two ends may miss each other by so much
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Lens:
     coefficients: tuple[float, ...] = ()
 
     def __post_init__(self):
-        if self.model not in MODELS:
+        if not isinstance(self.model, str) or self.model not in MODELS:
             raise InputError(f"Lens model: expected one of {', '.join(MODELS)}, got {self.model!r:.80}.")
         count = MODELS[self.model][1]
         try:
@@ -61,7 +63,7 @@ class Lens:
         NaN where the lens does not see them: beyond the angle where it folds.
         """
         x, y, z = np.moveaxis(np.asarray(rays, np.float64), -1, 0)
-        seen = z > math.cos(self.limit) * np.sqrt(x * x + y * y + z * z)
+        seen = z > self.least_cosine * np.sqrt(x * x + y * y + z * z)
         u, v = self.family.formula(self.numbers, np.where(seen, x, 0), np.where(seen, y, 0), np.where(seen, z, 1))
         return np.where(seen[..., None], np.stack([u, v], -1), np.nan)
 
@@ -105,6 +107,11 @@ class Lens:
         return math.pi / STEPS * (self._most if len(angles) == self._most or self.family.around else len(angles) - 1)
 
     @property
+    def least_cosine(self) -> float:
+        """Of the angle from the axis: no more, and a point is not seen. Of a panorama none is so small."""
+        return -2.0 if self.family.around else math.cos(self.limit)
+
+    @property
     def _most(self) -> int:
         """Steps to straight behind, or to the side."""
         return STEPS if self.family.wide else STEPS // 2
@@ -118,7 +125,8 @@ class Lens:
         with np.errstate(all="ignore"):
             u, v = self.family.formula(self.numbers, *np.moveaxis(_ray(bent), -1, 0))
         outward = u * np.cos(around) + v * np.sin(around)
-        rises = (np.diff(outward, axis=0) > 0).all(1)  # not, where it is no number
+        most = FARTHEST if self.family.wide else math.inf
+        rises = ((np.diff(outward, axis=0) > 0) & (outward[1:] < most)).all(1)  # not, where it is no number
         count = 1 + (len(rises) if rises.all() else int(np.argmin(rises)))
         return angles[:count], outward[:count].min(1)
 
@@ -151,7 +159,7 @@ def check_picture(lens: Lens, left: float, top: float, right: float, bottom: flo
     """
     if lens.model == "EQUIRECTANGULAR":
         sides = np.array([left, top, right, bottom]) / np.pi
-        if np.abs(sides - [-1, -0.5, 1, 0.5]).max() > 0.01:
+        if np.abs(sides - [-1, -0.5, 1, 0.5]).max() > SEAM:
             raise InputError(
                 "Camera lens EQUIRECTANGULAR: expected a picture of 2:1 that shows all around, fx = width / (2 pi), "
                 f"fy = height / pi, cx and cy in its middle, got {np.degrees(right - left):.1f} x "

@@ -138,6 +138,12 @@ def _angle_over_radius(r2, z):
     return np.where(near, series / np.where(near, z, 1 + 0 * z), np.arctan2(r, z) / r)
 
 
+def _angular_of(omega):
+    """What :func:`angular` takes; of no angle of view, a pinhole's to 1e-8."""
+    omega = max(abs(omega), 1e-4)
+    return 0.5 / math.tan(0.5 * omega), 1.0 / omega
+
+
 PINHOLE = Family(pinhole, 0, False)
 PERSPECTIVE = Family(perspective, 8, False)
 FISHEYE = Family(fisheye, 4, True)
@@ -157,7 +163,7 @@ MODELS: dict[str, tuple[Family, int]] = {
     "OPENCV_FISHEYE": (FISHEYE, 4),
     "THIN_PRISM_FISHEYE": (Family(thin_prism_fisheye, 8, True), 8),
     "RAD_TAN_THIN_PRISM_FISHEYE": (Family(prism_on_fisheye, 12, True), 12),
-    "FOV": (Family(angular, 2, False, lambda omega: (0.5 / math.tan(0.5 * omega), 1.0 / omega)), 1),
+    "FOV": (Family(angular, 2, False, _angular_of), 1),
     "SIMPLE_DIVISION": (DIVISION, 1),
     "DIVISION": (DIVISION, 1),
     "EUCM": (Family(enhanced_unified, 2, True), 2),

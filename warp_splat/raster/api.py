@@ -40,19 +40,21 @@ class RenderOutput:
 
     image: torch.Tensor  # [H, W, 3]
     alpha: torch.Tensor  # [H, W], 1 - transmittance
-    depth: torch.Tensor | None  # [H, W] world units, expected z (0 where alpha is 0), if asked for
+    depth: torch.Tensor | None  # [H, W] world units, expected depth (0 where alpha is 0), if asked for
     means2d: torch.Tensor  # [N, 2] px; 0 if culled
     radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
     conics: torch.Tensor  # [N, 3] 1/px^2, (xx, xy, yy) of the inverse 2D covariance; 0 if culled, as all that follow
     colors: torch.Tensor  # [N, 3]
-    depths: torch.Tensor  # [N] world units, z in the camera
+    depths: torch.Tensor  # [N] world units, z in the camera; through a wide lens, the distance
     opacities2d: torch.Tensor  # [N] after antialiasing
     invalid_count: int | torch.Tensor  # see `invalid`; on a GPU, reading it waits for the image
     gaussians: Gaussians  # that were rendered
     dropped: Dropped = field(default_factory=Dropped)
     features: torch.Tensor | None = None  # [H, W, C] sum of weight times feature, if given
     normals: torch.Tensor | None = None  # [H, W, 3] sum of weight times normal, in the world, if asked for
-    median_depth: torch.Tensor | None = None  # [H, W] world units, z where half of the light is gone; 0 where it is not
+    median_depth: torch.Tensor | None = (
+        None  # [H, W] world units, depth where half of the light is gone; 0 where it is not
+    )
     strongest: torch.Tensor | None = None  # [H, W, k] int64, Gaussians of the largest weights; -1 where there is none
     strongest_weights: torch.Tensor | None = None  # [H, W, k] share of them in the pixel
 
@@ -83,7 +85,8 @@ def rasterize(
         opacities: [N], in 0..1.
         sh: spherical-harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16; or the pair ([N, 1, 3], [N, K-1, 3])
             as trainers keep them, which saves a copy. Color = max(0, 0.5 + sum of coefficients times basis).
-        camera: pinhole camera, world to camera in COLMAP's axes; :class:`CameraParameters`, if it wants gradients.
+        camera: world to camera in COLMAP's axes, with or without a lens; :class:`CameraParameters`, if it wants
+            gradients.
         background: RGB behind everything; a tensor [3] receives a gradient.
         adjoint: how the pixel loop is differentiated; one image, one gradient up to rounding. "manual": by hand.
             "stepwise": reverse loop by hand, its body by Warp. "reversible": the whole loop by Warp, transmittance

@@ -44,7 +44,7 @@ class Strongest(NamedTuple):
 
     gaussians: torch.Tensor  # [H, W, k] int64, the strongest first, of equal ones the nearest; -1 where there is none
     weights: torch.Tensor  # [H, W, k] opacity times transmittance; 0 where there is none
-    median_depth: torch.Tensor  # [H, W] z of the Gaussian at which half of the light is gone; 0 where it is not
+    median_depth: torch.Tensor  # [H, W] depth of the Gaussian at which half of the light is gone; 0 where it is not
 
 
 def blend_beside(
@@ -249,7 +249,7 @@ def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
     needed = 4 * count * columns
     if needed > MANY and needed > (available := available_memory(device)):
         raise InputError(
-            f"features: the gradients of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
+            f"rasterize: the gradients of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
             f"{available / 2**30:.1f} GiB are free; render a smaller image or fewer, smaller Gaussians."
         )
     return torch.empty(count, columns, dtype=torch.float32, device=device)

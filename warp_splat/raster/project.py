@@ -61,7 +61,7 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
 def lens_limit(camera: Camera) -> float:
     """How far from the axis kernels follow the camera's lens: a cosine if it is wide, else a tangent."""
     if camera.lens and camera.lens.family.wide:
-        return math.cos(camera.lens.limit)
+        return camera.lens.least_cosine
     slope = (1.0 + FRUSTUM_MARGIN) * math.tan(camera.reach)
     return min(slope, math.tan(camera.lens.limit)) if camera.lens else slope
 
@@ -72,15 +72,14 @@ def projection_of(options: RasterOptions, lens: Lens | None = None) -> Projectio
     Raises:
         InputError: if it knows no lenses.
     """
-    if isinstance(options.projection, Projection):
-        return options.projection
-    module = importlib.import_module(f"warp_splat.kernels.project.{options.projection}")
+    name, own = options.projection, options.projection if isinstance(options.projection, Projection) else None
+    module = None if own else importlib.import_module(f"warp_splat.kernels.project.{name}")
     if lens and not hasattr(module, "through"):
         raise InputError(
-            f"options.projection: expected affine or unscented for a camera with a lens, got {options.projection}; "
-            "choose one of them, or undistort the photographs."
+            "options.projection: expected affine or unscented for a camera with a lens, got "
+            f"{'one of your own' if own else name}; choose one of them, or undistort the photographs."
         )
-    return module.through(lens.family) if lens else module.PROJECTION
+    return own or (module.through(lens.family) if lens else module.PROJECTION)
 
 
 def project(
