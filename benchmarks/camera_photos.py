@@ -76,16 +76,16 @@ def follow(draw, view, extent: float, free: int, seed: int) -> list[list[float]]
     return [*errors, distance(learned(view.camera).camera, view.camera, extent)]
 
 
-def follow_all(model: Path, free: list[str]) -> dict[tuple[str, str, str], list[list[float]]]:
-    """By scene, photograph and what is free: the middle one of those for training, and of those held out."""
+def follow_all(model: Path) -> dict[tuple[str, str, str], list[list[float]]]:
+    """By scene, photograph and what is free: the middle one of those for training; its pose of those held out."""
     iteration, gaussians, trained = open_model(model)
     scene = load_trained_scene(str(model), "", trained, lambda line: None, iteration)
     activated = Gaussians(*(tensor.detach() for tensor in GaussianModel.from_splats(gaussians.splats).activated()))
     options, background = options_of(trained), torch.zeros(3)
     found = {}
-    for split, views in (("", scene.train), (", held out", scene.test)):
+    for split, views, names in (("", scene.train, FREE), (", held out", scene.test, list(FREE)[:1])):
         view = views[len(views) // 2]
-        for name in free:
+        for name in names:
             draw = lambda camera: render(activated, camera, background, options).image  # noqa: E731
             key = (Path(str(trained["source_path"])).name, view.name + split, name)
             found[key] = follow(draw, view, scene.extent, FREE[name], seed=0)
@@ -107,14 +107,13 @@ def plot(runs: dict[tuple[str, str, str], list[list[float]]], path: Path) -> Non
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-m", "--model", type=Path, action="append", required=True, help="a model; may come again")
-    parser.add_argument("--free", nargs="+", default=list(FREE), help=f"of {', '.join(FREE)}")
     parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for the plot")
     arguments = parser.parse_args()
     launch.prepare("cpu", 1)
     torch.set_num_threads(1)
     runs = {}
     for model in arguments.model:
-        runs |= follow_all(model, arguments.free)
+        runs |= follow_all(model)
     rows = []
     for key, run in runs.items():
         degrees, *shares = run[-1]

@@ -61,17 +61,22 @@ def held_in_view(points, camera):
 def on_image(points, camera):
     """Where points [..., 3] in the camera are seen, [..., 2] px."""
     held, excess = held_in_view(points, camera)
-    focal, middle = torch.tensor([[camera.fx, camera.fy], [camera.cx, camera.cy]], dtype=torch.float64)
+    focal, middle = (_numbers(camera, *names) for names in (("fx", "fy"), ("cx", "cy")))
     return focal * bend(held, camera.lens) * excess[..., None] + middle
 
 
+def _numbers(camera, *names):
+    """Of the camera, which may be tensors that want gradients."""
+    return torch.stack([torch.as_tensor(getattr(camera, name), dtype=torch.float64) for name in names])
+
+
+@torch.enable_grad()
 def seen(points, camera):
     """Means [N, 2] px of points in the camera [N, 3], and the derivatives [N, 2, 3] px per world unit."""
     held, _ = held_in_view(points.clone(), camera)
     wanted = held.requires_grad
     held = held if wanted else held.requires_grad_()
-    focal = torch.tensor([camera.fx, camera.fy], dtype=torch.float64)
-    places = focal * bend(held, camera.lens)
+    places = _numbers(camera, "fx", "fy") * bend(held, camera.lens)
     rows = [torch.autograd.grad(column.sum(), held, create_graph=True)[0] for column in places.unbind(1)]
     jacobian = torch.stack(rows, 1)
     return on_image(points, camera), jacobian if wanted else jacobian.detach()

@@ -27,8 +27,8 @@ class CameraParameters:
     """A camera whose pose and intrinsics are tensors, for :func:`warp_splat.rasterize` in place of a camera.
 
     Their gradients are those of the image that is drawn. Sums have one order, whatever the threads and the processor.
-    Where the Jacobian of the affine projection is clamped stays as ``base`` has it: it does not move with the
-    intrinsics.
+    Where the Jacobian of the affine projection is clamped, and how far a lens is followed, stays as ``base`` has it: it
+    does not move with the intrinsics. The coefficients of a lens are not learned.
 
     Args:
         base: the camera to start from.
@@ -44,11 +44,6 @@ class CameraParameters:
     def __init__(self, base: Camera, twist: torch.Tensor | None = None, intrinsics: torch.Tensor | None = None):
         if not isinstance(base, Camera):
             raise InputError(f"base: expected a warp_splat.Camera, got {type(base).__name__}.")
-        if base.lens:
-            raise InputError(
-                f"base: expected a camera without distortion, got one with {base.lens.model}; its pose, "
-                "intrinsics and coefficients have no gradients yet: undistort the photographs."
-            )
         self.base = base
         self.twist = _checked("twist", twist, [0.0] * 6)
         self.intrinsics = _checked("intrinsics", intrinsics, [base.fx, base.fy, base.cx, base.cy])

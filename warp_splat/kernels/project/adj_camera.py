@@ -12,7 +12,7 @@ conic C = (A A' + e I)^-1 says all, without a difference of large numbers. With 
     fx dC/dfx        = 2 e C D C - (C D + D C)
     fx dopacity/dfx  = e C_xx opacity    under antialiasing
 
-That holds for every projection of a camera without distortion whose limits stay where they are.
+That holds for every projection and every lens whose limits and coefficients stay as they are.
 """
 
 import functools
