@@ -16,7 +16,9 @@ from test_train import SCENE, fails, train
 from warp_splat.cli import main
 from warp_splat.evaluation.alignment import find_pose
 from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.formats.colmap_text import write_colmap as write_model
 from warp_splat.formats.model_folder import read_cameras
+from warp_splat.lenses import Lens
 from warp_splat.raster.api import rasterize
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import View, visible
@@ -206,6 +208,19 @@ def test_other_tools_get_the_cameras(trained):
         assert (view.camera.fx, view.camera.cy) == (camera.fx, camera.cy)
     assert any(not np.allclose(cameras_now[v.name].rotation, v.camera.rotation, atol=1e-6) for v in given.train)
     np.testing.assert_allclose(np.sort(scene.points, 0), np.sort(given.points, 0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("model", "coefficients"), [("RADIAL", (0.05, -0.01)), ("FOV", (0.9,)), ("FISHEYE", ())])
+def test_lenses_are_written_as_colmap_has_them(model, coefficients, scene, tmp_path):
+    """With those of the family's model that a model lacks as zeros."""
+    view = scene.train[0]
+    camera = replace(view.camera, lens=Lens(model, coefficients))
+    (tmp_path / "images").symlink_to(SCENE / "images")
+    write_model(tmp_path / "sparse" / "0", [(view.name, camera)], scene.points, scene.colors)
+    (found,) = load_scene(tmp_path, lens="native", report=lambda line: None).train
+    rays = np.random.default_rng(0).normal(size=(50, 3)) * 0.2 + [0, 0, 1]
+    np.testing.assert_allclose(found.original.lens.distorted(rays), camera.lens.distorted(rays), atol=1e-12)
+    assert found.original.fx / found.original.width == pytest.approx(camera.fx / camera.width, rel=1e-9)
 
 
 def test_a_scene_that_changed_is_refused(trained, tmp_path, capsys):

@@ -120,10 +120,10 @@ class Pose:
         self.moves.detach().copy_(torch.from_numpy(moved.reshape(-1, 6)))
 
 
-def intrinsics_of(view: View) -> tuple[float, ...]:
+def intrinsics_of(view: View) -> tuple:
     """What photographs of one camera have in common."""
     camera = view.original
-    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.lens
 
 
 def gauge(cameras: Sequence[Camera], extent: float) -> np.ndarray:
@@ -170,7 +170,8 @@ def sensitivity(camera: Camera, points: np.ndarray, extent: float) -> np.ndarray
     The mean over the points [P, 3], damped: where they say little, a pose is to move little.
     """
     focal = np.array([camera.fx, camera.fy]) / camera.width
-    shown = points[visible(camera, points)]
+    ahead = (camera.rotation[2][:, None] * points.T).sum(0) > -camera.translation[2]  # of what a fisheye shows
+    shown = points[visible(camera, points) & ahead]
     rows = focal[:, None, None] * slope_changes(camera, shown[:: -(-len(shown) // MOST) or 1])[1]
     rows[:, 3:] *= extent
     products = torch.from_numpy((rows[:, :, None] * rows[:, None]).transpose(3, 0, 1, 2))
