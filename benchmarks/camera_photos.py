@@ -78,8 +78,8 @@ def follow(draw, view, extent: float, free: int, seed: int) -> list[list[float]]
 
 def follow_all(model: Path) -> dict[tuple[str, str, str], list[list[float]]]:
     """By scene, photograph and what is free: the middle one of those for training; its pose of those held out."""
-    iteration, gaussians, trained = open_model(model)
-    scene = load_trained_scene(str(model), "", trained, lambda line: None, iteration)
+    _, gaussians, trained = open_model(model)
+    scene = load_trained_scene(str(model), "", trained, lambda line: None)
     activated = Gaussians(*(tensor.detach() for tensor in GaussianModel.from_splats(gaussians.splats).activated()))
     options, background = options_of(trained), torch.zeros(3)
     found = {}

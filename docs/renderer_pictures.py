@@ -23,8 +23,8 @@ FEW = 60  # entries of a list
 
 def draw(model: str, images: Path) -> list[Path]:
     """Write renderer.jpg and renderer_pixel.png for the first held-out view of ``model``."""
-    iteration, gaussians, trained = open_model(model)
-    scene = load_trained_scene(model, "", trained, lambda line: None, iteration)
+    _, gaussians, trained = open_model(model)
+    scene = load_trained_scene(model, "", trained, lambda line: None)
     view = scene.evaluated[1][0]
     activated = GaussianModel.from_splats(gaussians.splats).activated()
     activated = Gaussians(*(tensor.detach() for tensor in activated))

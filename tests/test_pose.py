@@ -14,21 +14,22 @@ from test_checkpoints import begin, state_of, steps
 from test_train import SCENE, fails, train
 
 from warp_splat.cli import main
+from warp_splat.config import ViewConfig
 from warp_splat.evaluation.alignment import find_pose
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.colmap_text import write_colmap as write_model
-from warp_splat.formats.model_folder import read_cameras
+from warp_splat.formats.model_folder import read_cameras, read_cfg_args
 from warp_splat.lenses import Lens
 from warp_splat.raster.api import rasterize
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import View, visible
 from warp_splat.training.parts.pose import MOST, Pose, factors, gauge, inverses, orthonormal, pose_error, sensitivity
 from warp_splat.training.record import keep, restore
+from warp_splat.viewer.command import _find_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-import cameras
-import poses
+import cameras as made_cameras
 
 ALL = {"parts": "pose", "pose_from_iter": 1, "pose_intrinsics": "all"}
 
@@ -131,8 +132,11 @@ def test_verdict(tmp_path):
     """Of the embedded scene, the same with poses that are off, and one without keypoints."""
     scene = load_scene(SCENE, eval=True, resolution=2, report=lambda line: None)
     assert not Pose.needed(scene).needed
-    wrong = poses.misplaced(scene, np.random.default_rng(0))
-    assert Pose.needed(wrong).needed
+    generator = np.random.default_rng(0)
+    turns = [Rotation.from_rotvec(0.005 * turn).as_matrix() for turn in generator.normal(size=(len(scene.train), 3))]
+    cameras = [replace(v.camera, rotation=turn @ v.camera.rotation) for v, turn in zip(scene.train, turns, strict=True)]
+    train = [replace(view, camera=camera) for view, camera in zip(scene.train, cameras, strict=True)]
+    assert Pose.needed(replace(scene, train=train)).needed
     (tmp_path / "plain").mkdir()
     verdict = Pose.needed(load_scene(write_colmap(tmp_path / "plain"), report=lambda line: None))
     assert not verdict.needed and "keeps no keypoints" in verdict.sentence
@@ -165,13 +169,13 @@ def slopes_of(camera, points):
 
 def test_a_photograph_is_found_while_the_model_stays():
     """From 1 degree and 2 %, to where the model itself took it."""
-    gaussians, right = cameras.cube(0), cameras.looking()
+    gaussians, right = made_cameras.cube(0), made_cameras.looking()
     with torch.no_grad():
         photo = np.rint(255 * rasterize(*gaussians, right).image.numpy().clip(0, 1)).astype(np.uint8)
     turn = Rotation.from_rotvec([0.01, 0.01, -0.01]).as_matrix()
     start = replace(right, rotation=turn, translation=right.translation - 0.012)
     camera = find_pose(lambda learned: rasterize(*gaussians, learned).image, View("a.png", start, photo, start), 1.0)
-    degrees, meters, focal = cameras.distance(camera, right)
+    degrees, meters, focal = made_cameras.distance(camera, right)
     assert degrees < 0.05 and meters < 1e-3 and focal == 0
 
 
@@ -192,6 +196,16 @@ def test_render_knows_the_cameras(trained, capsys):
     for name in ("PSNR", "SSIM"):
         assert results[name] == pytest.approx(trained_results[name], abs=1e-3), name
     assert results["PSNR_POSE"] >= results["PSNR"]
+
+
+def test_the_viewer_has_both_cameras(trained):
+    given = load_scene(SCENE, eval=True, resolution=4, report=lambda line: None)
+    found = _find_scene(ViewConfig(str(trained)), read_cfg_args(trained), 24)
+    cameras = {view.name: view.camera for view in (*found.train, *found.test)}
+    assert len(cameras) == 2 * (len(given.train) + len(given.test))
+    for view in given.train:
+        assert np.array_equal(cameras[f"{view.name}, as given"].rotation, view.camera.rotation)
+    assert any(not np.allclose(cameras[v.name].rotation, v.camera.rotation, atol=1e-6) for v in given.train)
 
 
 def test_other_tools_get_the_cameras(trained):

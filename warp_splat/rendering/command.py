@@ -58,7 +58,10 @@ def render_model(config: RenderConfig) -> int:
         model_folder.check_place(Path(output).parent if Path(output).suffix.lower() == ".mp4" else Path(output))
     scene = None
     if _needs_scene(config):
-        scene = load_trained_scene(config.model_path, config.source_path, trained, say, iteration)
+        scene = load_trained_scene(config.model_path, config.source_path, trained, say)
+        scene = with_refined_cameras(scene, config.model_path, iteration)
+        if model_folder.read_refined(config.model_path, iteration):
+            say(f"The cameras are those of the model, which were refined in iteration {iteration}.")
     options, linear = options_of(trained), is_linear(scene, trained)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
@@ -139,20 +142,17 @@ def is_linear(scene: Scene | None, trained: dict) -> bool:
     return scene.linear if scene else bool(trained.get("linear_light"))
 
 
-def load_trained_scene(
-    model_path: str, source_path: str, trained: dict, say: Callable[[str], object], iteration: int
-) -> Scene:
-    """The scene that a model was trained on, as it was loaded then, with the cameras that were learned.
+def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Callable[[str], object]) -> Scene:
+    """The scene that a model was trained on, as it was loaded then.
 
     Args:
         model_path: the model, for messages.
         source_path: where the scene is now; empty: where it was.
         trained: options of the training.
         say: receives what there is to say.
-        iteration: of the model, whose cameras are taken if they were refined.
 
     Raises:
-        InputError: as :func:`load_scene`; if it is not known which scene that is, or it has changed since.
+        InputError: as :func:`load_scene`, or if it is not known which scene that is.
     """
     trained_on = str(trained.get("source_path", ""))
     source = source_path or trained_on
@@ -165,13 +165,20 @@ def load_trained_scene(
         raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
     flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
     names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
-    scene = load_scene(source, **names, resolution=resolution, **flags, report=say)
+    return load_scene(source, **names, resolution=resolution, **flags, report=say)
+
+
+def with_refined_cameras(scene: Scene, model_path: str, iteration: int) -> Scene:
+    """The scene with the cameras that were learned with the Gaussians of an iteration; itself, if they were not.
+
+    Raises:
+        InputError: if the scene has changed since the training.
+    """
     cameras = model_folder.read_refined(model_path, iteration)
-    if cameras:
-        say(f"The cameras are those of the model, which were refined in iteration {iteration}.")
-        train, test = ([_refined(view, cameras, model_path) for view in views] for views in (scene.train, scene.test))
-        scene = replace(scene, train=train, test=test)
-    return scene
+    if not cameras:
+        return scene
+    train, test = ([_refined(view, cameras, model_path) for view in views] for views in (scene.train, scene.test))
+    return replace(scene, train=train, test=test)
 
 
 def _refined(view: View, cameras: Mapping[str, Camera], model_path: str) -> View:

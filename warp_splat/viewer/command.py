@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of
+from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of, with_refined_cameras
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
@@ -50,9 +52,17 @@ def view_model(config: ViewConfig) -> int:
 
 
 def _find_scene(config: ViewConfig, trained: dict, iteration: int) -> Scene | None:
-    """The scene of the model; None if it is not known or has gone, since one can look around without it."""
+    """The scene of the model; None if it is not known or has gone, since one can look around without it.
+
+    Where cameras were refined, each photograph is there twice: seen by its camera as it is now, and as it was given.
+    """
     try:
-        return load_trained_scene(config.model, config.source_path, trained, print, iteration)
+        given = load_trained_scene(config.model, config.source_path, trained, print)
+        scene = with_refined_cameras(given, config.model, iteration)
+        if scene is given:
+            return scene
+        views = [replace(view, name=f"{view.name}, as given") for view in (*given.train, *given.test)]
+        return replace(scene, test=[*scene.test, *views])
     except InputError as error:
         if config.source_path:
             raise

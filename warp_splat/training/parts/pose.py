@@ -25,7 +25,7 @@ from warp_splat.training.optimizer import power
 from warp_splat.training.parts import PoseOptions
 from warp_splat.training.seams import Setting, Step, Verdict
 
-LENS_RATE = 0.3  # of the poses' rate: a lens learns from every photograph, a pose from its own
+LENS_RATE = 1.0  # of the poses' rate: a lens learns from every photograph, a pose from its own
 LAST_RATE = 0.01  # of the first one, at the end
 ENOUGH = 10  # points in a photograph, to tell whether its pose is right
 OFF = 0.5  # px that a pose moves its picture by: what blurs
