@@ -248,6 +248,7 @@ def exact_render(
     if camera.lens and camera.lens.model == exact_lenses.AROUND:
         again = {name: torch.cat([getattr(once, name)] * 3) for name in once.__dataclass_fields__}
         splats = Splats(**{**again, "means2d": exact_lenses.shown_thrice(once.means2d, camera)})
+    copies = 1 if splats is once else 3
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices
     order = order[splats.live[order]]
@@ -272,8 +273,8 @@ def exact_render(
         depth=depth.reshape(shape),
         means2d=once.means2d,
         fragile=fragile.reshape(shape),
-        touches=touches.reshape(-1, len(means)).any(0),
-        near_image=near_image.reshape(-1, len(means)).any(0),
+        touches=touches.reshape(copies, len(means)).any(0),
+        near_image=near_image.reshape(copies, len(means)).any(0),
         reach=reach[: len(means)],
         order=order,
         weights=weight.reshape(*shape, len(order)),
