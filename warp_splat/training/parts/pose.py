@@ -58,8 +58,8 @@ class Pose:
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If the points that structure from motion saw say that the median pose is off by what blurs."""
-        if any(view.camera.lens for view in scene.train):
-            return Verdict(False, "cameras with distortion cannot learn their poses yet")
+        if any(view.camera.lens and view.camera.lens.family.wide for view in scene.train):
+            return Verdict(False, "poses of cameras that see beside themselves are not judged")
         found = [
             pose_error(view.camera, scene.tracks[view.name])
             for view in scene.train
