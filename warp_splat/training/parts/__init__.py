@@ -35,7 +35,7 @@ class ExposureOptions:
     """Exposure and white balance of each photograph."""
 
     exposure: str = learning(
-        "", "colors of each photograph, learned: asks for the part; of --parts: affine", choices=("", *EXPOSURES)
+        "", "colors of each photograph, learned: asks for the part; of --parts: gain", choices=("", *EXPOSURES)
     )
     exposure_lr_init: float = learning(0.01, "rate of exposure at the start, of values from 0 to 1")
     exposure_lr_final: float = learning(0.0001, "rate of exposure at the end")
