@@ -21,6 +21,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
+from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.simd import LANES, vec16, vec16i
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.tiles import cut, outline, pixels
@@ -29,15 +30,6 @@ wp.set_module_options(FORWARD_ONLY)
 
 DIGITS = 2**11  # of the radix sort
 AHEAD = wp.constant(32)  # rounds for which memory is asked before
-
-
-@wp.func_native("__builtin_prefetch(&wp::index(values, i), 1);")
-def ask(values: wp.array[wp.vec2i], i: int):
-    """Bring the line of memory where an element lies into the cache."""
-
-
-@wp.func_native("__builtin_prefetch(&wp::index(values, i), 1);")
-def ask(values: wp.array[int], i: int): ...
 
 
 @wp.kernel(module="unique", module_options=dict(IN_LANES))
