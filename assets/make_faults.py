@@ -2,8 +2,8 @@
 
     python assets/make_faults.py exposure vignetting --out output/faulty [--seed 0]
 
-Of every eighth photograph by name, which `--eval` holds out, nothing is changed: they are the truth to measure with.
-`truth.json` holds by name what was done to the others.
+Of every eighth photograph by name, which `--eval` holds out, no pixel and no pose is changed: they are the truth to
+measure with. Their camera is that of the others, and so its focal length. `truth.json` holds what was done.
 """
 
 import argparse

@@ -15,6 +15,7 @@ from test_train import SCENE
 
 from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
+from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime import pool
@@ -87,11 +88,26 @@ def test_at_first_it_is_the_identity_and_its_mean_stays_so(kind, scene, tmp_path
     """Exactly, over the photographs; in the sum of float32 as well."""
     plain, _ = begin(scene, tmp_path)
     trainer, run = begin(scene, tmp_path, exposure=kind)
-    assert torch.equal(plain.differentiate(1), trainer.differentiate(1)) or kind == "bilateral"
+    assert torch.equal(plain.differentiate(1), trainer.differentiate(1))
     steps(trainer, run, 12)
     maps = trainer.parts[0].maps.detach()
     assert torch.equal(maps.double().sum(0), torch.zeros(maps.shape[1:], dtype=torch.float64))
     assert (maps != 0).any(1).all() if kind == "gain" else (maps != 0).any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_pixel_that_is_not_finite_spoils_no_map(kind, scene, tmp_path):
+    trainer, _ = begin(scene, tmp_path, exposure=kind, vignetting=True)
+    part, image = trainer.parts[0], torch.rand(5, 7, 3)
+    image[2, 3] = torch.inf
+    part.image(image, None, SimpleNamespace(view=scene.train[0])).clamp(0, 1).sum().backward()
+    assert torch.isfinite(part.maps.grad).all() and torch.isfinite(part.falloff.grad).all()
+    assert part.maps.grad.any()
+
+
+def test_rates_cannot_fall_to_nothing(scene, tmp_path):
+    with pytest.raises(InputError, match="--exposure_lr_final: expected a positive number"):
+        begin(scene, tmp_path, exposure="gain", exposure_lr_final=0.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -180,10 +180,6 @@ def test_what_meta_json_says_is_checked(tmp_path, way, value, sentence):
         load_gaussians(tmp_path / "b.sog")
 
 
-def webp_of(width, height, **options):
-    return webp_bytes(np.zeros((height, width, 3), np.uint8), **options)
-
-
 @pytest.mark.parametrize(
     ("name", "data", "sentence"),
     [
@@ -196,6 +192,7 @@ def webp_of(width, height, **options):
             "an image 'scales.webp' of 4x4 pixels, expected 8x4",
         ),
         ("scales.webp", webp_bytes(np.zeros((4, 8, 3), np.uint8), lossless=False), "whose compression changes values"),
+        ("scales.webp", webp_bytes(np.zeros((4, 8, 4), np.uint8), lossless=False), "whose compression changes values"),
         ("scales.webp", webp_bytes(np.zeros((9000, 9000, 3), np.uint8)), "of 9000x9000 pixels, expected 8x4"),
         ("meta.json", b"[]", "JSON that is no object"),
         ("meta.json", b"{", "damaged"),

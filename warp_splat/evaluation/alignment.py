@@ -17,7 +17,7 @@ from warp_splat.raster.data import Gaussians
 from warp_splat.scene.types import View
 
 LEVELS = (1, 2, 4, 8, 16)  # px: boxes over which differences are averaged; fine detail sees no large displacement
-STEPS = 40  # at most, each a picture and its adjoint
+STEPS = 40  # pictures and their adjoints, about: an iteration that has begun is ended
 
 
 def where_taken(

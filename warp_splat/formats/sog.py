@@ -211,7 +211,7 @@ class _Bundle:
         try:
             with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
                 return np.asarray(image.convert("RGBA"))
-        except (OSError, SyntaxError) as error:  # Pillow's words for damage
+        except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # Pillow's words for damage
             raise ValueError(f"image {names[index]!r:.80}: {error}") from error
 
     def _bytes(self, name: str, most: int) -> bytes:
@@ -253,9 +253,20 @@ def _webp_size(data: bytes, name: str) -> tuple[int, int]:
         case b"VP8L":
             bits = int.from_bytes(data[21:25], "little")
             return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-        case b"VP8X":
+        case b"VP8X" if _is_lossless(data):
             return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
     raise Unexpected(f"an image {name!r:.80} whose compression changes values")
+
+
+def _is_lossless(data: bytes) -> bool:
+    """Whether the first image among the chunks is, and none comes before that is animated."""
+    at = 12
+    while at + 8 <= len(data):
+        kind, size = data[at : at + 4], int.from_bytes(data[at + 4 : at + 8], "little")
+        if kind in (b"VP8L", b"VP8 ", b"ANMF"):
+            return kind == b"VP8L"
+        at += 8 + size + size % 2
+    return False
 
 
 def _listed(entries: np.ndarray) -> list[float]:

@@ -72,7 +72,7 @@ class LearnOptions:
     cooldown: int = learning(0, "over this many steps at the end, all rates fall to a tenth")
     sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1)
     optimizer_type: str = learning("default", "sparse_adam updates only what the image shows", choices=OPTIMIZERS)
-    half_moments: bool = learning(False, "keep Adam's moments in 16 bits, rounded at random: less memory, see docs")
+    half_moments: bool = learning(False, "keep Adam's moments in 16 bits, rounded at random: less memory")
     coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
     coarse_until_iter: int = learning(3000, "by this step the size has doubled to the full one", least=1)
     seed: int = learning(0, "seed of everything random", most=2**63 - 1)

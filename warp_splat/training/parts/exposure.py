@@ -14,6 +14,7 @@ import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from warp_splat.errors import InputError
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
 from warp_splat.kernels.simd import Types
 from warp_splat.raster.api import RenderOutput
@@ -44,6 +45,8 @@ class Exposure:
 
     def __init__(self, options: ExposureOptions, setting: Setting):
         self.options, self.kind, self.end = options, options.exposure or DEFAULT, setting.iterations
+        if options.exposure_lr_init and not options.exposure_lr_final:
+            raise InputError("--exposure_lr_final: expected a positive number, since rates fall log-linearly, got 0.")
         self.pivot = 0.0 if setting.scene.linear else PIVOT
         self.places = {view: place for place, view in enumerate(setting.scene.train)}
         device = setting.model.device
@@ -90,6 +93,8 @@ class Exposure:
                 image = (image + self.pivot) * (1.0 + (near + far * square) * square)[..., None] - self.pivot
             numbers = self.maps[self.places[step.view]]
             if self.kind == "bilateral":
+                if numbers.requires_grad:  # no pixel that is not finite may spoil the cells
+                    numbers.register_hook(lambda grad: grad.nan_to_num(0.0, 0.0, 0.0))
                 return self._through_grid(image, numbers)
             return _ColorMap.apply(image, self._whole(numbers))
 
