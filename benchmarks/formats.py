@@ -36,8 +36,8 @@ LEFT_OUT = {".gltf"}  # holds what a .glb does
 
 def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
     """A row for each format, the .ply first."""
-    _, file, trained = open_model(model)
-    scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None)
+    iteration, file, trained = open_model(model)
+    scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None, iteration)
     first, first_bytes, rows = None, 0, []
     for ending in (ending for ending in FORMATS if ending not in LEFT_OUT):
         path, start = folder / f"a{ending}", time.perf_counter()

@@ -17,6 +17,7 @@ LAYERS = [
     {"scene", "evaluation", "gaussians", "tape", "gsplat"},
     {"rendering", "sfm", "viewer"},
     {"training"},
+    {"pruning"},
     {"compare", "inspect", "export_html"},
     {"cli", "__init__", "__main__"},
 ]

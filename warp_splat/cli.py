@@ -12,12 +12,14 @@ from typing import Any
 
 from warp_splat import __version__
 from warp_splat.config import (
+    CleanConfig,
     CompareConfig,
     ConvertConfig,
     ExportHtmlConfig,
     InspectConfig,
     RenderConfig,
     SfmConfig,
+    SimplifyConfig,
     ViewConfig,
 )
 from warp_splat.errors import InputError
@@ -39,6 +41,8 @@ COMMANDS = {
         "formats.convert.convert",
         "convert Gaussians between .ply, .splat, .spz, .sog, glTF",
     ),
+    "simplify": (SimplifyConfig, "pruning.simplify.simplify", "leave out what a finished model does not need"),
+    "clean": (CleanConfig, "pruning.clean.clean", "leave out floaters: what hangs right before few cameras"),
     "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
     "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }

@@ -168,6 +168,37 @@ class ConvertConfig:
 
 
 @dataclass
+class SimplifyConfig:
+    """A model to make smaller."""
+
+    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
+    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
+    keep: float = flag(0.0, "the share of the Gaussians to keep", most=1)
+    max_loss: float = flag(0.0, "or: keep as few as cost at most this much PSNR of the training views, in dB")
+    size: str = flag("", "or: keep as many as fit into a file of this size, such as 10MB")
+    steps: int = flag(0, "steps of training that make up for what was left out (300 are enough)")
+    output: str = flag("", "the file to write, of any format; default: simplified.ply in the model's folder", "-o")
+    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores")
+
+
+@dataclass
+class CleanConfig:
+    """A model to rid of floaters."""
+
+    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
+    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
+    views: float = flag(3.0, "a floater is carried by fewer training views than this")
+    near: float = flag(0.5, "and nearer to them than this share of the depth of half of what they show")
+    steps: int = flag(0, "steps of training after leaving them out, with a price on opacity (--parts floaters)")
+    output: str = flag("", "the file to write, of any format; default: cleaned.ply in the model's folder", "-o")
+    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
+    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = flag(0, "CPU threads; 0: all cores")
+
+
+@dataclass
 class ExportHtmlConfig:
     """A model as a page that shows it."""
 

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
-from warp_splat.formats.curve import along_curve
+from warp_splat.formats.curve import along_curve, arranged
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.activation import make_activate, make_adj_activate
@@ -137,14 +137,17 @@ class GaussianModel:
             raw["sh_rest"].detach()[:, :0] if degree == 0 else raw["sh_rest"],
         )
 
+    def splats(self) -> SplatArrays:
+        """The Gaussians as files have them."""
+        raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}  # the device may be full
+        sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
+        return SplatArrays(
+            *(tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
+        )
+
     def save(self, path: Path, antialiased: bool = False) -> None:
         """Write a file of Gaussians, arranged: a PLY file in the reference's layout, or what else the name asks for."""
-        raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}  # the device may be full
-        order = along_curve(raw["means"])
-        raw = {name: tensor[order] for name, tensor in raw.items()}
-        sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
-        arrays = (tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
-        save_gaussians(path, SplatFile(SplatArrays(*arrays), antialiased))
+        save_gaussians(path, SplatFile(arranged(self.splats()), antialiased))
 
     @classmethod
     def load(cls, path: Path) -> GaussianModel:

@@ -18,7 +18,7 @@ import gzip
 import numpy as np
 
 from warp_splat.config import ALPHA_MIN
-from warp_splat.formats.splats import SplatArrays, sigmoid, unit_quats
+from warp_splat.formats.splats import SplatArrays, sigmoid, sizes, unit_quats
 
 ROUNDED_BITS = 6  # of the 23 of a position's mantissa
 LOG_STEPS = 256  # of scales, per factor e
@@ -44,9 +44,7 @@ def shown(splats: SplatArrays, most: int = 0) -> SplatArrays:
     opacities = sigmoid(splats.opacities)
     rows = np.flatnonzero((opacities >= ALPHA_MIN) & splats.quats.any(axis=1))
     if 0 < most < len(rows):
-        areas = np.sort(splats.scales[rows], axis=1)[:, 1:].sum(axis=1)
-        weights = np.log(opacities[rows]) + areas
-        rows = np.sort(rows[np.argsort(-weights, kind="stable")[:most]])
+        rows = np.sort(rows[np.argsort(-sizes(splats)[rows], kind="stable")[:most]])
     return SplatArrays(*(array[rows] for array in splats))
 
 

@@ -85,6 +85,12 @@ def unit_quats(quats: np.ndarray) -> np.ndarray:
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0]).astype(np.float32)
 
 
+def sizes(splats: SplatArrays) -> np.ndarray:
+    """Opacity times the area of the largest section [N]: what can be said of a Gaussian without any camera."""
+    areas = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    return sigmoid(splats.opacities.astype(np.float64)) * np.exp(np.minimum(areas, 700.0))
+
+
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which of w x y z is largest [N], and the others [N, 3] in that order, as -0.5..0.5, where it is positive."""
     unit = unit_quats(quats).astype(np.float64)

@@ -1,0 +1,267 @@
+"""What Gaussians do to images against images without them; what simplify and clean leave out, and their sentences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import C0
+from scipy.spatial.transform import Rotation
+
+from warp_splat.cli import main
+from warp_splat.compare.scenes import make_camera
+from warp_splat.config import RasterOptions
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.model_folder import ply_path, write_cfg_args
+from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.gaussians import GaussianModel
+from warp_splat.pruning.clean import floaters
+from warp_splat.pruning.score import Setting, carried, costs, weights
+from warp_splat.pruning.simplify import bytes_of, degrees_of
+from warp_splat.pruning.thinning import Thinning, fewer_harmonics
+from warp_splat.raster.api import render
+from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
+from warp_splat.scene.types import View
+
+SIZE = (48, 36)
+OPTIONS = RasterOptions()
+
+
+def splats_before(camera, count=40, seed=0, depth=(3, 5), scale=-2.0):
+    """Gaussians in front of a camera, of degree 3, none of them dark."""
+    rng = np.random.default_rng(seed)
+    seen = np.stack([rng.uniform(-1, 1, count), rng.uniform(-0.8, 0.8, count), rng.uniform(*depth, count)], axis=1)
+    return SplatArrays(
+        means=(seen @ camera.rotation + camera.center).astype(np.float32),
+        sh=np.concatenate(
+            [rng.uniform(0.5, 1.5, (count, 1, 3)), rng.normal(scale=0.05, size=(count, 15, 3))], axis=1
+        ).astype(np.float32),
+        opacities=rng.uniform(-1, 2, count).astype(np.float32),
+        scales=rng.normal(scale, 0.3, (count, 3)).astype(np.float32),
+        quats=rng.normal(size=(count, 4)).astype(np.float32),
+    )
+
+
+def views_of(cameras):
+    """Black photographs."""
+    pictures = [np.zeros((camera.height, camera.width, 3), np.uint8) for camera in cameras]
+    return [View(str(i), c, p, original=c) for i, (c, p) in enumerate(zip(cameras, pictures, strict=True))]
+
+
+def setting_of(cameras, device="cpu", background=(0.2, 0.4, 0.7)):
+    return Setting(views_of(cameras), OPTIONS, torch.tensor(background, device=device))
+
+
+def drawn(splats, setting, camera, options=OPTIONS):
+    """An image, float64."""
+    model = GaussianModel.from_splats(splats).to(setting.background.device)
+    with torch.no_grad():
+        return render(model.activated(), camera, setting.background, options).image.cpu().double()
+
+
+def without(splats, row):
+    return SplatArrays(*(np.delete(array, row, axis=0) for array in splats))
+
+
+def test_an_image_loses_what_the_adjoint_says(device):
+    """Against images without each Gaussian in turn."""
+    camera = make_camera(*SIZE, seed=3)
+    setting, splats = setting_of([camera], device), splats_before(camera)
+    upstream = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        gaussians = GaussianModel.from_splats(splats).to(torch.device(device)).activated()
+    found = carried(gaussians, camera, setting, upstream.to(device))
+    lost = (found.adj_opacities * found.splats.opacities.detach()).cpu().double()
+    whole = drawn(splats, setting, camera)
+    for row in range(len(splats.means)):
+        wanted = float((upstream.double() * (whole - drawn(without(splats, row), setting, camera))).sum())
+        assert float(lost[row]) == pytest.approx(wanted, abs=2e-3)
+    shares, depths = weights(gaussians, setting.views[0], setting)
+    assert float(shares.sum()) * SIZE[0] * SIZE[1] == pytest.approx(
+        float(render(gaussians, camera, setting.background, OPTIONS).alpha.detach().double().sum()), rel=1e-4
+    )
+    seen = (splats.means - camera.center) @ camera.rotation.T
+    np.testing.assert_allclose(depths.cpu().numpy(), seen[:, 2], rtol=1e-4)
+
+
+def test_costs_are_the_squared_changes_of_images(device):
+    """Random signs give their mean: 150 of them against images without a Gaussian, and without its harmonics."""
+    camera = make_camera(*SIZE, seed=3)
+    splats, repeats = splats_before(camera, 12), 150
+    setting = setting_of([camera] * repeats, device)
+    found = costs(GaussianModel.from_splats(splats).to(torch.device(device)), setting)
+    whole = drawn(splats, setting, camera)
+    for row in range(len(splats.means)):
+        wanted = float(((whole - drawn(without(splats, row), setting, camera)) ** 2).sum())
+        assert float(found.gaussians[row]) / repeats == pytest.approx(wanted, rel=0.5, abs=1e-3)
+    wanted = sum(float(((whole - drawn(without(splats, row), setting, camera)) ** 2).sum()) for row in range(12))
+    assert float(found.gaussians.sum()) / repeats == pytest.approx(wanted, rel=0.15)
+    for degree, coefficients in enumerate((1, 4, 9)):
+        wanted = 0.0
+        for row in range(12):
+            fewer = splats._replace(sh=splats.sh.copy())
+            fewer.sh[row, coefficients:] = 0
+            wanted += float(((whole - drawn(fewer, setting, camera)) ** 2).sum())
+        assert float(found.harmonics[:, degree].sum()) / repeats == pytest.approx(wanted, rel=0.15)
+
+
+def test_what_a_mask_covers_does_not_count():
+    camera = make_camera(*SIZE, seed=3)
+    splats, setting = splats_before(camera), setting_of([camera])
+    model = GaussianModel.from_splats(splats)
+    masked = replace(setting.views[0], mask=np.zeros(SIZE[::-1], np.uint8))
+    assert float(costs(model, setting._replace(views=[masked])).gaussians.abs().sum()) == 0
+
+
+def test_what_is_hidden_goes_first():
+    """Thirty Gaussians behind an opaque wall, and thirty before it."""
+    camera = make_camera(*SIZE, seed=3)
+    front, back = splats_before(camera, 30, 1, (3, 4)), splats_before(camera, 30, 2, (8, 9))
+    wall = splats_before(camera, 2, 3, (5, 5))
+    wall.means[:] = np.float32([[0, 0, 5], [0, 0, 5.1]]) @ camera.rotation + camera.center
+    wall.scales[:], wall.opacities[:] = [2.0, 2.0, -4.0], 12.0
+    wall.quats[:] = Rotation.from_matrix(camera.rotation.T).as_quat()[[3, 0, 1, 2]]
+    splats = SplatArrays(*(np.concatenate(arrays) for arrays in zip(front, back, wall, strict=True)))
+    thinning = Thinning(splats, setting_of([camera]))
+    kept = thinning.to(32)
+    np.testing.assert_array_equal(kept.means, np.concatenate([front.means, wall.means]))
+    fewer = thinning.to(20)
+    assert len(fewer.means) == 20 and {tuple(m) for m in fewer.means} <= {tuple(m) for m in kept.means}
+    np.testing.assert_array_equal(thinning.to(32).means, kept.means)
+
+
+def test_harmonics_that_do_not_show_become_zeros():
+    cameras = [make_camera(*SIZE, seed=3)] * 30  # of one, the estimate is a guess
+    splats = splats_before(cameras[0])
+    splats.sh[:10, 9:] *= 1e-4
+    splats.sh[10:20, 4:] *= 1e-4
+    splats.sh[20:25, 1:] *= 1e-4
+    setting = setting_of(cameras)
+    error = 30.0 * SIZE[0] * SIZE[1] * 3 * 0.01**2  # 40 dB
+    found = fewer_harmonics(splats, setting, error)
+    degrees = degrees_of(found)
+    assert (degrees[:10] <= 2).all() and (degrees[10:20] <= 1).all() and (degrees[20:25] == 0).all()
+    assert degrees[25:].max() == 3
+    changed = sum(float(((drawn(splats, setting, c) - drawn(found, setting, c)) ** 2).sum()) for c in cameras)
+    assert 0 < changed < 1.5 * error * (10 ** (0.02 / 10) - 1)
+    np.testing.assert_array_equal(found.sh[found.sh != 0], splats.sh[found.sh != 0])
+
+
+def test_floaters_hang_before_few_cameras():
+    """A cloud that eight cameras see, and a Gaussian right before one of them."""
+    first = make_camera(*SIZE, seed=3)
+    cameras = [
+        replace(first, translation=first.translation + np.float64([0.3 * step, 0, 0])) for step in np.arange(8) - 4.0
+    ]
+    splats = splats_before(first, 60, depth=(4, 6))
+    floater = splats_before(first, 1)
+    floater.means[:] = np.float32([[0, 0, 0.4]]) @ cameras[2].rotation + cameras[2].center
+    floater.scales[:] = -5.0
+    both = SplatArrays(*(np.concatenate(arrays) for arrays in zip(splats, floater, strict=True)))
+    found = floaters(both, setting_of(cameras), 3.0, 0.5)
+    assert np.flatnonzero(found).tolist() == [60]
+    assert not floaters(both, setting_of(cameras), 3.0, 0.01).any()  # not near enough
+    assert not floaters(both, setting_of(cameras), 0.5, 0.5).any()  # no Gaussian has fewer than one view
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A model of the embedded scene at an eighth of its size: its points, some of them twice."""
+    folder = tmp_path_factory.mktemp("model")
+    scene = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None)
+    model = GaussianModel.from_points(scene.points[::4], scene.colors[::4], 2)
+    splats = model.splats()
+    splats.opacities[:] = 1.0
+    save_gaussians(ply_path(folder, 7), SplatFile(splats))
+    write_cfg_args(folder, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
+    return folder, splats
+
+
+def test_simplify_to_a_share_with_training(folder, tmp_path, capsys):
+    folder, splats = folder
+    count = len(splats.means)
+    output = tmp_path / "small.sog"
+    arguments = ["simplify", str(folder), "--keep", "0.5", "--steps", "12", "-o", str(output), "--device", "cpu"]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    assert f"{output}: {round(count / 2)} of {count} Gaussians" in out and "test PSNR" in out and "harmonics: " in out
+    assert len(load_gaussians(output).splats.means) == round(count / 2)
+    assert (tmp_path / "small.curve.png").stat().st_size > 10_000
+    lines = (tmp_path / "small.curve.csv").read_text().splitlines()
+    assert lines[0] == "kept,Gaussians,MB,frames_per_second,test_PSNR" and len(lines) == 8
+
+
+@pytest.mark.long
+def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, capsys):
+    folder, splats = folder
+    save_gaussians(tmp_path / "whole.spz", SplatFile(splats))
+    size = int(0.7 * (tmp_path / "whole.spz").stat().st_size)
+    arguments = ["simplify", str(folder), "--device", "cpu"]
+    assert main([*arguments, "--size", f"{size / 1000}kB", "-o", str(tmp_path / "a.spz")]) == 0
+    assert 0.9 * size < (tmp_path / "a.spz").stat().st_size <= size
+    capsys.readouterr()
+    assert main([*arguments, "--max_loss", "0.5", "-o", str(tmp_path / "b.ply")]) == 0
+    said = capsys.readouterr().out
+    loss = float(said.split("train PSNR")[1].split("(")[1].split(")")[0])
+    assert loss > -0.51 and len(load_gaussians(tmp_path / "b.ply").splats.means) < len(splats.means)
+
+
+def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys):
+    camera = make_camera(*SIZE, seed=3)
+    splats = splats_before(camera)
+    splats.opacities[::2] = -5
+    save_gaussians(tmp_path / "a.ply", SplatFile(splats))
+    assert main(["simplify", str(tmp_path / "a.ply"), "--keep", "0.5", "-o", str(tmp_path / "b.glb")]) == 0
+    assert "Without a scene" in capsys.readouterr().out
+    np.testing.assert_allclose(load_gaussians(tmp_path / "b.glb").splats.means, splats.means[1::2], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ([], "expected one of --keep, --max_loss and --size, got none"),
+        (["--keep", "0.5", "--size", "1MB"], "got --keep and --size"),
+        (["--keep", "0.001"], "nothing would be left of 40 Gaussians"),
+        (["--keep", "1.5"], "--keep: expected"),
+        (["--size", "10 miles"], "--size 10 miles: expected a size of file such as 10MB"),
+        (["--size", "3B"], "nothing would be left of 40 Gaussians"),
+        (["--max_loss", "0.1"], "expected photographs to compare with"),
+        (["--keep", "0.5", "--steps", "-1"], "--steps: expected"),
+        (["--keep", "0.5", "-o", "b.obj"], "b.obj: expected a name that ends in"),
+        (["--keep", "0.5", "-o", "a.ply"], "a.ply: expected another file than the model"),
+    ],
+)
+def test_simplify_refuses_in_one_sentence(tmp_path, capsys, monkeypatch, options, sentence):
+    monkeypatch.chdir(tmp_path)
+    save_gaussians("a.ply", SplatFile(splats_before(make_camera(*SIZE, seed=3))))
+    assert main(["simplify", "a.ply", *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert sentence in line and [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_clean_reports_before_and_after(folder, tmp_path, capsys):
+    """With a dark Gaussian planted right before the first training camera."""
+    folder, splats = folder
+    camera = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None).train[0].camera
+    planted = SplatArrays(*(np.concatenate([array, array[:1]]) for array in splats))
+    planted.means[-1] = np.float32([0, 0, 0.3]) @ camera.rotation + camera.center
+    planted.sh[-1, 0], planted.scales[-1], planted.opacities[-1] = -0.5 / C0, -2.5, 5.0
+    output = tmp_path / "b.spz"
+    copy = tmp_path / "model"
+    save_gaussians(ply_path(copy, 7), SplatFile(planted))
+    write_cfg_args(copy, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
+    arguments = ["clean", str(copy), "-o", str(output), "--device", "cpu"]
+    assert main(arguments) == 0
+    out = capsys.readouterr().out
+    left = int(out.split(f"{output}: ")[1].split(" of ")[0])
+    assert len(planted.means) - 20 < left < len(planted.means)
+    gain = float(out.split("train PSNR")[1].split("(")[1].split(")")[0])
+    assert gain >= 0.01 and (tmp_path / "b.sheet.png").stat().st_size > 10_000
+    found = load_gaussians(output).splats.means
+    assert np.abs(found - planted.means[-1]).max(axis=1).min() > 1e-3
+
+
+@pytest.mark.parametrize(("text", "wanted"), [("10MB", 10**7), ("500 kB", 500_000), ("1.5g", 1_500_000_000), ("7", 7)])
+def test_sizes_as_people_write_them(text, wanted):
+    assert bytes_of(text) == wanted

@@ -1,0 +1,97 @@
+"""``warp-splat clean``: leaves out floaters, Gaussians that hang right before few cameras.
+
+A Gaussian is one if the training views that carry it are few, by their weights w: (sum w)^2 / (sum w^2) < ``views``;
+and if it lies nearer to them than most of what they show. Both are needed. Tried, held-out PSNR of models of two
+scenes, 31.57 and 21.78 dB before:
+
+- 31.59 and 21.76 dB: both
+- 31.45 and 21.97 dB: less than 1.5 views alone; the edges of a scene have no more either, and one view lost 0.95 dB
+- 31.38 and 21.75 dB: less than 2 views alone
+- 31.57 and 21.79 dB: instead of near, before what many views carry, by an adjoint of an image of that
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from warp_splat.config import CleanConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluation.metrics import psnr
+from warp_splat.evaluation.report import contact_sheet
+from warp_splat.flags import check_numbers
+from warp_splat.formats.splats import SplatArrays
+from warp_splat.pruning.opening import Opened, open_scene, output_of, print_quality, write
+from warp_splat.pruning.score import Setting, weights
+from warp_splat.pruning.thinning import model_of, rows_of, tuned
+
+SHOWN = 3  # views on the sheet: those that changed most
+
+
+def clean(config: CleanConfig) -> int:
+    """Clean as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the model, its scene or an option is not usable; if nothing would be left.
+    """
+    check_numbers(config)
+    output = output_of(config.model, config.output, "cleaned.ply")
+    opened = open_scene(config.model, config.source_path, config.iteration, config.device, config.threads)
+    file, before = opened.file, opened.file.splats
+    found = floaters(before, opened.setting, config.views, config.near)
+    if found.all():
+        raise InputError(f"{config.model}: nothing would be left; choose lower --views or --near.")
+    splats = rows_of(before, np.flatnonzero(~found))
+    if config.steps:
+        parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}
+        trained = {**opened.trained, "parts": ",".join(sorted(parts))}
+        left = file._replace(splats=splats)
+        splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
+    write(output, file, splats)
+    print_quality(opened.quality(before), opened.quality(splats))
+    sheet = output.with_suffix(".sheet.png")
+    _draw(opened, before, splats, sheet)
+    print(f"  the views that changed most, before and after: {sheet}")
+    return 0
+
+
+def floaters(splats: SplatArrays, setting: Setting, views: float, near: float) -> np.ndarray:
+    """Which Gaussians hang right before few cameras, [N] bool.
+
+    Args:
+        splats: the model.
+        setting: the training views.
+        views: that carry a Gaussian, below which it may be one.
+        near: its depth in them, below which it may be one, as a share of the depth of half of what they show.
+    """
+    model = model_of(splats, setting)
+    with torch.no_grad():
+        gaussians = model.activated()
+    total, squares, nearness = torch.zeros(3, len(model), dtype=torch.float64, device=model.device)
+    for view in setting.views:
+        weight, depth = weights(gaussians, view, setting)
+        order = torch.argsort(depth)
+        ahead = torch.cumsum(weight[order], 0)
+        middle = depth[order][torch.searchsorted(ahead, 0.5 * ahead[-1:]).clamp_max(len(order) - 1)].clamp_min(1e-12)
+        total += weight
+        squares += weight**2
+        nearness += weight * (depth / middle)
+    few = total**2 < views * squares
+    return (few & (nearness < near * total)).cpu().numpy()
+
+
+def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None:
+    """A sheet of the views that changed most, before and after."""
+    views = [*opened.scene.test, *opened.scene.train]
+    pictures = [opened.picture(splats) for splats in (before, after)]
+    pairs = [[picture(view.camera) for picture in pictures] for view in views]
+    changes = [np.abs(one.astype(int) - other).mean() for one, other in pairs]
+    chosen = np.argsort(changes, kind="stable")[::-1][:SHOWN]
+    sections = {}
+    for place, title in enumerate(("before", "after")):
+        rows = [(views[index], pairs[index][place]) for index in chosen]
+        sections[title] = [
+            (view.name, view.picture, render, f"PSNR {psnr(render, view.picture, view.mask):.2f} dB")
+            for view, render in rows
+        ]
+    contact_sheet(path, sections)

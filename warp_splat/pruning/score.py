@@ -1,0 +1,106 @@
+"""What each Gaussian does to the images of a model, by adjoints of the blend: one for each view and question.
+
+The image is linear in the opacity of one Gaussian, and in its color. So with C the image, o the opacity and w the
+weight by which a Gaussian is blended into a pixel, o dC/do is what the image loses without it, exactly, with all that
+shines through then; and dC/dcolor is w. For upstream gradients r that are 1 or -1 at random, in each pixel and channel,
+(sum of r dC/do)^2 has as its mean the sum of (dC/do)^2 (Hutchinson 1990).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.blend import blend
+from warp_splat.raster.data import Dropped, Gaussians, Splats2D
+from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.project import project
+from warp_splat.scene.types import View
+
+
+class Carried(NamedTuple):
+    """A view of N Gaussians, and the adjoint of its blend."""
+
+    splats: Splats2D
+    adj_colors: torch.Tensor  # [N, 3] sums over the pixels of weight times upstream gradient
+    adj_opacities: torch.Tensor  # [N]
+
+
+class Costs(NamedTuple):
+    """What leaving out would change, as squared differences summed over pixels, channels and views, float64."""
+
+    gaussians: torch.Tensor  # [N] each Gaussian alone
+    harmonics: torch.Tensor  # [N, D] what a Gaussian has of harmonics beyond degree 0, 1 .. D - 1
+
+
+class Setting(NamedTuple):
+    """How a model is looked at."""
+
+    views: Sequence[View]
+    options: RasterOptions
+    background: torch.Tensor  # [3]
+
+
+def carried(gaussians: Gaussians, camera: Camera, setting: Setting, upstream: torch.Tensor) -> Carried:
+    """The adjoint of the blend of a view alone.
+
+    Args:
+        gaussians: activated, without gradients.
+        camera: of the view.
+        setting: how it is rendered.
+        upstream: gradient of the image, [H, W, 3].
+    """
+    options, driver, dropped = setting.options, driver_of(gaussians.means.device), Dropped()
+    with torch.no_grad():
+        splats = project(gaussians, camera, options, driver, dropped)
+    colors, opacities = (tensor.detach().requires_grad_() for tensor in (splats.colors, splats.opacities))
+    splats = splats._replace(colors=colors, opacities=opacities)
+    bins = driver.bin(splats, camera, options)
+    image, *_ = blend(splats, bins, setting.background, camera, options, "manual", driver, dropped)
+    return Carried(splats, *torch.autograd.grad(image, (colors, opacities), upstream))
+
+
+def weights(gaussians: Gaussians, view: View, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
+    """The share of a view's pixels that each Gaussian covers, [N] float64, and its depth [N], world units."""
+    camera = view.camera
+    ones = torch.ones(camera.height, camera.width, 3, device=gaussians.means.device)
+    found = carried(gaussians, camera, setting, _masked(ones, view))
+    return found.adj_colors[:, 0].double() / (camera.height * camera.width), found.splats.depths
+
+
+def costs(model: GaussianModel, setting: Setting) -> Costs:
+    """See :class:`Costs`; the same for any number of threads.
+
+    Tried, on photographs, half of 60,000 Gaussians left out at once: 28.0 dB by the sum of weights, 28.4 by that of
+    their squares, 29.5 by this and the gradient of the error, 30.1 by this.
+    """
+    with torch.no_grad():
+        gaussians = model.activated()
+    degrees = int(np.sqrt(1 + gaussians.sh_rest.shape[1])) - 1
+    whole = torch.zeros(len(model), dtype=torch.float64, device=model.device)
+    harmonics = torch.zeros(len(model), degrees, dtype=torch.float64, device=model.device)
+    for number, view in enumerate(setting.views):
+        camera, generator = view.camera, torch.Generator().manual_seed(number)
+        signs = 2.0 * torch.randint(0, 2, (camera.height, camera.width, 3), generator=generator) - 1.0
+        found = carried(gaussians, camera, setting, _masked(signs.to(model.device), view))
+        whole += (found.adj_opacities.double() * found.splats.opacities.detach()) ** 2
+        squares = (found.adj_colors.double() ** 2).mean(1)
+        for degree in range(degrees):
+            with torch.no_grad():
+                fewer = replace(setting.options, sh_degree=degree)
+                colors = project(gaussians, camera, fewer, driver_of(model.device), Dropped()).colors
+            harmonics[:, degree] += squares * ((colors - found.splats.colors.detach()).double() ** 2).sum(1)
+    return Costs(whole, harmonics)
+
+
+def _masked(upstream: torch.Tensor, view: View) -> torch.Tensor:
+    if view.mask is None:
+        return upstream
+    return upstream * torch.from_numpy(view.mask).to(upstream)[..., None]

@@ -1,0 +1,178 @@
+"""``warp-splat simplify``: a finished model in fewer Gaussians and harmonics, to a share, a loss or a size of file."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.config import SimplifyConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluation.metrics import psnr
+from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
+from warp_splat.flags import check_numbers
+from warp_splat.formats.atomic import write_csv
+from warp_splat.formats.model_folder import is_file_of_gaussians
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
+from warp_splat.pruning.opening import Opened, open_file, open_scene, output_of, print_quality, write, written_bytes
+from warp_splat.pruning.thinning import Thinning, fewer_harmonics, rows_of, tuned
+from warp_splat.text import format_table
+
+LEVELS = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # shares of the Gaussians that the table and the plot show
+TRIES = 6  # halvings of the range of counts, for a loss or a size: 1/64 of the Gaussians is left of it
+UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
+UNSEEN = "Without a scene, Gaussians are left out by opacity and extent alone, which costs several times the decibels."
+
+
+def simplify(config: SimplifyConfig) -> int:
+    """Simplify as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the model, its scene or an option is not usable; if nothing would be left.
+    """
+    _check(config)
+    output = output_of(config.model, config.output, "simplified.ply")
+    if is_file_of_gaussians(config.model) and not config.source_path:
+        return _unseen(config, output)
+    opened = open_scene(config.model, config.source_path, config.iteration, config.device, config.threads)
+    thinning, file = Thinning(opened.file.splats, opened.setting), opened.file
+    _curve(opened, thinning, output)
+
+    def made(count: int) -> SplatArrays:
+        if not config.steps:
+            return thinning.to(count)
+        return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained)
+
+    total, views = len(file.splats.means), opened.scene.train
+    if config.max_loss:
+        least = opened.psnr(file.splats, views) - config.max_loss
+        count = _fewest(total, lambda count: opened.psnr(made(count), views) >= least)
+    else:
+        count = _count(config, total, lambda count: written_bytes(output, file._replace(splats=thinning.to(count))))
+    splats = made(count)
+    splats = fewer_harmonics(splats, opened.setting, _squared_error(opened, splats))
+    write(output, file, splats)
+    numbers = np.bincount(degrees_of(splats))
+    print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
+    print_quality(opened.quality(file.splats), opened.quality(splats))
+    print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
+    return 0
+
+
+def degrees_of(splats: SplatArrays) -> np.ndarray:
+    """The highest degree of each Gaussian that is not zero [N]."""
+    used = np.any(splats.sh != 0, axis=2)
+    highest = np.where(used, np.arange(used.shape[1]), 0).max(axis=1)
+    return np.searchsorted(COEFFICIENTS, highest, side="right")
+
+
+def bytes_of(size: str) -> int:
+    """A number of bytes from text: 10MB, 500 kB, 1.5M.
+
+    Raises:
+        InputError: if it is no size.
+    """
+    found = re.fullmatch(r"(\d+\.?\d*)\s*([KMG]?)B?", size.strip().upper())
+    if not found or not float(found[1]):
+        raise InputError(f"--size {size:.40}: expected a size of file such as 10MB or 500kB.")
+    return int(float(found[1]) * UNITS[found[2]])
+
+
+def _check(config: SimplifyConfig) -> None:
+    check_numbers(config)
+    given = [name for name in ("keep", "max_loss", "size") if getattr(config, name)]
+    if len(given) != 1:
+        found = " and ".join(f"--{name}" for name in given) or "none"
+        raise InputError(f"warp-splat simplify: expected one of --keep, --max_loss and --size, got {found}.")
+    if config.size:
+        bytes_of(config.size)
+
+
+def _count(config: SimplifyConfig, total: int, size_of: Callable[[int], int]) -> int:
+    """How many of ``total`` Gaussians to keep, for ``--keep`` or ``--size``; ``size_of`` a count, in bytes."""
+    if config.keep:
+        count = round(config.keep * total)
+    else:
+        most = bytes_of(config.size)
+        count = _most(total, lambda count: size_of(count) <= most)
+    if not count:
+        raise InputError(f"{config.model}: nothing would be left of {total} Gaussians; keep more, or allow more bytes.")
+    return count
+
+
+def _fewest(total: int, good: Callable[[int], bool]) -> int:
+    """The least count found that is ``good``; ``total`` is."""
+    low, high = 0, total
+    for _ in range(TRIES):
+        if high - low < 2:
+            break
+        middle = (low + high) // 2
+        low, high = (low, middle) if good(middle) else (middle, high)
+    return high
+
+
+def _most(total: int, good: Callable[[int], bool]) -> int:
+    """The largest count found that is ``good``, 0 if none is."""
+    if good(total):
+        return total
+    low, high = (1, total) if good(1) else (0, 1)
+    for _ in range(TRIES):
+        if high - low < 2:
+            break
+        middle = (low + high) // 2
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low
+
+
+def _squared_error(opened: Opened, splats: SplatArrays) -> float:
+    """Of the training views, summed over pixels and channels, colors 0..1."""
+    picture, error = opened.picture(splats), 0.0
+    for view in opened.scene.train:
+        squared = (picture(view.camera) / 255.0 - view.picture / 255.0) ** 2
+        error += float(squared.sum() if view.mask is None else squared[view.mask > 0].sum())
+    return error
+
+
+def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
+    """Print, write and plot what shares of the Gaussians are worth, before any training."""
+    rows, (name, views) = [], opened.scene.evaluated
+    for share in LEVELS:
+        splats = thinning.to(max(1, round(share * len(opened.file.splats.means))))
+        picture, start = opened.picture(splats), time.perf_counter()
+        renders = [picture(view.camera) for view in views]
+        seconds = time.perf_counter() - start
+        pairs = zip(renders, views, strict=True)
+        rows.append(
+            {
+                "kept": share,
+                "Gaussians": len(splats.means),
+                "MB": written_bytes(output, opened.file._replace(splats=splats)) / 1e6,
+                "frames_per_second": len(views) / seconds,
+                f"{name}_PSNR": float(np.mean([psnr(render, view.picture, view.mask) for render, view in pairs])),
+            }
+        )
+    lines = [[f"{value:.2f}" if isinstance(value, float) else value for value in row.values()] for row in rows]
+    print(format_table([head.replace("_", " ") for head in rows[0]], lines))
+    write_csv(output.with_suffix(".curve.csv"), rows)
+    figure, grid = new_panels(2.5, 1, 3, sharex=True)
+    titles = {"MB": "size [MB]", "frames_per_second": "frames per second", f"{name}_PSNR": f"{name} PSNR [dB]"}
+    for axes, color, (key, title) in zip(np.ravel(grid), (BLUE, GREEN, ORANGE), titles.items(), strict=True):
+        plain_axes(axes, title, "share of the Gaussians kept")
+        axes.plot([row["kept"] for row in rows], [row[key] for row in rows], color=color, marker="o", markersize=4)
+    save_figure(figure, output.with_suffix(".curve.png"))
+
+
+def _unseen(config: SimplifyConfig, output: Path) -> int:
+    """Without a scene: the largest by opacity and extent."""
+    if config.max_loss or config.steps:
+        raise InputError("--max_loss, --steps: expected photographs to compare with; name the scene with -s.")
+    print(UNSEEN)
+    _, file, _ = open_file(config.model, config.iteration)
+    order = np.argsort(-sizes(file.splats), kind="stable")
+    keep = lambda count: rows_of(file.splats, np.sort(order[:count]))  # noqa: E731
+    count = _count(config, len(order), lambda count: written_bytes(output, file._replace(splats=keep(count))))
+    write(output, file, keep(count))
+    return 0
