@@ -16,7 +16,7 @@ from warp_splat.formats.model_folder import ply_path, write_cfg_args
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.clean import floaters
-from warp_splat.pruning.score import Setting, carried, costs, weights
+from warp_splat.pruning.score import ViewSetting, carried, costs, weights
 from warp_splat.pruning.simplify import bytes_of, degrees_of
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics
 from warp_splat.raster.api import render
@@ -50,7 +50,7 @@ def views_of(cameras):
 
 
 def setting_of(cameras, device="cpu", background=(0.2, 0.4, 0.7)):
-    return Setting(views_of(cameras), OPTIONS, torch.tensor(background, device=device))
+    return ViewSetting(views_of(cameras), OPTIONS, torch.tensor(background, device=device))
 
 
 def drawn(splats, setting, camera, options=OPTIONS):

@@ -22,7 +22,7 @@ from warp_splat.evaluation.report import contact_sheet
 from warp_splat.flags import check_numbers
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.pruning.opening import Opened, open_scene, output_of, print_quality, write
-from warp_splat.pruning.score import Setting, weights
+from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, rows_of, tuned
 
 SHOWN = 3  # views on the sheet: those that changed most
@@ -55,7 +55,7 @@ def clean(config: CleanConfig) -> int:
     return 0
 
 
-def floaters(splats: SplatArrays, setting: Setting, views: float, near: float) -> np.ndarray:
+def floaters(splats: SplatArrays, setting: ViewSetting, views: float, near: float) -> np.ndarray:
     """Which Gaussians hang right before few cameras, [N] bool.
 
     Args:

@@ -17,7 +17,7 @@ from warp_splat.formats.exchange import format_of, save_gaussians
 from warp_splat.formats.model_folder import is_file_of_gaussians, open_model
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.pruning.score import Setting
+from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.command import load_trained_scene, make_picture, options_of
 from warp_splat.runtime import launch
@@ -30,7 +30,7 @@ class Opened(NamedTuple):
     file: SplatFile
     trained: dict  # options of its training
     scene: Scene
-    setting: Setting  # of the training views
+    setting: ViewSetting  # of the training views
 
     def picture(self, splats: SplatArrays) -> Callable[[Camera], np.ndarray]:
         """A function from a camera to what ``splats`` look like, [H, W, 3] uint8."""
@@ -67,7 +67,7 @@ def open_scene(model: str, source_path: str, iteration: int, device: str, thread
     iteration, file, trained = open_file(model, iteration)
     scene = load_trained_scene(model, source_path, trained, print, iteration)
     background = torch.full((3,), float(bool(trained.get("white_background"))), device=used)
-    return Opened(file, trained, scene, Setting(scene.train, options_of(trained), background))
+    return Opened(file, trained, scene, ViewSetting(scene.train, options_of(trained), background))
 
 
 def output_of(model: str, output: str, name: str) -> Path:

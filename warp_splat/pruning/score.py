@@ -40,7 +40,7 @@ class Costs(NamedTuple):
     harmonics: torch.Tensor  # [N, D] what a Gaussian has of harmonics beyond degree 0, 1 .. D - 1
 
 
-class Setting(NamedTuple):
+class ViewSetting(NamedTuple):
     """How a model is looked at."""
 
     views: Sequence[View]
@@ -48,7 +48,7 @@ class Setting(NamedTuple):
     background: torch.Tensor  # [3]
 
 
-def carried(gaussians: Gaussians, camera: Camera, setting: Setting, upstream: torch.Tensor) -> Carried:
+def carried(gaussians: Gaussians, camera: Camera, setting: ViewSetting, upstream: torch.Tensor) -> Carried:
     """The adjoint of the blend of a view alone.
 
     Args:
@@ -67,7 +67,7 @@ def carried(gaussians: Gaussians, camera: Camera, setting: Setting, upstream: to
     return Carried(splats, *torch.autograd.grad(image, (colors, opacities), upstream))
 
 
-def weights(gaussians: Gaussians, view: View, setting: Setting) -> tuple[torch.Tensor, torch.Tensor]:
+def weights(gaussians: Gaussians, view: View, setting: ViewSetting) -> tuple[torch.Tensor, torch.Tensor]:
     """The share of a view's pixels that each Gaussian covers, [N] float64, and its depth [N], world units."""
     camera = view.camera
     ones = torch.ones(camera.height, camera.width, 3, device=gaussians.means.device)
@@ -75,7 +75,7 @@ def weights(gaussians: Gaussians, view: View, setting: Setting) -> tuple[torch.T
     return found.adj_colors[:, 0].double() / (camera.height * camera.width), found.splats.depths
 
 
-def costs(model: GaussianModel, setting: Setting) -> Costs:
+def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
     """See :class:`Costs`; the same for any number of threads.
 
     Tried, on photographs, half of 60,000 Gaussians left out at once: 28.0 dB by the sum of weights, 28.4 by that of

@@ -11,7 +11,7 @@ import torch
 from warp_splat.flags import fits, flags_of
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.pruning.score import Setting, costs
+from warp_splat.pruning.score import ViewSetting, costs
 from warp_splat.scene.types import Scene
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import PARTS
@@ -47,7 +47,7 @@ class Thinning:
         setting: the training views, and how they are rendered.
     """
 
-    def __init__(self, splats: SplatArrays, setting: Setting):
+    def __init__(self, splats: SplatArrays, setting: ViewSetting):
         self.splats, self.setting = splats, setting
         self._kept = {len(splats.means): np.arange(len(splats.means))}
 
@@ -61,18 +61,18 @@ class Thinning:
         return rows_of(self.splats, rows)
 
 
-def model_of(splats: SplatArrays, setting: Setting) -> GaussianModel:
+def model_of(splats: SplatArrays, setting: ViewSetting) -> GaussianModel:
     """On the device of the setting."""
     return GaussianModel.from_splats(splats).to(setting.background.device)
 
 
-def _costliest(model: GaussianModel, setting: Setting, count: int) -> torch.Tensor:
+def _costliest(model: GaussianModel, setting: ViewSetting, count: int) -> torch.Tensor:
     """Indices of the Gaussians, ascending, without which the images would change most."""
     order = torch.sort(costs(model, setting).gaussians, descending=True, stable=True).indices
     return torch.sort(order[:count]).values
 
 
-def fewer_harmonics(splats: SplatArrays, setting: Setting, squared_error: float) -> SplatArrays:
+def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, squared_error: float) -> SplatArrays:
     """The Gaussians with zeros for harmonics of degrees that do not show, each from its own degree on.
 
     Args:
@@ -106,7 +106,7 @@ def _degrees(change: np.ndarray, bound: float) -> tuple[np.ndarray, float]:
     return degrees, float(padded[np.arange(len(change)), degrees].sum())
 
 
-def tuned(scene: Scene, file: SplatFile, setting: Setting, count: int, steps: int, trained: dict) -> SplatArrays:
+def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps: int, trained: dict) -> SplatArrays:
     """The model in ``count`` Gaussians, which ``steps`` of training adapt; they are left out by and by.
 
     Args:
