@@ -21,7 +21,7 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
 from warp_splat.flags import check_numbers
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.opening import Opened, open_scene, output_of, print_quality, write
+from warp_splat.pruning.finished import Opened, open_finished, output_of, print_quality, write
 from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, rows_of, tuned
 
@@ -36,7 +36,7 @@ def clean(config: CleanConfig) -> int:
     """
     check_numbers(config)
     output = output_of(config.model, config.output, "cleaned.ply")
-    opened = open_scene(config.model, config.source_path, config.iteration, config.device, config.threads)
+    opened = open_finished(config.model, config.source_path, config.iteration, config.device, config.threads)
     file, before = opened.file, opened.file.splats
     found = floaters(before, opened.setting, config.views, config.near)
     if found.all():

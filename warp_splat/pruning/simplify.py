@@ -17,7 +17,7 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_csv
 from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
-from warp_splat.pruning.opening import Opened, open_file, open_scene, output_of, print_quality, write, written_bytes
+from warp_splat.pruning.finished import Opened, open_file, open_finished, output_of, print_quality, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, rows_of, tuned
 from warp_splat.text import format_table
 
@@ -37,7 +37,7 @@ def simplify(config: SimplifyConfig) -> int:
     output = output_of(config.model, config.output, "simplified.ply")
     if is_file_of_gaussians(config.model) and not config.source_path:
         return _unseen(config, output)
-    opened = open_scene(config.model, config.source_path, config.iteration, config.device, config.threads)
+    opened = open_finished(config.model, config.source_path, config.iteration, config.device, config.threads)
     thinning, file = Thinning(opened.file.splats, opened.setting), opened.file
     _curve(opened, thinning, output)
 

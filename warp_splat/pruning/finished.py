@@ -57,7 +57,7 @@ def open_file(model: str, iteration: int) -> tuple[int, SplatFile, dict]:
     return iteration, file, trained
 
 
-def open_scene(model: str, source_path: str, iteration: int, device: str, threads: int) -> Opened:
+def open_finished(model: str, source_path: str, iteration: int, device: str, threads: int) -> Opened:
     """The model with its scene.
 
     Raises:
