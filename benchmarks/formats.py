@@ -17,7 +17,7 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import FORMATS, load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.command import load_trained_scene, make_picture, options_of
+from warp_splat.rendering.command import load_trained_scene, make_picture, options_of, with_refined_cameras
 from warp_splat.runtime import launch
 
 HEADERS = (
@@ -37,7 +37,8 @@ LEFT_OUT = {".gltf"}  # holds what a .glb does
 def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
     """A row for each format, the .ply first."""
     iteration, file, trained = open_model(model)
-    scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None, iteration)
+    scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None)
+    scene = with_refined_cameras(scene, str(model), iteration)
     first, first_bytes, rows = None, 0, []
     for ending in (ending for ending in FORMATS if ending not in LEFT_OUT):
         path, start = folder / f"a{ending}", time.perf_counter()

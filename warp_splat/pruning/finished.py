@@ -19,7 +19,7 @@ from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.command import load_trained_scene, make_picture, options_of
+from warp_splat.rendering.command import load_trained_scene, make_picture, options_of, with_refined_cameras
 from warp_splat.runtime import launch
 from warp_splat.scene.types import Scene, View
 
@@ -65,7 +65,8 @@ def open_finished(model: str, source_path: str, iteration: int, device: str, thr
     """
     used = settle_device(launch.prepare(device, threads), device)
     iteration, file, trained = open_file(model, iteration)
-    scene = load_trained_scene(model, source_path, trained, print, iteration)
+    scene = load_trained_scene(model, source_path, trained, print)
+    scene = with_refined_cameras(scene, model, iteration)
     background = torch.full((3,), float(bool(trained.get("white_background"))), device=used)
     return Opened(file, trained, scene, ViewSetting(scene.train, options_of(trained), background))
 
