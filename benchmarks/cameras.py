@@ -139,7 +139,7 @@ def measure_price() -> tuple[float, float]:
     whole, projection = [], {through: [], learning: []}
     for _ in range(ROUNDS):
         for change, seconds in projection.items():
-            clock = patch.object(launch, "_now", time.process_time)
+            clock = patch.object(timers, "_now", time.process_time)
             with patch.object(Trainer, "_through", change), clock, timers.profile() as stages:
                 start = time.process_time()
                 step()

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
+from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.runtime.sums import in_pairs
@@ -32,6 +33,7 @@ OFF = 0.5  # px that a pose moves its picture by: what blurs
 FLAT = 1e-9  # length of a motion that moves nothing: growth, where all cameras stand at one place
 MOST = 1000  # points of a photograph that say how a pose moves it
 DAMPING = 0.01  # of its square
+NUMBERS = "pose.numbers"  # in a checkpoint
 
 
 class Pose:
@@ -42,18 +44,31 @@ class Pose:
         self.options, self.iterations, self.scene = options, setting.iterations, scene
         self.places = {view: place for place, view in enumerate(scene.train)}
         self.lenses = {lens: place for place, lens in enumerate(dict.fromkeys(map(intrinsics_of, scene.train)))}
-        device, numbers = setting.model.device, {"": 0, "focal": 1, "all": 4}[options.pose_intrinsics]
+        self.device, numbers = setting.model.device, {"": 0, "focal": 1, "all": 4}[options.pose_intrinsics]
         cameras, points = [view.camera for view in scene.train], scene.points.astype(np.float64)
-        lower = factors(np.stack([sensitivity(camera, points, scene.extent) for camera in cameras]))
-        ways = inverses(lower) * np.array([1.0] * 3 + [scene.extent] * 3)
-        #: Of each photograph and of each of its numbers: the twist, [V, 6, 6].
-        self.ways = torch.from_numpy(ways).to(device)
+        self._choose_numbers(factors(np.stack([sensitivity(camera, points, scene.extent) for camera in cameras])))
         #: Shares of the pictures' widths.
-        self.moves = new(len(scene.train), 6, device=device, requires_grad=True)
+        self.moves = new(len(scene.train), 6, device=self.device, requires_grad=True)
         #: Shares of fx, fy, width and height; with "focal" one of both focal lengths.
-        self.stretches = new(len(self.lenses), numbers, device=device, requires_grad=True)
-        whole = [in_order(lower * motion[:, :, None]) for motion in gauge(cameras, scene.extent)]
+        self.stretches = new(len(self.lenses), numbers, device=self.device, requires_grad=True)
+
+    def _choose_numbers(self, lower: np.ndarray) -> None:
+        """What the numbers of each photograph stand for: those that ``lower`` [V, 6, 6] makes of a twist."""
+        extent, cameras = self.scene.extent, [view.camera for view in self.scene.train]
+        self.lower = lower
+        #: Of each photograph and of each of its numbers: the twist, [V, 6, 6].
+        self.ways = torch.from_numpy(inverses(lower) * np.array([1.0] * 3 + [extent] * 3)).to(self.device)
+        whole = [in_order(lower * motion[:, :, None]) for motion in gauge(cameras, extent)]
         self.gauge = orthonormal(np.stack(whole).reshape(len(whole), -1))
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """What the numbers stand for: points and sizes of photographs may be others after a resume."""
+        return {NUMBERS: torch.from_numpy(self.lower)}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on with the same numbers."""
+        if NUMBERS in checkpoint.arrays:  # not, if training went without this part so far
+            self._choose_numbers(checkpoint.array(NUMBERS, self.lower.shape, np.float64))
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
@@ -99,7 +114,9 @@ class Pose:
             place = self.places[view]
             twist = in_pairs(self.ways[place] * self.moves[place].double()[:, None])
         if not self.options.pose_intrinsics or intrinsics_of(view) not in self.lenses:
-            return CameraParameters(camera, twist, torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]).double())
+            return CameraParameters(
+                camera, twist, torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+            )
         free = self.options.pose_intrinsics == "all"
         units = [camera.fx, camera.fy, free * camera.width, free * camera.height]
         given = [camera.fx, camera.fy, camera.cx, camera.cy]
