@@ -31,7 +31,7 @@ def differentiate_on_tape(
 def gradients_on_tape(workload: Workload, truth: Truth) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """As :func:`warp_splat.compare.truth.gradients_of`, but for the 2D means, which the tape does not show."""
     rows, columns = workload.pixels.T
-    upstream = torch.zeros(workload.camera.height, workload.camera.width, 3, device=workload.device)
+    upstream = workload.background.new_zeros(workload.camera.height, workload.camera.width, 3)
     upstream[rows, columns] = truth.weights.to(upstream)
     image, found = differentiate_on_tape(workload, upstream)
     return image[rows, columns].cpu(), {name: grad.cpu() for name, grad in found.items()}
