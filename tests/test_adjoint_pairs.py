@@ -31,6 +31,10 @@ CONSTANT = {
     "covers_pixel": "masks",
     "weight_of": "wp.grad(weigh) is asked for the direction alone",
     "begin": "in front of everything, the transmittance is 1",
+    "ask": "brings memory into the cache",
+    "noise": "random numbers",
+    "widened": "moments, which have no gradient",
+    "rounded": "the same",
     "fall_value": "exp2_known has the derivative",
 }
 #: Derivatives that are right only together, in the loop that Warp replays, and adjoints of whole steps: against
@@ -108,9 +112,13 @@ def make_piece(name, number):
     def clamped(x: number, y: number, z: number):
         return opaque(x, ALPHA_MIN, y, z)
 
+    @wp.func
+    def angle(x: number, y: number, z: number):
+        return simd.angle(x, y)
+
     pieces = {"exp2_known": known, "opaque": clamped, "inverse": inverse, "root": root, "halved": halved}
     pieces |= {"times": times, "fma": fma, "over": over, "where_less": where_less, "fraction": fraction}
-    piece = (pieces | {"pick": pick, "columns": columns})[name]
+    piece = (pieces | {"pick": pick, "columns": columns, "angle": angle})[name]
 
     @wp.kernel(module="unique")
     def evaluate(x: wp.array[number], y: wp.array[number], z: wp.array[number], values_out: wp.array[number]):
@@ -132,6 +140,7 @@ TRUTH = {
     "halved": lambda x, y, z: x * 0.5 ** np.trunc(y),
     "pick": lambda x, y, z: np.where(x < 1, y * y, z * x),
     "columns": lambda x, y, z: x * y * y + z,
+    "angle": lambda x, y, z: np.arctan2(x, y),
     "exp2_known": lambda x, y, z: np.exp2(-x),
     "opaque": lambda x, y, z: np.where(y < z, np.where(x < ALPHA_MIN, 0, np.minimum(x, ALPHA_MAX)), 0),
 }

@@ -8,7 +8,7 @@ import scenes
 import torch
 from scipy.spatial.transform import Rotation
 
-from warp_splat import Camera, CameraParameters, InputError, RasterOptions, rasterize
+from warp_splat import Camera, InputError, RasterOptions, rasterize
 from warp_splat.kernels.formula import Notes, Number
 from warp_splat.kernels.project import affine
 from warp_splat.lenses import Lens
@@ -138,8 +138,6 @@ def test_what_knows_no_lenses_refuses_them():
     scene, camera = scenes.SCENES["single"](), picture()
     with pytest.raises(InputError, match=r"options\.projection: expected affine or unscented for a camera with a lens"):
         rasterize(*scene.parameters(), camera, options=RasterOptions(projection="ellipsoid"))
-    with pytest.raises(InputError, match="base: expected a camera without distortion, got one with OPENCV"):
-        CameraParameters(camera)
     with pytest.raises(InputError, match="for a camera with a lens, got one of your own"):
         rasterize(*scene.parameters(), camera, options=RasterOptions(projection=affine.PROJECTION))
     with pytest.raises(InputError, match=r"Camera lens: expected a warp_splat\.Lens or None, got 3"):

@@ -42,7 +42,7 @@ COMMANDS = {
         "convert Gaussians between .ply, .splat, .spz, .sog, glTF",
     ),
     "simplify": (SimplifyConfig, "pruning.simplify.simplify", "leave out what a finished model does not need"),
-    "clean": (CleanConfig, "pruning.clean.clean", "leave out floaters: what hangs right before few cameras"),
+    "clean": (CleanConfig, "pruning.clean.clean", "leave out what hangs right before few cameras"),
     "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
     "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }
