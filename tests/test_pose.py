@@ -183,6 +183,16 @@ def test_a_photograph_is_found_while_the_model_stays():
     assert degrees < 0.05 and meters < 1e-3 and focal == 0
 
 
+def test_a_model_that_shows_nothing_leads_nowhere_far():
+    """Each further radian would be better, up to a hundred."""
+    camera = made_cameras.looking()
+    white = np.full((camera.height, camera.width, 3), 255, np.uint8)
+    start = View("a.png", camera, white, camera)
+    found = find_pose(lambda learned: (learned.twist[0] / 100).float().expand(*white.shape), start, 1.0)
+    degrees, meters, _ = made_cameras.distance(found, camera)
+    assert degrees == pytest.approx(np.degrees(alignment.FARTHEST)) and meters < 1e-9
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """Held-out poses are refined in a few steps, which is enough to be better."""

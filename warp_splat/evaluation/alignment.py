@@ -17,6 +17,7 @@ from warp_splat.raster.data import Gaussians
 from warp_splat.scene.types import View
 
 LEVELS = (1, 2, 4, 8, 16)  # px: boxes over which differences are averaged; fine detail sees no large displacement
+FARTHEST = 0.25  # rad about an axis, shares of the extent along one: a model that shows nothing leads nowhere
 STEPS = 40  # pictures and their adjoints, about: an iteration that has begun is ended
 
 
@@ -29,7 +30,7 @@ def where_taken(
 
 
 def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, extent: float) -> Camera:
-    """The camera from which the model looks most like the photograph, by L-BFGS from where it was given.
+    """The camera from which the model looks most like the photograph, by L-BFGS near where it was given.
 
     Args:
         draw: the model's image [H, W, 3] through a camera, with gradients for that.
@@ -50,7 +51,8 @@ def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, exte
         errors.backward()
         return errors.item(), twist.grad.numpy()
 
-    found = minimize(loss, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxfun": STEPS})
+    near = [(-FARTHEST, FARTHEST)] * 6
+    found = minimize(loss, np.zeros(6), jac=True, method="L-BFGS-B", bounds=near, options={"maxfun": STEPS})
     return _moved(camera, torch.from_numpy(found.x) * units).camera
 
 
