@@ -10,6 +10,9 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN
 from warp_splat.kernels import falloff, simd, splat
+from warp_splat.kernels.angle import angle as angle_of
+from warp_splat.kernels.columns import columns as columns_of
+from warp_splat.kernels.columns import rows
 from warp_splat.kernels.falloff import exp2_known, make_exp
 from warp_splat.kernels.simd import vec16
 from warp_splat.kernels.step import opaque
@@ -101,7 +104,7 @@ def make_piece(name, number):
 
     @wp.func
     def columns(x: number, y: number, z: number):
-        a, b, c = simd.columns(simd.rows(x, y, z))
+        a, b, c = columns_of(rows(x, y, z))
         return simd.times(a, simd.times(b, b)) + c
 
     @wp.func
@@ -114,7 +117,7 @@ def make_piece(name, number):
 
     @wp.func
     def angle(x: number, y: number, z: number):
-        return simd.angle(x, y)
+        return angle_of(x, y)
 
     pieces = {"exp2_known": known, "opaque": clamped, "inverse": inverse, "root": root, "halved": halved}
     pieces |= {"times": times, "fma": fma, "over": over, "where_less": where_less, "fraction": fraction}

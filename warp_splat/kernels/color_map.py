@@ -4,8 +4,9 @@ import functools
 
 import warp as wp
 
+from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.simd import TYPES, columns, fill, fma, inner, rows, times
+from warp_splat.kernels.simd import TYPES, fill, fma, inner, times
 
 vec12 = wp.types.vector(length=12, dtype=float)
 

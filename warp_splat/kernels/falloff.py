@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_splat.errors import InputError
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.simd import exp2_exact, fill, fma, fraction, halved, times, vec16, whole
+from warp_splat.kernels.simd import LANES, fill, fma, fraction, halved, times, vec16, whole
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -140,6 +140,20 @@ def make_exp(degree: int | None) -> wp.Function:
         return halved(p, n)
 
     return exp2_minus
+
+
+@wp.func
+def exp2_exact(x: float):
+    """2^x by the C library: a call per lane."""
+    return wp.exp(x * 0.6931471805599453)
+
+
+@wp.func
+def exp2_exact(x: vec16):
+    r = vec16()
+    for lane in range(LANES):
+        r[lane] = wp.exp(x[lane] * 0.6931471805599453)
+    return r
 
 
 @wp.func

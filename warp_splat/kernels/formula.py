@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_splat.kernels import simd
+from warp_splat.kernels.angle import angle
 from warp_splat.kernels.project.camera_view import CameraView, turn
 
 Name = str | None  # of a variable of the function; None: zero
@@ -204,6 +205,6 @@ def write_function(
     source = "\n    ".join([head, *body]) + "\n"
     path = f"<{name} {zlib.crc32(source.encode())} of {lanes}>"
     linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
-    known = {**vars(simd), "CameraView": CameraView, "turn": turn, "number": simd.TYPES[lanes].number}
+    known = {**vars(simd), "angle": angle, "CameraView": CameraView, "turn": turn, "number": simd.TYPES[lanes].number}
     exec(compile(source, path, "exec"), known)
     return wp.func(known[name])

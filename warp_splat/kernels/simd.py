@@ -5,19 +5,14 @@ operations are those of the compiler's vectors: one AVX-512 register, two of AVX
 ``float``. ``+``, ``-``, ``wp.min`` and ``wp.max`` are Warp's and take either. There LLVM has to find the vectors among
 scalars, which it does if the code has no branch per lane and no libm call.
 
-Kernels that Warp differentiates need operations that know their derivative. The generated one is slow in lanes:
-
-- of a choice: a branch per lane;
-- of a constant: a sum over the lanes, one after the other (an adjoint twice as slow);
-- of a division: two more divisions.
-
-(Where ``wp.grad`` differentiates a function, what is called two levels below it needs a derivative by hand, too: Warp
-1.19 silently leaves out the generated one.)
+Kernels that Warp differentiates need operations that know their derivative. The generated one is slow in lanes: of a
+choice it is a branch per lane; of a constant a sum over the lanes, one after the other (an adjoint twice as slow); of a
+division two more divisions. (Where ``wp.grad`` differentiates a function, what is called two levels below it needs a
+derivative by hand, too: Warp 1.19 silently leaves out the generated one.)
 
 Masks are 1 or 0. Masks, constants, whole and rounded numbers have no derivative.
 """
 
-import math
 import re
 from typing import NamedTuple
 
@@ -36,11 +31,6 @@ vec48 = wp.types.vector(length=3 * LANES, dtype=float)
 vec64 = wp.types.vector(length=4 * LANES, dtype=float)
 
 
-PI, EIGHTH, LEAST = wp.constant(math.pi), wp.constant(math.tan(math.pi / 8)), wp.constant(1.0e-37)
-#: Of arctan(t) / t - 1 by t^2, up to an eighth of a half turn: the least largest error, 2e-8.
-ARCTAN = wp.constant(wp.types.vector(length=4, dtype=float)(-0.33332955, 0.19977925, -0.13879842, 0.08060285))
-
-
 class Types(NamedTuple):
     """The types of a kernel for a number of lanes."""
 
@@ -52,10 +42,6 @@ class Types(NamedTuple):
 
 
 TYPES = {1: Types(wp.float32, wp.int32, wp.vec2, wp.vec3, wp.vec4), LANES: Types(vec16, vec16i, vec32, vec48, vec64)}
-
-#: Pixel offsets of the lanes in their 4 x 4 block, row by row.
-LANE_X = wp.constant(vec16(*[float(lane % 4) for lane in range(LANES)]))
-LANE_Y = wp.constant(vec16(*[float(lane // 4) for lane in range(LANES)]))
 
 
 def _fused(number: str, builtin: str) -> str:
@@ -295,69 +281,6 @@ def halved(x: vec16, n: vec16i) -> vec16: ...
 
 
 @wp.func
-def exp2_exact(x: float):
-    """2^x by the C library: a call per lane."""
-    return wp.exp(x * 0.6931471805599453)
-
-
-@wp.func
-def exp2_exact(x: vec16):
-    r = vec16()
-    for lane in range(LANES):
-        r[lane] = wp.exp(x[lane] * 0.6931471805599453)
-    return r
-
-
-def _make_arctangent(number: type) -> wp.Function:
-    @wp.func
-    def arctangent(y: number, x: number):
-        zero = fill(0.0, x)
-        one = fill(1.0, x)
-        long = wp.max(wp.max(x, -x), wp.max(y, -y))
-        short = wp.min(wp.max(x, -x), wp.max(y, -y))
-        # of t = short / long: from 1 as well as from 0, whichever is nearer
-        steep = less(times(fill(EIGHTH, x), long), short)
-        t = over(pick(steep, short - long, short), wp.max(pick(steep, short + long, long), fill(LEAST, x)))
-        q = times(t, t)
-        series = fma(fill(ARCTAN[3], x), q, fill(ARCTAN[2], x))
-        series = fma(fma(series, q, fill(ARCTAN[1], x)), q, fill(ARCTAN[0], x))
-        found = fma(times(series, q), t, t) + pick(steep, fill(0.25 * PI, x), zero)
-        found = pick(less(wp.max(x, -x), wp.max(y, -y)), fill(0.5 * PI, x) - found, found)
-        found = pick(less(x, zero), fill(PI, x) - found, found)
-        return times(found, pick(less(y, zero), -one, one))
-
-    return arctangent
-
-
-arctangent, arctangents = _make_arctangent(float), _make_arctangent(vec16)
-
-
-@wp.func
-def angle(y: float, x: float):
-    """Of the point (x, y) from the x axis, -pi to pi, 0 for the origin: a polynomial, alike on all processors."""
-    return arctangent(y, x)
-
-
-@wp.func
-def angle(y: vec16, x: vec16):
-    return arctangents(y, x)
-
-
-@wp.func_grad(angle)
-def adj_angle(y: float, x: float, adj_ret: float):
-    per_square = adj_ret / wp.max(x * x + y * y, LEAST)
-    wp.adjoint[y] += x * per_square
-    wp.adjoint[x] -= y * per_square
-
-
-@wp.func_grad(angle)
-def adj_angle(y: vec16, x: vec16, adj_ret: vec16):
-    per_square = over(adj_ret, wp.max(fma(x, x, times(y, y)), fill(LEAST, x)))
-    wp.adjoint[y] += times(x, per_square)
-    wp.adjoint[x] -= times(y, per_square)
-
-
-@wp.func
 def inner(a: float, b: float):
     """Sum over the lanes of the product."""
     return a * b
@@ -375,124 +298,3 @@ def total(x: vec16):
     for lane in range(LANES):
         s += x[lane]
     return s
-
-
-@wp.func
-def columns(row: wp.vec2):
-    """The numbers of a row one by one: rows of sixteen Gaussians become columns of sixteen lanes.
-
-    Tried: one function for any width, a column at a time: projection and adjoint take half as long again.
-    """
-    return row[0], row[1]
-
-
-@wp.func
-def columns(row: vec32):
-    x = vec16()
-    y = vec16()
-    for lane in range(LANES):
-        x[lane] = row[2 * lane]
-        y[lane] = row[2 * lane + 1]
-    return x, y
-
-
-@wp.func
-def columns(row: wp.vec3):
-    return row[0], row[1], row[2]
-
-
-@wp.func
-def columns(row: vec48):
-    x = vec16()
-    y = vec16()
-    z = vec16()
-    for lane in range(LANES):
-        x[lane] = row[3 * lane]
-        y[lane] = row[3 * lane + 1]
-        z[lane] = row[3 * lane + 2]
-    return x, y, z
-
-
-@wp.func
-def columns(row: wp.vec4):
-    return row[0], row[1], row[2], row[3]
-
-
-@wp.func
-def columns(row: vec64):
-    w = vec16()
-    x = vec16()
-    y = vec16()
-    z = vec16()
-    for lane in range(LANES):
-        w[lane] = row[4 * lane]
-        x[lane] = row[4 * lane + 1]
-        y[lane] = row[4 * lane + 2]
-        z[lane] = row[4 * lane + 3]
-    return w, x, y, z
-
-
-@wp.func
-def rows(x: float, y: float):
-    """Columns back to a row."""
-    return wp.vec2(x, y)
-
-
-@wp.func
-def rows(x: vec16, y: vec16):
-    row = vec32()
-    for lane in range(LANES):
-        row[2 * lane] = x[lane]
-        row[2 * lane + 1] = y[lane]
-    return row
-
-
-@wp.func
-def rows(x: float, y: float, z: float):
-    return wp.vec3(x, y, z)
-
-
-@wp.func
-def rows(x: vec16, y: vec16, z: vec16):
-    row = vec48()
-    for lane in range(LANES):
-        row[3 * lane] = x[lane]
-        row[3 * lane + 1] = y[lane]
-        row[3 * lane + 2] = z[lane]
-    return row
-
-
-@wp.func
-def rows(w: vec16, x: vec16, y: vec16, z: vec16):
-    row = vec64()
-    for lane in range(LANES):
-        row[4 * lane] = w[lane]
-        row[4 * lane + 1] = x[lane]
-        row[4 * lane + 2] = y[lane]
-        row[4 * lane + 3] = z[lane]
-    return row
-
-
-@wp.func_grad(columns)
-def adj_columns(row: vec48, adj_x: vec16, adj_y: vec16, adj_z: vec16):
-    wp.adjoint[row] += rows(adj_x, adj_y, adj_z)
-
-
-@wp.func_grad(columns)
-def adj_columns(row: vec64, adj_w: vec16, adj_x: vec16, adj_y: vec16, adj_z: vec16):
-    wp.adjoint[row] += rows(adj_w, adj_x, adj_y, adj_z)
-
-
-@wp.func_grad(rows)
-def adj_rows(x: vec16, y: vec16, adj_ret: vec32):
-    adj_x, adj_y = columns(adj_ret)
-    wp.adjoint[x] += adj_x
-    wp.adjoint[y] += adj_y
-
-
-@wp.func_grad(rows)
-def adj_rows(x: vec16, y: vec16, z: vec16, adj_ret: vec48):
-    adj_x, adj_y, adj_z = columns(adj_ret)
-    wp.adjoint[x] += adj_x
-    wp.adjoint[y] += adj_y
-    wp.adjoint[z] += adj_z

@@ -4,8 +4,9 @@ import functools
 
 import warp as wp
 
+from warp_splat.kernels.columns import columns
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.simd import TYPES, columns, equal, fill, less, pick, real, root, times
+from warp_splat.kernels.simd import TYPES, equal, fill, less, pick, real, root, times
 
 
 @functools.cache

@@ -37,7 +37,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.falloff import make_falloff
-from warp_splat.kernels.simd import LANE_X, LANE_Y, LANES, fma, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANES, fma, times, total, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
 
@@ -47,6 +47,9 @@ AHEAD = 32  # instances that are copied, and their boxes found, together; then, 
 ROWS_AHEAD = AHEAD * wp.types.type_size_in_bytes(Splat2D) // (4 * LANES)  # of lanes, in which that many splats fit
 vec4i = wp.types.vector(length=4, dtype=int)
 mat_boxes = wp.types.matrix(shape=(AHEAD, 4), dtype=int)
+#: Pixel offsets of the lanes in their 4 x 4 block, row by row.
+LANE_X = wp.constant(vec16(*[float(lane % 4) for lane in range(LANES)]))
+LANE_Y = wp.constant(vec16(*[float(lane // 4) for lane in range(LANES)]))
 
 
 @wp.func

@@ -22,9 +22,9 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.cpu.blend import BLOCKS, reach
+from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, reach
 from warp_splat.kernels.falloff import make_falloff
-from warp_splat.kernels.simd import LANE_X, LANE_Y, fma, times, total, vec16, where_less
+from warp_splat.kernels.simd import fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
 from warp_splat.kernels.step import conic_from_root, opaque

@@ -20,9 +20,10 @@ import functools
 import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN
+from warp_splat.kernels.columns import columns
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.project.camera_view import CameraView
-from warp_splat.kernels.simd import TYPES, columns, equal, fill, fma, inner, less, pick, root, times
+from warp_splat.kernels.simd import TYPES, equal, fill, fma, inner, less, pick, root, times
 
 
 @functools.cache

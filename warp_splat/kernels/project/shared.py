@@ -22,6 +22,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR
+from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
@@ -29,7 +30,6 @@ from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.simd import (
     LANES,
     TYPES,
-    columns,
     equal,
     fill,
     fma,
@@ -41,7 +41,6 @@ from warp_splat.kernels.simd import (
     root,
     rounded_down,
     rounded_up,
-    rows,
     some,
     times,
     vec16,
