@@ -167,6 +167,19 @@ def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, optio
     assert int(by_sorting.invalid) == counted.invalid
 
 
+@pytest.mark.parametrize("miscounted", [-1, 1])
+def test_lists_stay_within_the_places_that_were_counted(miscounted):
+    """Even where the two runs of a GPU found another number of tiles."""
+    camera, projected = project(300, 4)
+    *_, counts, list_tiles = bin._start_sorting(projected, camera, PLAIN)
+    ends = torch.cumsum((counts + miscounted).clamp(min=0), 0)
+    listed, ranks = torch.full((2, int(ends[-1]) + 64), -7, dtype=torch.int32)
+    list_tiles(ends, counts[:0], listed, ranks)
+    assert (listed[int(ends[-1]) :] == -7).all() and (ranks[int(ends[-1]) :] == -7).all()
+    for rank, (begin, end) in enumerate(zip([0, *ends.tolist()], ends.tolist(), strict=False)):
+        assert (ranks[begin:end] == rank).all() and (listed[begin:end] >= 0).all() and (listed[begin:end] < 20).all()
+
+
 def test_sorting_breaks_ties_by_index_and_leaves_out_what_is_invalid():
     camera, projected = project(400)
     with torch.no_grad():

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_splat import InputError
 from warp_splat.config import ADJOINTS
-from warp_splat.raster import cpu, selftest
+from warp_splat.raster import bin, cpu, selftest
 from warp_splat.raster.drivers import CPU, using
 from warp_splat.runtime import devices, launch
 
@@ -99,6 +99,18 @@ def test_a_wrong_gradient_is_found(factor):
         return factor * slots, adj_background, bad
 
     with using(replace(CPU, adjoint=wrong)), pytest.raises(InputError, match=r"self-test expected \S+ as a gradient"):
+        selftest.check_device(HOST)
+
+
+def test_lists_that_round_otherwise_when_they_are_written_are_found(monkeypatch):
+    def differ(*arguments):
+        counts, again = bin.count_twice(*arguments)
+        assert torch.equal(counts, again) and counts.max() > 100 and (counts > 0).sum() > 10_000
+        again[12_345] += 1
+        return counts, again
+
+    monkeypatch.setattr(selftest, "count_twice", differ)
+    with pytest.raises(InputError, match=r"self-test expected \d+ as a number of tiles and found \d+"):
         selftest.check_device(HOST)
 
 

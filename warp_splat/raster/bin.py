@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 import warp as wp
@@ -62,27 +64,13 @@ def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -
     Where these are so many that one tile might hold too many, it waits for the longest list as well.
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    radii, device, total = splats2d.radii, splats2d.radii.device, len(splats2d.radii)
-    keys = torch.where(radii > 0, splats2d.depths.detach(), torch.inf)
-    order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
-    splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
-    rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
-    square = int(options.extent == "square")
-    inputs = [order, splats2d.view(), camera.height, options.alpha_min, square]
-    pack = tiles.make_pack(falloff_of(options).reach_of)
-    launch(pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
-    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, tiles_x, square]
-
-    def list_tiles(place_ends: torch.Tensor, *lists: torch.Tensor) -> None:
-        outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]
-        launch(tiles.list_tiles, total, [*inputs, view(place_ends, wp.int64)], outputs, device=device)
-
-    list_tiles(counts[:0], *torch.empty(2, 0, dtype=torch.int32, device=device))
+    device, total = splats2d.radii.device, len(splats2d.radii)
+    order, splats, counts, list_tiles = _start_sorting(splats2d, camera, options)
     place_ends = torch.cumsum(counts, 0)
     count = int(place_ends[-1]) if total else 0
     _check_count(count, camera, total, device)
     listed, ranks = torch.empty(2, count, dtype=torch.int32, device=device)
-    list_tiles(place_ends, listed, ranks)
+    list_tiles(place_ends, counts[:0], listed, ranks)
     # the fewer bits, the fewer passes of the sort
     narrow = torch.int16 if tiles_x * tiles_y < 2**15 else torch.int32
     listed, numbers = torch.sort(listed.to(narrow), stable=True)
@@ -92,9 +80,40 @@ def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -
     ranges = torch.stack([bounds[:-1], bounds[1:]], 1)
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
         _check_longest(int(bounds.diff().max()))
-    invalid = torch.count_nonzero(radii < 0)
+    invalid = torch.count_nonzero(splats2d.radii < 0)
     lists = (instances, places, (place_ends - counts).int(), ranges)
     return Bins(total, order, splats, *lists, [], tiles_x, invalid)
+
+
+def _start_sorting(
+    splats2d: Splats2D, camera: Camera, options: RasterOptions
+) -> tuple[wp.array, wp.array, torch.Tensor, Callable[..., None]]:
+    """Gaussians nearest first, their splats, the number of their tiles, and what lists these (see the kernel)."""
+    radii, device, total = splats2d.radii, splats2d.radii.device, len(splats2d.radii)
+    keys = torch.where(radii > 0, splats2d.depths.detach(), torch.inf)
+    order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
+    splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
+    rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
+    square = int(options.extent == "square")
+    inputs = [order, splats2d.view(), camera.height, options.alpha_min, square]
+    pack = tiles.make_pack(falloff_of(options).reach_of)
+    launch(pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
+    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, -(-camera.width // TILE), square]
+
+    def list_tiles(place_ends: torch.Tensor, counts: torch.Tensor, *lists: torch.Tensor) -> None:
+        outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]
+        launch(tiles.list_tiles, total, [*inputs, view(place_ends, wp.int64)], outputs, device=device)
+
+    list_tiles(counts[:0], counts, *torch.empty(2, 0, dtype=torch.int32, device=device))
+    return order, splats, counts, list_tiles
+
+
+def count_twice(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> tuple[torch.Tensor, torch.Tensor]:
+    """The number of tiles of each splat [N], as :func:`bin_by_sorting` finds it to count, and to write."""
+    *_, counts, list_tiles = _start_sorting(splats2d, camera, options)
+    again, ends = torch.empty_like(counts), torch.cumsum(counts, 0)
+    list_tiles(ends, again, *torch.empty(2, int(ends[-1]), dtype=torch.int32, device=ends.device))
+    return counts, again
 
 
 def _sort_by_tile(

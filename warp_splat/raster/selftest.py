@@ -7,6 +7,8 @@ circle of variance v = (f s / z)^2 + BLUR, so at distance r from the principal p
 
 for the near ball 1 and the far ball 2, and the gradient of the sum over all pixels and channels with respect to the
 near ball's first scale is that of sum (c1 - b) a1 dx^2 / v1^2 (f / z1)^2 s1.
+
+Beside it, random needles: a GPU counts their tiles, then lists them, and has to find as many.
 """
 
 from __future__ import annotations
@@ -21,7 +23,9 @@ from warp_splat.config import BLUR, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.api import render
+from warp_splat.raster.bin import count_twice
 from warp_splat.raster.data import Gaussians
+from warp_splat.raster.project import project
 from warp_splat.runtime.devices import is_out_of_memory
 
 # The far ball stands first: the device has to sort. Each shows in every pixel of the four tiles.
@@ -29,6 +33,7 @@ CAMERA = Camera(24, 18, 20.0, 20.0, 12.3, 8.6, np.eye(3), np.zeros(3))
 DEPTHS, SCALES, OPACITIES = (4.0, 2.0), (1.4, 0.6), (0.8, 0.6)
 COLORS, BACKGROUND = ((0.9, 0.2, 0.4), (0.3, 0.7, 0.5)), (0.1, 0.3, 0.6)
 TOLERANCE = 1e-4  # of the image, and relative of the gradient
+NEEDLES, FIELD = 20_000, Camera(1000, 700, 600.0, 600.0, 500.3, 350.6, np.eye(3), np.zeros(3))
 
 
 def settle_device(
@@ -71,6 +76,7 @@ def check_device(device: torch.device, adjoint: str = "manual") -> None:
     exact_image, exact_gradient = answer()
     try:
         image, gradient = _compute(device, adjoint)
+        counted, listed = (counts.cpu().numpy() for counts in _count_tiles(device))
     except RuntimeError as error:
         if is_out_of_memory(error):
             what = "there is not enough memory left for the smallest image; end other programs that use it"
@@ -83,6 +89,9 @@ def check_device(device: torch.device, adjoint: str = "manual") -> None:
         found, expected, what = image[place], exact_image[place], "a pixel"
     elif not abs(gradient - exact_gradient) <= TOLERANCE * abs(exact_gradient):
         found, expected, what = gradient, exact_gradient, "a gradient"
+    elif (counted != listed).any():
+        place = np.flatnonzero(counted != listed)[0]
+        found, expected, what = listed[place], counted[place], "a number of tiles"
     else:
         return
     raise InputError(
@@ -107,6 +116,23 @@ def _compute(device: torch.device, adjoint: str) -> tuple[np.ndarray, float]:
     out = render(gaussians, CAMERA, tensor(BACKGROUND), RasterOptions(), adjoint)
     (gradient,) = torch.autograd.grad(out.image.sum(), scales)
     return out.image.detach().cpu().numpy(), gradient[1, 0].item()
+
+
+def _count_tiles(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """The tiles of needles [NEEDLES], as a GPU's lists count and as they write them."""
+    generator = torch.Generator().manual_seed(0)
+    normal = lambda *shape: torch.randn(NEEDLES, *shape, generator=generator)  # noqa: E731
+    gaussians = Gaussians(
+        means=normal(3) + torch.tensor([0.0, 0.0, 6.0]),
+        quats=normal(4),
+        scales=torch.exp(1.5 * normal(3) - 4.0),
+        opacities=torch.rand(NEEDLES, generator=generator),
+        sh_dc=torch.zeros(NEEDLES, 1, 3),
+        sh_rest=torch.zeros(NEEDLES, 0, 3),
+    )
+    options = RasterOptions()
+    splats = project(Gaussians(*(tensor.to(device) for tensor in gaussians)), FIELD, options)
+    return count_twice(splats, FIELD, options)
 
 
 def answer() -> tuple[np.ndarray, float]:

@@ -50,6 +50,18 @@ def row_from_root(sums: vec10, root: wp.vec3):
     return row_of(wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic, sums)
 
 
+@wp.func
+def clear_rest(bins: BinsView, tile: int, thread: int, steps: int, slots_out: wp.array2d[float]):
+    """Zeros for the tile's instances behind the first ``steps``, which no adjoint walks."""
+    first = bins.ranges[tile][0] + steps
+    count = bins.ranges[tile][1] - first
+    for batch in range((count + THREADS - 1) // THREADS):
+        place = batch * THREADS + thread
+        if place < count:  # not by first + place, which may be more than 32 bits hold
+            for grad in range(slots_out.shape[1]):
+                slots_out[first + place, grad] = 0.0
+
+
 @functools.cache
 def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
     """The start of every adjoint: upstream gradients by tile and thread, those that are not finite dropped."""
@@ -101,12 +113,7 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
                 adj_background_out[tile, channel] = sums[channel]
             dropped_out[tile] = bad
             steps_out[tile] = steps
-        first = bins.ranges[tile][0] + steps
-        for batch in range((bins.ranges[tile][1] - first + THREADS - 1) // THREADS):
-            k = first + batch * THREADS + thread
-            if k < bins.ranges[tile][1]:
-                for grad in range(slots_out.shape[1]):
-                    slots_out[k, grad] = 0.0
+        clear_rest(bins, tile, thread, steps, slots_out)
 
     return upstream
 

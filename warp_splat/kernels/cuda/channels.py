@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.cuda.adjoint import row_from_moments, row_from_root
+from warp_splat.kernels.cuda.adjoint import clear_rest, row_from_moments, row_from_root
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import fma
@@ -175,11 +175,6 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                     for channel in range(WIDTH):
                         if CHANNEL + channel < slots_out.shape[1]:
                             slots_out[k, CHANNEL + channel] = more[channel]
-        first = start + steps[tile]
-        for batch in range((bins.ranges[tile][1] - first + THREADS - 1) // THREADS):
-            k = first + batch * THREADS + thread
-            if k < bins.ranges[tile][1]:
-                for grad in range(slots_out.shape[1]):
-                    slots_out[k, grad] = 0.0
+        clear_rest(bins, tile, thread, steps[tile], slots_out)
 
     return adj_channels
