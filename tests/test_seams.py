@@ -175,10 +175,10 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
         main(["train", "--help"])
     assert "--gain_lr FLOAT" in capsys.readouterr().out
     begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
-    assert "--parts: expected auto, or some of random_background, exposure, pose, floaters, gain" in fails(
-        capsys, *begun, "--parts", "sky"
+    assert "--parts: expected auto, or some of random_background, exposure, pose, depth, floaters, gain" in fails(
+        capsys, *begun, "--parts", "weather"
     )
-    assert "--growth: expected one of reference, faint" in fails(capsys, *begun, "--growth", "sky")
+    assert "--growth: expected one of reference, faint" in fails(capsys, *begun, "--growth", "weather")
 
 
 def test_neither_trainer_nor_command_line_knows_one_by_name():

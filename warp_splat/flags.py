@@ -78,9 +78,6 @@ def _is_like(value: Any, default: Any) -> bool:
 
 #: Flags of the reference that this program does not have, and what to say when somebody uses one.
 FOREIGN_FLAGS = {
-    "--depths": "depth regularization is not supported",
-    "--depth_l1_weight_init": "depth regularization is not supported",
-    "--depth_l1_weight_final": "depth regularization is not supported",
     "--train_test_exp": "no exposure is learned of held-out photographs; CC_PSNR fits one for each",
     "--exposure_lr_delay_steps": "the rate of exposure falls from its start; there is no delay",
     "--exposure_lr_delay_mult": "the rate of exposure falls from its start; there is no delay",

@@ -89,7 +89,7 @@ def load_scene(
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
     require_one_kind([(view.name, view.linear) for view in train_views + test_views], source)
     tracks = partial(read_tracks, Path(source)) if takes_colmap(Path(source)) else dict
-    return Scene(train_views, test_views, points, colors, file, drawn, tracks)
+    return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source))
 
 
 def _drop_masked(views: list[View], source: str | Path, report: Callable[[str], object]) -> list[View]:

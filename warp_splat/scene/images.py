@@ -163,6 +163,23 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
     return bright if found == size else _resize(bright[..., None], *size)[..., 0]
 
 
+def read_numbers(path: Path) -> np.ndarray:
+    """The first channel of a file [H, W] float64: floats as they are, 16-bit numbers as shares of 65536.
+
+    Raises:
+        InputError: if it has neither, or is not an image that OpenImageIO reads.
+    """
+    file = _open(path)
+    kind = file.spec().format
+    if kind.basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
+        raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
+    numbers = file.read_image(0, 0, 0, 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
+    error = _text(file.geterror)
+    if numbers is None or error:
+        raise _unreadable(path, error)
+    return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
+
+
 def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     """Resample ``image`` [H, W, C] float32 at the positions ``sampling``.
 
@@ -207,7 +224,7 @@ def load_views(photos: list[Photo], resolution: int, white_background: bool, inv
         color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
         alpha = None if pixels.alpha is None else _quantized(image[..., 3])
         mask = None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8)
-        return View(photo.name, camera, color, photo.camera, alpha, mask)
+        return View(photo.name, camera, color, photo.camera, alpha, mask, photo.sampling is not None)
 
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(load, photos))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,7 @@ class View:
     original: Camera  # before the resize of `-r` (after undistortion)
     alpha: np.ndarray | None = None  # [H, W] uint8, where the photograph says it; for other backgrounds
     mask: np.ndarray | None = None  # [H, W] uint8, 1 where the photograph counts; None: everywhere
+    undistorted: bool = False  # from the file, which a lens with distortion took
 
     @property
     def linear(self) -> bool:
@@ -70,6 +72,7 @@ class Scene:
     start: SplatFile | None = None  # Gaussians to start from instead; the points are their centers
     random_points: bool = False  # drawn, since there were none
     find_tracks: Callable[[], dict[str, Sightings]] = dict  # by the names of views
+    source: Path | None = None  # its folder
 
     @cached_property
     def tracks(self) -> dict[str, Sightings]:

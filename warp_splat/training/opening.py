@@ -130,7 +130,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene
 
 def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: bool) -> None:
     """Write what this training was given: options, cameras, points."""
-    others = {"depths": "", "train_test_exp": False, "linear_light": scene.linear}
+    others = {"train_test_exp": False, "linear_light": scene.linear}
     model_folder.write_cfg_args(folder, {**config.flat(), **others})
     write_config(folder, config)
     model_folder.write_cameras(folder, scene.test, scene.train)

@@ -53,11 +53,26 @@ class PoseOptions:
     pose_intrinsics: str = learning("", "what of the lens --parts pose refines, too", choices=("", "focal", "all"))
 
 
+@dataclass(frozen=True)
+class DepthOptions:
+    """Depths that are known."""
+
+    depths: str = learning("", "folder in the scene with maps of inverse depth, .png or .exr: asks for depth", "-d")
+    depth_l1_weight_init: float = learning(1.0, "weight of known depths in the loss at the start")
+    depth_l1_weight_final: float = learning(0.01, "weight of known depths at the end")
+
+    @property
+    def depth(self) -> bool:
+        """Whether a flag asks for the part."""
+        return bool(self.depths)
+
+
 #: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
     "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
     "exposure": Entry(ExposureOptions, "warp_splat.training.parts.exposure.Exposure"),
     "pose": Entry(PoseOptions, "warp_splat.training.parts.pose.Pose"),
+    "depth": Entry(DepthOptions, "warp_splat.training.parts.depth.Depth"),
     "floaters": Entry(FloatersOptions, "warp_splat.training.parts.floaters.Floaters"),
 }
 

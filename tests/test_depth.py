@@ -1,0 +1,202 @@
+"""Known depths: the term against float64, maps in the reference's layout, the verdict, what is refused."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from test_checkpoints import begin, steps
+from test_train import SCENE, fails
+
+from warp_splat.errors import InputError
+from warp_splat.scene.depth_maps import PARAMETERS, read_inverse_depths
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import choose
+from warp_splat.training.seams import Step
+
+DEPTH = {"parts": "depth", "depth_l1_weight_init": 0.5}
+
+
+def write_map(path, numbers):
+    """uint16 as PNG, float32 as EXR."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    spec = oiio.ImageSpec(
+        numbers.shape[1], numbers.shape[0], 1, {"f": "float"}.get(numbers.dtype.kind, str(numbers.dtype))
+    )
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.ascontiguousarray(numbers[..., None]))
+    assert output.close()
+
+
+@pytest.fixture(scope="module")
+def made(scene, tmp_path_factory):
+    """Maps of a scene: of the size at which it is loaded, but for the first, of the file's."""
+    folder = tmp_path_factory.mktemp("maps")
+    fits, random = {}, np.random.default_rng(0)
+    for index, view in enumerate(scene.train):
+        size = (248, 264) if index == 0 else view.image.shape[:2]
+        write_map(folder / "depths" / view.name, random.integers(0, 2**16, size, dtype=np.uint16))
+        fits[view.name[:-4]] = {"scale": 20.0 if index == 2 else 1.5 + 0.01 * index, "offset": -0.25}
+    (folder / PARAMETERS).parent.mkdir(parents=True)
+    (folder / PARAMETERS).write_text(json.dumps(fits))
+    return scene, folder
+
+
+@pytest.fixture
+def mapped(made, tmp_path):
+    """The scene, as if it lay in a folder of its own, and that folder."""
+    scene, folder = made
+    return replace(scene, source=shutil.copytree(folder, tmp_path / "scene")), tmp_path / "scene"
+
+
+def test_the_term_is_the_mean_of_what_each_point_says(scene, tmp_path):
+    """And so is its gradient, written out in float64; of points in one pixel, the nearer one counts."""
+    trainer, _ = begin(scene, tmp_path, **DEPTH)
+    view, part = scene.train[3], trainer.parts[0]
+    out = trainer.look(view.camera, depth=True)
+    out.depth = out.depth.clone().requires_grad_()
+    out.alpha[::2] = 0.4  # of rows that show too little
+    loss = part.loss(torch.zeros(()), out, Step(25, view))
+    loss.backward()
+    known, (height, width) = {}, out.alpha.shape
+    for point in scene.tracks[view.name].points:
+        x, y, z = view.camera.rotation @ point + view.camera.translation
+        u, v = view.camera.fx * x / z + view.camera.cx, view.camera.fy * y / z + view.camera.cy
+        if 0 <= u < width and 0 <= v < height:
+            place = int(v), int(u)
+            known[place] = min(known.get(place, z), z)
+    weight, extent = 0.5 * (0.01 / 0.5) ** (25 / 50), scene.extent
+    total, gradient = 0.0, np.zeros((height, width))
+    for (row, column), z in known.items():
+        depth = out.depth[row, column].item()
+        if out.alpha[row, column] > 0.5:
+            error = abs(extent / depth - extent / z)
+            total += 0.1 * error / (error + 0.1)
+            slope = -np.sign(extent / depth - extent / z) * extent / depth**2
+            gradient[row, column] = weight / len(known) * slope * 0.01 / (error + 0.1) ** 2
+    assert len(known) > 100 and loss.item() == pytest.approx(weight * total / len(known), rel=1e-5)
+    assert np.abs(out.depth.grad.numpy() - gradient).max() < 1e-5 * np.abs(gradient).max()
+
+
+def test_geometry_learns_from_it(scene, tmp_path):
+    """Alone, without photographs, expected depths come closer to those of the points."""
+    trainer, run = begin(scene, tmp_path, **DEPTH, densify_from_iter=99)
+    part, view = trainer.parts[0], scene.train[5]
+
+    def measure():
+        out = trainer.look(view.camera, depth=True)
+        return part._error(out, part._points_at(view, *out.alpha.shape)).item()
+
+    before = measure()
+    weigh = part.loss
+    part.loss = lambda loss, out, step: weigh(0.0 * loss, out, step)  # the photograph's does not count
+    steps(trainer, run, 40)
+    assert measure() < 0.7 * before
+
+
+def test_maps_are_read_as_the_reference_writes_them(mapped):
+    scene, folder = mapped
+    maps = read_inverse_depths(scene, "depths")
+    assert scene.train[2] not in maps and len(maps) == len(scene.train) - 1  # far from the median scale
+    for index, step in ((0, 8), (7, 1)):
+        view = scene.train[index]
+        raw = np.asarray(oiio.ImageBuf(str(folder / "depths" / view.name)).get_pixels(oiio.UINT16))[..., 0]
+        expected = raw[step // 2 :: step, step // 2 :: step] / 65536 * (1.5 + 0.01 * index) - 0.25
+        assert maps[view].shape == view.image.shape[:2]
+        assert np.allclose(maps[view], np.where(expected < 0, -1, expected), atol=1e-6)
+
+
+def test_exr_needs_no_parameters_and_masks_count(mapped):
+    scene, folder = mapped
+    scene = replace(scene, train=scene.train[:2])
+    numbers = np.linspace(0, 2, 31 * 33, dtype=np.float32).reshape(31, 33)
+    numbers[2] = np.nan
+    for view in scene.train:
+        write_map((folder / "exr" / view.name).with_suffix(".exr"), numbers)
+    (folder / PARAMETERS).unlink()
+    mask = np.ones((31, 33), np.uint8)
+    mask[5] = 0
+    masked = replace(scene, train=[replace(view, mask=mask) for view in scene.train])
+    for given, unknown in ((scene, [2]), (masked, [2, 5])):
+        expected = numbers.copy()
+        expected[unknown] = -1
+        assert np.array_equal(read_inverse_depths(given, str(folder / "exr"))[given.train[1]], expected)
+
+
+def test_maps_are_compared_like_points(mapped, tmp_path):
+    scene, _ = mapped
+    trainer, _ = begin(scene, tmp_path, depths="depths")
+    view, part = scene.train[7], trainer.parts[0]
+    out = trainer.look(view.camera, depth=True)
+    target = part._map_at(view, *out.alpha.shape)
+    numbers, depth = (np.float64(a) for a in (part.maps[view], out.depth))
+    error = np.abs(scene.extent / np.where(depth > 0, depth, 1) - scene.extent * numbers)
+    counts = (out.alpha.numpy() > 0.5) & (numbers >= 0)
+    expected = np.where(counts, 0.1 * error / (error + 0.1), 0).mean()
+    assert float(part._error(out, target)) == pytest.approx(expected, rel=1e-5)
+    small = part._map_at(view, 31, 11).nearness.view(31, 11)
+    assert np.allclose(small, np.float32(scene.extent) * part.maps[view][:, 1::3])
+
+
+def test_verdict(scene):
+    assert "depth" not in choose(TrainConfig(parts="auto"), scene)[0]
+    used, told = choose(TrainConfig(parts="auto"), replace(scene, train=scene.train[::8]))
+    assert "depth" in used and any("half of its points lie in 6 photographs or fewer" in line for line in told)
+    without = replace(scene, train=scene.train[::8], find_tracks=dict)
+    assert "depth" not in choose(TrainConfig(parts="auto"), without)[0]
+
+
+def spoil(folder, name):
+    if name == "a missing map":
+        (folder / "depths" / "view_009.png").unlink()
+    elif name == "another size":
+        write_map(folder / "depths" / "view_009.png", np.zeros((100, 264), np.uint16))
+    elif name == "eight bits":
+        write_map(folder / "depths" / "view_009.png", np.zeros((248, 264), np.uint8))
+    elif name == "no parameters":
+        (folder / PARAMETERS).unlink()
+    else:
+        fits = json.loads((folder / PARAMETERS).read_text())
+        fits.pop("view_009") if name == "none for one" else fits.update(view_009={"scale": None, "offset": 0})
+        (folder / PARAMETERS).write_text(json.dumps(fits))
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("a missing map", "view_009.png: expected a map of inverse depth for view_009.png, found none; add it."),
+        (
+            "another size",
+            "expected a map of 264 x 248 pixels as its photograph has, or scaled by one factor, got 264 x 100",
+        ),
+        ("eight bits", "view_009.png: expected numbers of 16 bits or floats, found uint8"),
+        (
+            "no parameters",
+            "depth_params.json: expected scale and offset of each map of inverse depth, found no such file",
+        ),
+        ("none for one", "depth_params.json: expected JSON of the kind"),
+        ("no number", "found {'scale': None, 'offset': 0} for view_009"),
+    ],
+)
+def test_what_does_not_fit_is_one_sentence(name, sentence, mapped):
+    scene, folder = mapped
+    spoil(folder, name)
+    with pytest.raises(InputError) as refused:
+        read_inverse_depths(scene, "depths")
+    assert sentence in str(refused.value)
+
+
+def test_photographs_that_were_undistorted_have_no_maps(mapped):
+    scene, _ = mapped
+    with pytest.raises(InputError, match="which is undistorted as it is read"):
+        read_inverse_depths(replace(scene, train=[replace(scene.train[0], undistorted=True)]), "depths")
+
+
+def test_a_scene_without_depths_is_refused(scene, tmp_path, capsys):
+    command = ["train", "-s", str(SCENE), "-m", str(tmp_path / "m"), "--parts", "depth", "--depth_l1_weight_final=0"]
+    assert "--depth_l1_weight_final: expected a positive number" in fails(capsys, *command)
+    with pytest.raises(InputError, match="--parts depth: expected a scene that says which points"):
+        begin(replace(scene, find_tracks=dict), tmp_path, **DEPTH)

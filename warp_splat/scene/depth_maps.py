@@ -1,0 +1,107 @@
+"""Maps of inverse depth in the reference's layout (Kerbl et al. 2024): a folder of files, and how to scale them.
+
+A monocular network knows inverse depth up to a factor and an offset, which were fitted to the points of the scene.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from warp_splat.errors import InputError
+from warp_splat.formats.reading import Unexpected, json_object, reading
+from warp_splat.scene.images import read_numbers, same_shape
+from warp_splat.scene.types import Scene, View
+
+ENDINGS = (".png", ".exr")
+PARAMETERS = "sparse/0/depth_params.json"
+NEAR_MEDIAN = 0.2, 5.0  # times the median scale: a map outside did not fit its points
+
+
+class Fit(NamedTuple):
+    """What makes 1 / depth [1 / world units] of a map."""
+
+    scale: float
+    offset: float
+
+
+def read_inverse_depths(scene: Scene, folder: str) -> dict[View, np.ndarray]:
+    """1 / depth of the training views, each [H, W] float32 as its photograph, negative where it is not known.
+
+    Of PNG, a number counts 1 / 65536; both kinds are taken times ``scale`` plus ``offset`` of PARAMETERS, which EXR can
+    do without. Maps whose scale lies far from the median are left out.
+
+    Args:
+        scene: as it was loaded.
+        folder: in the scene's, or anywhere.
+
+    Raises:
+        InputError: if a map or its parameters are missing, not readable, or do not fit the photograph.
+    """
+    source = scene.source or Path()
+    paths = {view: _find(source / folder, view) for view in scene.train}
+    fits = _read_fits(source / PARAMETERS, [Path(v.name).with_suffix("").as_posix() for v in scene.train], paths)
+    median = float(np.median([fit.scale for fit in fits if fit.scale > 0] or [1.0]))
+    low, high = (share * median for share in NEAR_MEDIAN)
+    return {
+        view: _read(path, view, fit)
+        for (view, path), fit in zip(paths.items(), fits, strict=True)
+        if low <= fit.scale <= high
+    }
+
+
+def _find(folder: Path, view: View) -> Path:
+    """The map of a photograph."""
+    if view.undistorted:
+        raise InputError(
+            f"--depths {folder}: expected photographs as the files have them, found {view.name}, which is undistorted "
+            "as it is read; use --lens native, or undistort photographs and maps first."
+        )
+    paths = [folder / Path(view.name).with_suffix(ending) for ending in ENDINGS]
+    found = [path for path in paths if path.is_file()]
+    if not found:
+        raise InputError(f"{paths[0]}: expected a map of inverse depth for {view.name}, found none; add it.")
+    return found[0]
+
+
+def _read_fits(path: Path, names: list[str], maps: dict[View, Path]) -> list[Fit]:
+    """Of each name; those of EXR are optional."""
+    if not path.is_file() and all(map.suffix == ".exr" for map in maps.values()):
+        return [Fit(1.0, 0.0)] * len(names)
+    if not path.is_file():
+        raise InputError(
+            f"{path}: expected scale and offset of each map of inverse depth, found no such file; write it, by fitting "
+            "the maps to the points, or use EXR files of 1 / depth."
+        )
+    with reading(path, 'JSON of the kind {"NAME": {"scale": NUMBER, "offset": NUMBER}}'):
+        entries = json_object(path.read_bytes())
+        return [_fit(entries, name) for name in names]
+
+
+def _fit(entries: dict, name: str) -> Fit:
+    entry = entries.get(name)
+    if not isinstance(entry, dict):
+        raise Unexpected(f"none for {name}")
+    values = [entry.get(key) for key in Fit._fields]
+    if not all(isinstance(value, int | float) and np.isfinite(value) for value in values):
+        raise Unexpected(f"{entry!s:.80} for {name}")
+    return Fit(*map(float, values))
+
+
+def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
+    """The numbers nearest to each pixel, which no filter mixes over edges."""
+    numbers, (height, width) = read_numbers(path), view.image.shape[:2]
+    file = view.original.width, view.original.height
+    if not same_shape(numbers.shape[::-1], file):
+        raise InputError(
+            f"{path}: expected a map of {file[0]} x {file[1]} pixels as its photograph has, or scaled by one factor, "
+            f"got {numbers.shape[1]} x {numbers.shape[0]}; make it from the photograph."
+        )
+    rows, columns = (
+        (np.arange(n) * 2 + 1) * size // (2 * n) for n, size in zip((height, width), numbers.shape, strict=True)
+    )
+    found = np.maximum(numbers[rows[:, None], columns], 0.0) * fit.scale + fit.offset
+    known = np.isfinite(found) & (found >= 0.0) & (True if view.mask is None else view.mask > 0)
+    return np.where(known, found, -1.0).astype(np.float32)
