@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from scene_files import write_floats, write_image
 from test_checkpoints import begin, steps
 from test_train import SCENE, fails
 
@@ -20,17 +21,6 @@ from warp_splat.training.seams import Step
 DEPTH = {"parts": "depth", "depth_l1_weight_init": 0.5}
 
 
-def write_map(path, numbers):
-    """uint16 as PNG, float32 as EXR."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    spec = oiio.ImageSpec(
-        numbers.shape[1], numbers.shape[0], 1, {"f": "float"}.get(numbers.dtype.kind, str(numbers.dtype))
-    )
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(np.ascontiguousarray(numbers[..., None]))
-    assert output.close()
-
-
 @pytest.fixture(scope="module")
 def made(scene, tmp_path_factory):
     """Maps of a scene: of the size at which it is loaded, but for the first, of the file's."""
@@ -38,7 +28,7 @@ def made(scene, tmp_path_factory):
     fits, random = {}, np.random.default_rng(0)
     for index, view in enumerate(scene.train):
         size = (248, 264) if index == 0 else view.image.shape[:2]
-        write_map(folder / "depths" / view.name, random.integers(0, 2**16, size, dtype=np.uint16))
+        write_image(folder / "depths" / view.name, random.integers(0, 2**16, (*size, 1), dtype=np.uint16))
         fits[view.name[:-4]] = {"scale": 20.0 if index == 2 else 1.5 + 0.01 * index, "offset": -0.25}
     (folder / PARAMETERS).parent.mkdir(parents=True)
     (folder / PARAMETERS).write_text(json.dumps(fits))
@@ -115,7 +105,7 @@ def test_exr_needs_no_parameters_and_masks_count(mapped):
     numbers = np.linspace(0, 2, 31 * 33, dtype=np.float32).reshape(31, 33)
     numbers[2] = np.nan
     for view in scene.train:
-        write_map((folder / "exr" / view.name).with_suffix(".exr"), numbers)
+        write_floats((folder / "exr" / view.name).with_suffix(".exr"), numbers[..., None], "float")
     (folder / PARAMETERS).unlink()
     mask = np.ones((31, 33), np.uint8)
     mask[5] = 0
@@ -153,9 +143,9 @@ def spoil(folder, name):
     if name == "a missing map":
         (folder / "depths" / "view_009.png").unlink()
     elif name == "another size":
-        write_map(folder / "depths" / "view_009.png", np.zeros((100, 264), np.uint16))
+        write_image(folder / "depths" / "view_009.png", np.zeros((100, 264, 1), np.uint16))
     elif name == "eight bits":
-        write_map(folder / "depths" / "view_009.png", np.zeros((248, 264), np.uint8))
+        write_image(folder / "depths" / "view_009.png", np.zeros((248, 264, 1), np.uint8))
     elif name == "no parameters":
         (folder / PARAMETERS).unlink()
     else:

@@ -1,6 +1,7 @@
 """The documentation holds: its links, flags and tables, and every command and piece of code in it."""
 
 import functools
+import json
 import re
 import shlex
 import shutil
@@ -9,12 +10,16 @@ import textwrap
 from contextlib import redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
 import room
+from scene_files import write_image
 from serving import CtrlC
 
 from warp_splat.cli import COMMANDS, main, parse
 from warp_splat.flags import flags_of
+from warp_splat.scene.depth_maps import PARAMETERS
+from warp_splat.scene.images import read_size
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -184,6 +189,8 @@ def run(line, folder):
     if arguments[0] == "sfm":
         room.write_photos(folder / "path/to/photos", PHOTOGRAPHS)
         shutil.rmtree(folder / "path/to/scene")
+    if "--depths" in arguments:
+        write_depths(folder / "path/to/scene")
     if arguments[0] == "train":
         if "-m" in arguments:  # another page may have trained there
             shutil.rmtree(folder / arguments[arguments.index("-m") + 1], ignore_errors=True)
@@ -196,6 +203,15 @@ def run(line, folder):
     watched = arguments[0] == "view" or "--viewer" in arguments
     with redirect_stdout(CtrlC("Viewer at") if watched else sys.stdout):
         assert main(arguments) == (130 if watched and arguments[0] == "train" else 0), line
+
+
+def write_depths(scene):
+    """A map of inverse depth for each photograph, in the reference's layout."""
+    for path in (scene / "images").iterdir():
+        width, height = read_size(path)
+        write_image(scene / "depths" / f"{path.stem}.png", np.full((height, width, 1), 2**15, np.uint16))
+    fits = {path.stem: {"scale": 1.0, "offset": 0.0} for path in (scene / "images").iterdir()}
+    (scene / PARAMETERS).write_text(json.dumps(fits))
 
 
 def example():

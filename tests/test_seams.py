@@ -187,7 +187,7 @@ def test_neither_trainer_nor_command_line_knows_one_by_name():
     words = set(re.findall(r"\w+", re.sub(r'""".*?"""|#[^\n]*', "", "\n".join(texts), flags=re.DOTALL)))
     for entry in (*PARTS.values(), *GROWTHS.values()):
         found = words & {*entry.place.split(".")[-2:], *(item.name for item in fields(entry.options))}
-        assert found <= {"background"}  # that is a color, too
+        assert found <= {"background", "depth"}  # a color and a plane, too
 
 
 def test_options_of_one_name_are_refused(monkeypatch, capsys):
