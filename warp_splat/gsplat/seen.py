@@ -30,13 +30,13 @@ class Seen(NamedTuple):
 def see(request: Request) -> Seen:
     """Project (Zwicker et al. 2001): linearized at the mean, W' = J V R S, covariance W' W''."""
     turn, shift = request.viewmats[..., :3, :3], request.viewmats[..., :3, 3]
-    points = torch.einsum("scij,snj->scni", turn, request.means) + shift[:, :, None]
+    points = _product(request.means[:, None], turn.mT[:, :, None]) + shift[:, :, None]
     z = points[..., 2]
     ahead = (z > request.near_plane) & (z < request.far_plane) & (request.quats != 0).any(-1)[:, None]
     points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
     places, to_x, to_y = _LENSES[request.camera_model](request, points)
     axes = _rotations(request.quats) * request.scales[:, :, None]
-    a, b = (torch.einsum("scni,scij,snjk->scnk", row, turn, axes) for row in (to_x, to_y))
+    a, b = (_product(_product(row, turn[:, :, None]), axes[:, None]) for row in (to_x, to_y))
     xx, xy, yy = (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1)
     sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
     wide = sharp + request.eps2d * (xx + yy) + request.eps2d**2
@@ -66,6 +66,12 @@ def see(request: Request) -> Seen:
         radii,
         drawn,
     )
+
+
+def _product(rows: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
+    """Rows [..., 3] times matrices [..., 3, 3]. In torch's own product bits depend on how many there are."""
+    first, second, third = (rows[..., axis, None] * matrices[..., axis, :] for axis in range(3))
+    return first + second + third
 
 
 def _rotations(quats: torch.Tensor) -> torch.Tensor:
