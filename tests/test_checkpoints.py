@@ -78,6 +78,7 @@ def state_of(trainer, run):
         {"optimizer_type": "sparse_adam", "random_background": True, "coarse": 4, "coarse_until_iter": 40},
         {"white_background": True, "prune_screen_size": 20, "antialiasing": True, "sh_degree": 1},
         {"max_gaussians": 5000, "sh_degree": 0, "seed": 7, "half_moments": True},
+        {"growth": "budget", "max_gaussians": 7000},
     ],
     ids=str,
 )

@@ -103,7 +103,7 @@ class GaussianModel:
         offsets = points[nearest].astype(np.float64) - points[:, None]
         # fewer than four points: no or few neighbors; one unit then
         squared = np.mean((offsets * offsets).sum(2), axis=1) if neighbors > 1 else np.ones(count)
-        scales = 0.5 * _log(np.maximum(squared, SMALLEST_DISTANCE2))
+        scales = 0.5 * logarithm(np.maximum(squared, SMALLEST_DISTANCE2))
         tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
         return cls(
             {
@@ -166,7 +166,7 @@ class GaussianModel:
         return cls({**parameters, "opacities": opacities, "scales": scales, "quats": quats})
 
 
-def _log(x: np.ndarray) -> np.ndarray:
+def logarithm(x: np.ndarray) -> np.ndarray:
     """The natural logarithm to 1e-9; NumPy's differs by processor. As 2 artanh((m - 1) / (m + 1)) of a mantissa m."""
     m, exponent = np.frexp(x)
     s = (m - 1.0) / (m + 1.0)

@@ -10,6 +10,8 @@ A growth is made of (options, setting, optimizer); the optimizer's ``replace`` a
     observe(out, step)                      look at what was rendered; ``out.means2d.grad`` [N, 2] is there
     update(iteration) -> Change | None      change the set if it is time; None: nothing changed
     grows(iterations) -> bool               whether a training of this length gains Gaussians
+    compare(image, target, mask, out, step) look at what is compared, as the loss does, before it is differentiated (not
+                                            of every growth)
 
 A part is made of (options, setting). It has any of these methods; ``tests/test_seams.py`` has an example. In each step
 they run in this order:

@@ -128,6 +128,8 @@ class Trainer:
             image, target = (LOSS_CURVES[self.config.data.loss_space](picture) for picture in (image, target))
         # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
         loss = image_loss(image, target, learn.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
+        for compare in having([self.growth], "compare"):
+            compare(image, target, photograph.mask, out, step)
         loss = self._through("loss", loss, out, step)
         loss.backward()
         with stage("densify"):

@@ -10,7 +10,7 @@ from warp_splat.training.seams import Entry
 
 @dataclass(frozen=True)
 class ReferenceOptions:
-    """Densification of the reference (Kerbl et al. 2023), with its names and defaults."""
+    """Densification of the reference (Kerbl et al. 2023), with its names and defaults; others take its schedule."""
 
     densify_from_iter: int = growing(500, "first step of densification", least=-1)
     densify_until_iter: int = growing(15_000, "last step of densification", least=-1)
@@ -23,4 +23,5 @@ class ReferenceOptions:
 
 GROWTHS: dict[str, Entry] = {
     "reference": Entry(ReferenceOptions, "warp_splat.training.growth.reference.Reference"),
+    "budget": Entry(ReferenceOptions, "warp_splat.training.growth.budget.Budget"),
 }

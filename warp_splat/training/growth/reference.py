@@ -45,6 +45,10 @@ class Reference:
         self.views = new(len(self.model))  # in which the Gaussian was drawn
         self.radius = new(len(self.model), dtype=torch.int32)  # px, largest in any view
 
+    def statistics(self) -> dict[str, torch.Tensor]:
+        """What was observed since the last change, by name [N]."""
+        return {"gradient": self.gradient, "views": self.views, "radius": self.radius}
+
     def observe(self, out: RenderOutput, step: Step) -> None:
         """Take in the gradient of one view's 2D means."""
         grad, (height, width) = out.means2d.grad, out.image.shape[:2]
@@ -84,23 +88,19 @@ class Reference:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Statistics since the last densification, [R, N] with a row for each process, and the random state."""
-        statistics = {"gradient": self.gradient, "views": self.views, "radius": self.radius}
-        found = {f"statistics.{name}": self.processes.gather(rows) for name, rows in statistics.items()}
+        found = {f"statistics.{name}": self.processes.gather(rows) for name, rows in self.statistics().items()}
         return {**found, "random.densification": self.random.get_state()}
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Take what :meth:`state` gave from a checkpoint, for the present set; of any number of processes."""
-        rank, count = self.processes.rank, len(self.model)
-
-        def statistic(name: str, dtype: type) -> torch.Tensor:
-            rows = torch.from_numpy(checkpoint.array(f"statistics.{name}", (-1, count), dtype))
+        self.clear()
+        for name, own in self.statistics().items():
+            dtype = np.int32 if name == "radius" else np.float32
+            rows = torch.from_numpy(checkpoint.array(f"statistics.{name}", (-1, len(self.model)), dtype))
             if len(rows) != self.processes.count:  # the first takes all
                 rows = rows.amax(0, keepdim=True) if name == "radius" else rows.sum(0, keepdim=True)
                 rows = torch.nn.functional.pad(rows, (0, 0, 0, self.processes.count - 1))
-            return rows[rank].to(self.model.device, copy=True)
-
-        self.gradient, self.views = statistic("gradient", np.float32), statistic("views", np.float32)
-        self.radius = statistic("radius", np.int32)
+            own.copy_(rows[self.processes.rank])
         self.random.set_state(torch.from_numpy(checkpoint.generator("random.densification")))
 
     def _densify(self, prune_large: bool) -> Change:

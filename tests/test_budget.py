@@ -1,0 +1,178 @@
+"""Growth to a budget: exact numbers, what a split leaves as it was, and the error that a Gaussian carries."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scenes import SCENES
+from scipy.spatial.transform import Rotation
+from test_checkpoints import SCHEDULE
+from test_distributed import Pretended
+from test_train import SCENE, fails
+
+from warp_splat.compare.oracle import exact_render
+from warp_splat.config import RasterOptions
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
+from warp_splat.runtime.distributed import ALONE
+from warp_splat.training.growth.budget import EVERY, Budget, halves
+from warp_splat.training.growth.reference import Reference
+from warp_splat.training.optimizer import Optimizer
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.seams import Setting, Step
+from warp_splat.training.trainer import Trainer
+
+POINTS = 4500  # of the scene
+
+
+def count_steps(scene, budget, **options):
+    """A training of 50 steps, and the Gaussians after each."""
+    config = TrainConfig(**{**SCHEDULE, "growth": "budget", "max_gaussians": budget, **options})
+    trainer, found = Trainer(scene, config), []
+    for iteration in range(1, 51):
+        if iteration > 1:
+            trainer.update(iteration - 1)
+        trainer.differentiate(iteration)
+        found.append(len(trainer.model))
+    return trainer, found
+
+
+@pytest.mark.parametrize(("budget", "until"), [(POINTS, 45), (5017, 45), (12_000, 45), (9001, 10**6)])
+def test_it_ends_with_exactly_as_many_as_asked_for(budget, until, scene):
+    _, found = count_steps(scene, budget, densify_until_iter=until, opacity_lr=0.3)  # some fade away meanwhile
+    assert found[-1] == budget and found == sorted(found) and found[19] == POINTS
+    due = [round(POINTS + (budget - POINTS) * (step / (min(until, 50) - 10)) ** 0.5) for step in (10, 20)]
+    assert [found[20], found[30]] == due
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (
+            "",
+            "--max_gaussians 0: expected the number of Gaussians that --growth budget ends with, at least the 4500 of",
+        ),
+        ("--max_gaussians 4499", "at least the 4500 of the start; raise it, or take --growth reference."),
+        ("--max_gaussians 9001 --densify_until_iter 601", "at most 9000, since 1 densifications double 4500"),
+        ("--max_gaussians 4501 --densify_until_iter 600", "at most 4500, since 0 densifications double 4500"),
+    ],
+)
+def test_a_budget_that_cannot_be(flags, sentence, capsys, tmp_path):
+    command = ["train", "-s", str(SCENE), "-r", "8", "-m", str(tmp_path / "a"), "--growth", "budget", *flags.split()]
+    assert sentence in fails(capsys, *command)
+
+
+def test_a_set_that_stays_changes_nothing(scene):
+    """A budget of the start with nothing to prune: the same bytes as without growth."""
+    trainer, _ = count_steps(scene, POINTS)
+    other, _ = count_steps(scene, 0, growth="reference", densify_from_iter=100, opacity_reset_interval=100)
+    for name, tensor in trainer.model.parameters.items():
+        assert torch.equal(tensor, other.model.parameters[name])
+
+
+def growth_on(model, budget=None, processes=ALONE):
+    """A growth of a model."""
+    config, scene = TrainConfig(growth="budget"), SimpleNamespace(extent=1.0)
+    setting = Setting(scene, model, torch.zeros(3), processes, 0, budget or len(model), 2000)
+    return Budget(config.plugins["budget"], setting, Optimizer(model, config.learn, 1.0))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_error_that_each_carries_is_that_of_its_weights(masked):
+    """Against the weights of the float64 oracle; the loss is differentiated afterwards as if nobody had looked."""
+    scene = SCENES["degree1"]()
+    camera, names = scene.camera, ("means", "quats", "scales", "opacities")
+    growth = growth_on(GaussianModel.from_points(scene.means.numpy(), np.zeros((len(scene.means), 3), np.uint8), 0))
+    rng = np.random.default_rng(0)
+    photograph = torch.from_numpy(rng.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8))
+    mask = torch.from_numpy(rng.integers(0, 2, (camera.height, camera.width, 1), dtype=np.uint8)) if masked else None
+    gradients = []
+    for looks in (False, True):
+        leaves = [getattr(scene, name).clone().requires_grad_() for name in names]
+        gaussians = Gaussians(*leaves, scene.sh[:, :1], scene.sh[:, 1:])
+        out = render(gaussians, camera, scene.background, RasterOptions())
+        for iteration in (EVERY, EVERY + 1) if looks else ():
+            growth.compare(out.image, photograph, mask, out, Step(iteration, None))
+        (out.image * photograph).sum().backward()
+        gradients.append([leaf.grad for leaf in leaves])
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+    exact = exact_render(*(tensor.double() for tensor in scene.parameters()), camera, scene.background.double())
+    error = (exact.image - photograph.double() / 255).abs().sum(2) * (1 if mask is None else mask[..., 0].double())
+    expected = torch.zeros(len(scene.means), dtype=torch.float64)
+    expected[exact.order] = (exact.weights * error[..., None]).sum((0, 1)) / (camera.height * camera.width)
+    assert not exact.fragile.any()
+    assert torch.allclose(growth.error.double(), expected, rtol=1e-4, atol=1e-7)
+    assert torch.equal(growth.looks, (out.radii > 0).float()) and float(growth.error.max()) > 0
+
+
+def some_splits():
+    """Parameters before activation, of Gaussians in the view of a camera."""
+    scene = SCENES["degree1"]()
+    opacities = scene.opacities
+    raw = {
+        "means": scene.means,
+        "sh_dc": scene.sh[:, :1],
+        "sh_rest": scene.sh[:, 1:],
+        "opacities": torch.log(opacities / (1 - opacities)),
+        "scales": torch.log(scene.scales),
+        "quats": scene.quats,
+    }
+    return scene, raw
+
+
+def test_halves_have_the_moments_of_the_whole():
+    _, raw = some_splits()
+    raw["opacities"][:3] = torch.tensor([30.0, -30.0, 0.0])  # opaque, clear
+    count, both = len(raw["means"]), halves(raw, torch.arange(len(raw["means"])))
+
+    def covariances(rows):
+        turned = Rotation.from_quat(rows["quats"].double().numpy(), scalar_first=True).as_matrix()
+        return np.einsum("nij,nj,nkj->nik", turned, np.exp(2 * rows["scales"].double().numpy()), turned)
+
+    means, middle = both["means"].double().numpy().reshape(2, count, 3), raw["means"].double().numpy()
+    inner = covariances(both).reshape(2, count, 3, 3)
+    spread = np.einsum("hni,hnj->nij", means - middle, means - middle) / 2
+    whole = covariances(raw)
+    assert np.allclose(means.mean(0), middle, atol=1e-6)
+    assert np.allclose(inner.mean(0) + spread, whole, atol=1e-3 * np.abs(whole).max((1, 2)).max())
+    a, b = (torch.sigmoid(rows["opacities"].double()).numpy() for rows in (raw, both))
+    assert np.allclose((1 - b[:count]) * (1 - b[count:]), 1 - a, atol=2e-6)
+    assert all(torch.isfinite(rows).all() for rows in both.values())
+
+
+def test_a_split_leaves_the_picture_about_as_it_was():
+    """All Gaussians at once, against the two samples of each that the reference takes."""
+    scene, raw = some_splits()
+    everything = torch.arange(len(raw["means"]))
+
+    def picture(rows):
+        with torch.no_grad():
+            return render(GaussianModel(rows).activated(), scene.camera, scene.background, RasterOptions()).image
+
+    samples = SimpleNamespace(random=torch.Generator().manual_seed(0))
+    changes = [
+        float((picture(rows) - picture(raw)).abs().mean())
+        for rows in (halves(raw, everything), Reference._children(samples, raw, everything))
+    ]
+    assert changes[0] < 0.5 * changes[1] and changes[0] < 0.03
+
+
+def test_processes_add_what_they_saw(scene, monkeypatch):
+    """Two that saw half each split the same ones as one that saw all."""
+    model = GaussianModel.from_points(np.random.default_rng(0).normal(size=(50, 3)), np.zeros((50, 3), np.uint8), 0)
+    alone, first = (growth_on(GaussianModel(model.parameters), 70) for _ in range(2))
+    first.processes = first.setting.processes
+    values = {name: torch.rand(2, 50, generator=torch.Generator().manual_seed(1)) for name in alone.statistics()}
+    for name, rows in alone.statistics().items():
+        rows.copy_(values[name].sum(0).to(rows.dtype))
+    for name, rows in first.statistics().items():
+        rows.copy_(values[name][0].to(rows.dtype))
+    shared = Pretended(0, 1)
+    other = {rows.data_ptr(): values[name][1] for name, rows in first.statistics().items()}
+    monkeypatch.setattr(shared, "sum", lambda rows: rows.add_(other[rows.data_ptr()]))
+    first.processes = shared
+    assert alone._grow(70) == first._grow(70)
+    for name, tensor in alone.model.parameters.items():
+        assert torch.equal(tensor, first.model.parameters[name])
