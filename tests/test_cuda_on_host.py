@@ -1,0 +1,113 @@
+"""The kernels' code for a GPU, on the host: no races, no access outside of arrays, one result in any order of threads.
+
+Beside the fibers, which share the kernels' text and nothing of what it becomes for a GPU.
+"""
+
+from dataclasses import replace
+
+import cuda_on_host
+import numpy as np
+import pytest
+import torch
+from cuda_on_host import build, recorded, run
+from scenes import PARAMETERS, cloud, dense_tile, make_camera
+
+from warp_splat import RasterOptions, rasterize
+from warp_splat.config import ADJOINTS
+from warp_splat.raster.drivers import CUDA, using
+
+pytestmark = [
+    pytest.mark.skipif(cuda_on_host.COMPILER is None, reason="g++ is missing: it compiles the kernels for the host."),
+    pytest.mark.slow,
+]
+SUMS = 1e-6  # relative: fibers add in another order
+
+
+def small(count=16):
+    """Tiles at both borders, an empty one, pixels that stop early: 40 x 24 px, 6 tiles."""
+    return cloud(50, count, make_camera(40, 24), sigma=(1.0, 5.0), opacity=(0.5, 0.99), frame=-0.25)
+
+
+def differentiate(scene, mode, options, features=None):
+    leaves = [getattr(scene, name).detach().clone().requires_grad_() for name in PARAMETERS]
+    if features:
+        features = torch.rand(len(leaves[0]), features, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    out = rasterize(*leaves, scene.camera, scene.background, mode, options, features=features)
+    shown = (out.image, out.alpha, out.depth, out.features, out.strongest_weights)
+    generator = torch.Generator().manual_seed(1)
+    sum((x * torch.randn(x.shape, generator=generator)).sum() for x in shown if x is not None).backward()
+
+
+#: What is rendered; each case compiles the kernels that those before it have not.
+CASES = {
+    **{mode: (mode, RasterOptions()) for mode in ADJOINTS},
+    **{f"{mode}, depth": (mode, RasterOptions(depth=True)) for mode in ADJOINTS},
+    "channels": ("manual", RasterOptions(), 5),
+    "channels, stepwise": ("stepwise", RasterOptions(), 5),
+    "weights": ("manual", RasterOptions(strongest=3)),
+}
+
+
+def launches_of(case, monkeypatch, scene):
+    with using(CUDA), recorded(monkeypatch) as launches:
+        differentiate(scene, *CASES[case])
+    return launches
+
+
+def check_memory(found, launch):
+    """What the program left is what the fibers left: to the bit, sums to their rounding."""
+    for here, there in zip(found.memory, launch.after, strict=True):
+        if not np.array_equal(here, there):
+            sums, expected = (memory.view(np.float32).astype(float) for memory in (here, there))
+            assert np.abs(there.view(np.int32)).max() > 2**23, "integers differ"
+            assert np.linalg.norm(sums - expected) <= SUMS * np.linalg.norm(expected)
+
+
+def check_clean(program, launch):
+    """No report in two orders of threads, and one result."""
+    first, second = (run(program, launch, seed) for seed in range(2))
+    assert first.code == second.code == 0, first.said + second.said
+    check_memory(first, launch)
+    assert all(map(np.array_equal, first.memory, second.memory))
+    return first.barriers
+
+
+def check_controls(program, launch, barriers):
+    """A barrier that is taken out is reported: all but one, which stands beside another."""
+    silent = [barrier for barrier in barriers if run(program, launch, without=barrier).code == 0]
+    assert len(silent) <= 1, silent
+    assert len(barriers) >= 3
+
+
+def test_adjoint_has_no_races(monkeypatch, tmp_path):
+    launch = launches_of("manual", monkeypatch, small(4))[-1]
+    program = build(launch, "thread", tmp_path)
+    check_controls(program, launch, check_clean(program, launch))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+@pytest.mark.parametrize("case", CASES)
+def test_every_kernel(case, sanitizer, monkeypatch, tmp_path):
+    for number, launch in enumerate(launches_of(case, monkeypatch, small())):
+        (folder := tmp_path / str(number)).mkdir()
+        program = build(launch, sanitizer, folder)
+        barriers = check_clean(program, launch)
+        if sanitizer == "thread" and barriers:
+            check_controls(program, launch, barriers)
+
+
+@pytest.mark.long
+def test_more_than_a_batch(monkeypatch, tmp_path):
+    for number, launch in enumerate(launches_of("manual", monkeypatch, dense_tile())):
+        (folder := tmp_path / str(number)).mkdir()
+        check_clean(build(launch, "thread", folder), launch)
+
+
+@pytest.mark.long
+def test_short_arrays_are_reported(monkeypatch, tmp_path):
+    launch = launches_of("manual", monkeypatch, small())[-1]
+    program = build(launch, "address", tmp_path)
+    for which in range(len(launch.memory)):
+        memory = [array[:-4] if i == which else array for i, array in enumerate(launch.memory)]
+        assert "heap-buffer-overflow" in run(program, replace(launch, memory=memory)).said
