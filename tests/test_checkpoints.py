@@ -79,6 +79,7 @@ def state_of(trainer, run):
         {"white_background": True, "prune_screen_size": 20, "antialiasing": True, "sh_degree": 1},
         {"max_gaussians": 5000, "sh_degree": 0, "seed": 7, "half_moments": True},
         {"growth": "budget", "max_gaussians": 7000},
+        {"growth": "mcmc", "max_gaussians": 4900, "opacity_lr": 0.3},
     ],
     ids=str,
 )

@@ -178,7 +178,7 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
     assert "--parts: expected auto, or some of random_background, exposure, pose, depth, floaters, gain" in fails(
         capsys, *begun, "--parts", "weather"
     )
-    assert "--growth: expected one of reference, budget, faint" in fails(capsys, *begun, "--growth", "weather")
+    assert "--growth: expected one of reference, budget, mcmc, faint" in fails(capsys, *begun, "--growth", "weather")
 
 
 def test_neither_trainer_nor_command_line_knows_one_by_name():

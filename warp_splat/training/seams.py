@@ -7,11 +7,13 @@ and command line know none by name.
 
 A growth is made of (options, setting, optimizer); the optimizer's ``replace`` and ``arrange`` change the set:
 
-    observe(out, step)                      look at what was rendered; ``out.means2d.grad`` [N, 2] is there
     update(iteration) -> Change | None      change the set if it is time; None: nothing changed
     grows(iterations) -> bool               whether a training of this length gains Gaussians
-    compare(image, target, mask, out, step) look at what is compared, as the loss does, before it is differentiated (not
-                                            of every growth)
+
+It may look at every step, without a gradient:
+
+    compare(image, target, mask, out, step) at what the loss compares, before it is differentiated
+    observe(out, step)                      at what was rendered; ``out.means2d.grad`` [N, 2] is there
 
 A part is made of (options, setting). It has any of these methods; ``tests/test_seams.py`` has an example. In each step
 they run in this order:
@@ -23,18 +25,18 @@ they run in this order:
     background(color, step) -> color        [3], to render on
     image(image, out, step) -> image        [H, W, 3], of what was rendered, which is compared
     photograph(photograph, step)            what it is compared with; with ``reads_alpha``, it has its transparency
-    loss(loss, out, step) -> loss           a scalar, which is differentiated
-    after_step(iteration)                   after Adam
 
 For what is shown and saved, a part may have:
 
     refined(camera, view) -> camera         of a photograph, held out or not, as it is learned by now
     files() -> {name: value}                JSON files of the model's folder
 
-Both may have:
+Both may have, the growth after the parts:
 
     load()                                  compile and load the kernels that they launch, before the first step
     asks(options, step) -> options          what they need of the renderer in this step: depth, ...
+    loss(loss, out, step) -> loss           a scalar, which is differentiated
+    after_step(iteration)                   after Adam
     state() -> {name: tensor}               what a checkpoint keeps besides ``parameters``, by names that no other has
     restore(checkpoint)                     take that back; raise InputError if it does not fit
 """

@@ -117,7 +117,7 @@ class Trainer:
         self._set_iteration(iteration)
         step = Step(iteration, self._next_view())
         camera, photograph = self.photographs.at_size(step.view, iteration)
-        options = self._asked(step)
+        options = self._through("asks", self.options, step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
         out = self._render(camera, background, options)
         out.means2d.retain_grad()
@@ -133,7 +133,8 @@ class Trainer:
         loss = self._through("loss", loss, out, step)
         loss.backward()
         with stage("densify"):
-            self.growth.observe(out, step)
+            for observe in having([self.growth], "observe"):
+                observe(out, step)
         self.quarantine.pixels += out.dropped.pixel_count
         self.quarantine.gradients += out.dropped.gaussian_count
         self.quarantine.gaussians += out.invalid_count
@@ -144,15 +145,10 @@ class Trainer:
         return loss
 
     def _through(self, method: str, value: T, *arguments: Any) -> T:
-        """What the parts make of ``value``, one after another."""
-        for make in having(self.parts, method):
+        """What the parts and then the growth make of ``value``, one after another."""
+        for make in having((*self.parts, self.growth), method):
             value = make(value, *arguments)
         return value
-
-    def _asked(self, step: Step) -> RasterOptions:
-        """What parts and growth need of the renderer."""
-        asked = self._through("asks", self.options, step)
-        return self.growth.asks(asked, step) if hasattr(self.growth, "asks") else asked
 
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
@@ -163,7 +159,7 @@ class Trainer:
             self.quarantine.prunings += changed.refused
         with stage("Adam"):
             self.optimizer.step(self._radii if changed is None or changed.refused else None)
-        for after_step in having(self.parts, "after_step"):
+        for after_step in having((*self.parts, self.growth), "after_step"):
             after_step(iteration)
 
     def warm_up(self) -> None:
@@ -171,7 +167,7 @@ class Trainer:
         view = self.scene.train[0]
         step = Step(0, view)
         camera = self._through("camera", view.camera.resized(TILE, TILE), step)
-        out = self._render(camera, self.background, self._asked(step))
+        out = self._render(camera, self.background, self._through("asks", self.options, step))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.adam.zero_grad()
         self.optimizer.load()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+from warp_splat.errors import InputError
 from warp_splat.flags import growing
 from warp_splat.training.seams import Entry
 
@@ -21,7 +23,17 @@ class ReferenceOptions:
     prune_screen_size: int = growing(0, "prune Gaussians wider than this radius in px; 0: never, as in the reference")
 
 
+def check_budget(growth: str, budget: int, start: int, most: float = math.inf, why: str = "") -> None:
+    """Raise InputError if --max_gaussians is not what a growth can end with: ``start`` to ``most``."""
+    what = f"--max_gaussians {budget}: expected the number of Gaussians that --growth {growth} ends with"
+    if budget < start:
+        raise InputError(f"{what}, at least the {start} of the start; raise it, or take --growth reference.")
+    if budget > most:
+        raise InputError(f"{what}, at most {most:.0f}, since {why}; lower it, or raise --densify_until_iter.")
+
+
 GROWTHS: dict[str, Entry] = {
     "reference": Entry(ReferenceOptions, "warp_splat.training.growth.reference.Reference"),
     "budget": Entry(ReferenceOptions, "warp_splat.training.growth.budget.Budget"),
+    "mcmc": Entry(ReferenceOptions, "warp_splat.training.growth.mcmc.Mcmc"),
 }

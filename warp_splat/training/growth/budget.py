@@ -12,14 +12,13 @@ import math
 import numpy as np
 import torch
 
-from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import activate, logarithm
 from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime.timers import stage
-from warp_splat.training.growth import ReferenceOptions
-from warp_splat.training.growth.reference import Reference, rotate
+from warp_splat.training.growth import ReferenceOptions, check_budget
+from warp_splat.training.growth.reference import Reference, rotate, survivors
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting, Step
 
@@ -36,18 +35,10 @@ class Budget(Reference):
         super().__init__(options, setting, optimizer)
         self.start = len(self.model)
         self.end = min(options.densify_until_iter, setting.iterations)
-        self._check()
-
-    def _check(self) -> None:
-        """Raise InputError if there is no budget, or none that can be reached."""
-        budget, interval = self.setting.max_gaussians, self.options.densification_interval
-        what = f"--max_gaussians {budget}: expected the number of Gaussians that --growth budget ends with"
-        if budget < self.start:
-            raise InputError(f"{what}, at least the {self.start} of the start; raise it, or take --growth reference.")
-        doublings = max((self.end - 1) // interval - self.options.densify_from_iter // interval, 0)
-        if budget > self.start * 2.0**doublings:
-            most = f"at most {self.start * 2**doublings}, since {doublings} densifications double {self.start}"
-            raise InputError(f"{what}, {most}; lower it, or raise --densify_until_iter.")
+        interval = options.densification_interval
+        doublings = max((self.end - 1) // interval - options.densify_from_iter // interval, 0)
+        why = f"{doublings} densifications double {self.start}"
+        check_budget("budget", setting.max_gaussians, self.start, self.start * 2.0**doublings, why)
 
     def clear(self) -> None:
         """Begin to observe the present set."""
@@ -95,7 +86,7 @@ class Budget(Reference):
         for rows in (self.gradient, self.views, self.error, self.looks):
             self.processes.sum(rows)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
-        keep = self._survivors(raw, prune_large=False)
+        keep = survivors(raw)
         score = torch.where(keep, self._score().nan_to_num(0.0, 0.0, 0.0), -1.0)
         kept = int(keep.sum())
         pruned, room = len(keep) - kept, min(max(due - kept, 0), kept)

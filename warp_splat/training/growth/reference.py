@@ -141,22 +141,28 @@ class Reference:
         twice = split.repeat(2)
         rows = {name: tensor[twice] for name, tensor in raw.items()}
         drawn = torch.randint(LEVELS, (len(twice), 3), generator=self.random)  # on the host: the same on any device
-        offsets = activate(rows["scales"], rows["opacities"])[0] * _normals()[drawn].to(twice.device)
+        offsets = activate(rows["scales"], rows["opacities"])[0] * normals()[drawn].to(twice.device)
         rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
         rows["scales"] = rows["scales"] - math.log(SPLIT_SHRINK)
         return rows
 
     def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
-        keep = raw["opacities"] >= math.log(PRUNE_OPACITY / (1.0 - PRUNE_OPACITY))
-        for tensor in raw.values():  # one that is not finite is left out of every image, so nothing else would prune it
-            keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
+        keep = survivors(raw)
         if prune_large:
             keep &= raw["scales"].amax(1) <= _log(PRUNE_EXTENT * self.extent)
         return keep
 
 
+def survivors(raw: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Which Gaussians are finite, and not too faint to be seen [N]."""
+    keep = raw["opacities"] >= math.log(PRUNE_OPACITY / (1.0 - PRUNE_OPACITY))
+    for tensor in raw.values():  # one that is not finite is left out of every image, so nothing else would prune it
+        keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
+    return keep
+
+
 @functools.cache
-def _normals() -> torch.Tensor:
+def normals() -> torch.Tensor:
     """Standard normal numbers, each as likely as the others [LEVELS]; torch's own differ by processor."""
     return torch.tensor([NormalDist().inv_cdf((level + 0.5) / LEVELS) for level in range(LEVELS)])
 
