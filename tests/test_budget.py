@@ -16,6 +16,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
+from warp_splat.runtime import pool
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.growth.budget import EVERY, Budget, halves
 from warp_splat.training.growth.reference import Reference
@@ -47,6 +48,18 @@ def test_it_ends_with_exactly_as_many_as_asked_for(budget, until, scene):
     assert [found[20], found[30]] == due
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("growth", ["budget", "mcmc"])
+def test_any_number_of_threads_makes_the_same_bytes(growth, scene):
+    before, found = pool.get_threads(), []
+    for threads in (1, 3):
+        pool.set_threads(threads)
+        trainer, counts = count_steps(scene, 5500, growth=growth, opacity_lr=0.3)
+        found.append([counts, *(tensor.detach().numpy().tobytes() for tensor in trainer.model.parameters.values())])
+    pool.set_threads(before)
+    assert found[0] == found[1] and found[0][0][-1] > POINTS
+
+
 @pytest.mark.parametrize(
     ("flags", "sentence"),
     [
@@ -64,19 +77,25 @@ def test_a_budget_that_cannot_be(flags, sentence, capsys, tmp_path):
     assert sentence in fails(capsys, *command)
 
 
-def test_a_set_that_stays_changes_nothing(scene):
-    """A budget of the start with nothing to prune: the same bytes as without growth."""
-    trainer, _ = count_steps(scene, POINTS)
-    other, _ = count_steps(scene, 0, growth="reference", densify_from_iter=100, opacity_reset_interval=100)
-    for name, tensor in trainer.model.parameters.items():
-        assert torch.equal(tensor, other.model.parameters[name])
-
-
 def growth_on(model, budget=None, processes=ALONE):
     """A growth of a model."""
     config, scene = TrainConfig(growth="budget"), SimpleNamespace(extent=1.0)
     setting = Setting(scene, model, torch.zeros(3), processes, 0, budget or len(model), 2000)
     return Budget(config.plugins["budget"], setting, Optimizer(model, config.learn, 1.0))
+
+
+def test_where_it_is_full_the_weakest_make_room():
+    """Two of a hundred; those that no look has shown stay, since nothing is known of them."""
+    model = GaussianModel.from_points(np.random.default_rng(0).normal(size=(100, 3)), np.zeros((100, 3), np.uint8), 0)
+    means, growth = model.parameters["means"].detach().clone(), growth_on(model)
+    growth.weight[:], growth.looks[:] = torch.linspace(1.0, 2.0, 100), 1.0
+    growth.weight[[3, 7, 40, 50]] = torch.tensor([0.2, 0.1, 0.0, 0.6])
+    growth.looks[40], growth.looks[50], growth.views[:] = 0.0, 4.0, 1.0
+    growth.gradient[[11, 12, 13]], growth.error[[11, 12, 50]] = 1.0, torch.tensor([2.0, 1.0, 3.0])
+    change = growth._grow(100)
+    assert (change.split, change.pruned, len(model)) == (2, 2, 100)
+    left = model.parameters["means"].detach()
+    assert [row for row in range(100) if not bool((left == means[row]).all(1).any())] == [7, 11, 12, 50]
 
 
 @pytest.mark.parametrize("masked", [False, True])

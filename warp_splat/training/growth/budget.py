@@ -2,7 +2,7 @@
 
 The score of a Gaussian is (error that it carries) x (mean gradient of its 2D mean). The error that it carries is the
 sum over pixels of weight times |image - photograph|. Both come from adjoints of the blend: the gradient from that of
-the step, the sums from one more in every eighth step.
+the step, the sums from one more in every tenth step.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from warp_splat.training.growth.reference import Reference, rotate, survivors
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting, Step
 
-EVERY = 8  # steps from one look at the error to the next: each costs an adjoint of the blend
+EVERY = 10  # steps from one look at the error to the next: a look costs about half a step, an adjoint of the blend
+MOVED = 0.02  # share of the Gaussians that move, where there are as many as planned
 APART = 0.7  # standard deviations from the middle of a Gaussian to those of its halves, along its longest axis
 NARROW = math.log(0.714)  # of that axis: 0.7^2 + 0.714^2 = 1, so the halves together are as wide as the whole
 CLEAREST = 1e-12  # floor of opacities and transmittances, whose logarithms are taken
@@ -45,11 +46,12 @@ class Budget(Reference):
         super().clear()
         new = self.model.parameters["means"].new_zeros
         self.error = new(len(self.model))  # sum over looks of weight x error, mean over the pixels
+        self.weight = new(len(self.model))  # likewise of weight
         self.looks = new(len(self.model))  # in which the Gaussian was drawn
 
     def statistics(self) -> dict[str, torch.Tensor]:
         """What was observed since the last change, by name."""
-        return {**super().statistics(), "error": self.error, "looks": self.looks}
+        return {**super().statistics(), "error": self.error, "weight": self.weight, "looks": self.looks}
 
     def compare(self, image, target: torch.Tensor, mask: torch.Tensor | None, out: RenderOutput, step: Step) -> None:
         """Share the error of a view out among the Gaussians that made it."""
@@ -58,12 +60,12 @@ class Budget(Reference):
         with stage("densify"):
             target = target / 255.0 if target.dtype == torch.uint8 else target
             r, g, b = (image.detach() - target).abs().unbind(2)
-            error = (r + g + b) / r.numel()
-            if mask is not None:
-                error = torch.where(mask[..., 0] != 0, error, error.new_zeros(()))
-            upstream = torch.stack([error, torch.zeros_like(r), torch.zeros_like(r)], 2)
+            counts = torch.ones_like(r) if mask is None else (mask[..., 0] != 0).to(r)
+            error = torch.where(counts > 0, r + g + b, torch.zeros_like(r))
+            upstream = torch.stack([error, counts, torch.zeros_like(r)], 2) / r.numel()
             (sums,) = torch.autograd.grad(out.image, out.colors, upstream, retain_graph=True)
             self.error += sums[:, 0]
+            self.weight += sums[:, 1]
             self.looks += out.radii > 0
 
     def update(self, iteration: int) -> Change | None:
@@ -83,22 +85,31 @@ class Budget(Reference):
         return self.start + round((self.setting.max_gaussians - self.start) * share)
 
     def _grow(self, due: int) -> Change | None:
-        for rows in (self.gradient, self.views, self.error, self.looks):
+        for rows in (self.gradient, self.views, self.error, self.weight, self.looks):
             self.processes.sum(rows)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         keep = survivors(raw)
-        score = torch.where(keep, self._score().nan_to_num(0.0, 0.0, 0.0), -1.0)
+        if int(keep.sum()) >= due:
+            keep &= ~self._weakest(keep)
         kept = int(keep.sum())
         pruned, room = len(keep) - kept, min(max(due - kept, 0), kept)
         if not pruned + room or not kept:  # an empty scene could never recover
             self.clear()
             return None if kept else Change(0, 0, 0, refused=True)
+        score = torch.where(keep, self._score().nan_to_num(0.0, 0.0, 0.0), -1.0)
         split = torch.sort(torch.sort(score, descending=True, stable=True).indices[:room]).values
         keep[split] = False
         self.optimizer.replace(keep.nonzero()[:, 0], halves(raw, split))
         self.optimizer.arrange(along_curve(self.model.parameters["means"]))
         self.clear()
         return Change(0, len(split), pruned)
+
+    def _weakest(self, keep: torch.Tensor) -> torch.Tensor:
+        """Of those that were looked at, a share with the least weight in the pixels [N]."""
+        seen = keep & (self.looks > 0)
+        weight = torch.where(seen, self.weight / self.looks.clamp_min(1.0), torch.inf)
+        order = torch.sort(weight, stable=True).indices[: min(round(MOVED * int(keep.sum())), int(seen.sum()))]
+        return torch.zeros_like(keep).index_fill_(0, order, True)
 
     def _score(self) -> torch.Tensor:
         gradient = self.gradient / self.views.clamp_min(1.0)
