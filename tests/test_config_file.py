@@ -82,8 +82,8 @@ def test_help_begins_with_the_flags_that_matter(capsys):
     first, *rest = re.split(r"\n\n(?=\S)", capsys.readouterr().out.split("options:\n", 1)[1])
     flags = re.findall(r"^  (-.*?)(?:  |$)", first, re.MULTILINE)
     names = {name for line in flags for name in re.findall(r"--(\w+)", line) if not name.startswith("no")}
-    expected = "help source_path model_path sfm eval resolution preset iterations max_gaussians resume start_checkpoint"
-    assert names == {*expected.split(), "quiet"}
+    expected = "help source_path model_path sfm eval resolution preset iterations minutes max_gaussians resume quiet"
+    assert names == {*expected.split(), "start_checkpoint"}
     listed = set(re.findall(r"^  (?:-\w[^-]*, )?--(\w+)", "\n".join(rest), re.MULTILINE))
     others = {item.name for item in flags_of(TrainConfig) if item.metadata["group"]}
     assert len(others) > 30 and others <= listed | names

@@ -83,6 +83,7 @@ def test_pictures_are_the_same_bytes_each_time(tmp_path):
     "history",
     [
         [{"iteration": 1, "loss": 0.3}],
+        [{"iteration": 100 * index, "psnr": 20.0, "seconds": 0.1 * index} for index in range(1, 9)],
         [{"iteration": 500 * index, "psnr": 20.0 + index} for index in range(1, 4)],
         [{"iteration": index, "loss": 1 / index, "gaussians": 10**5 * index} for index in range(1, 200)],
         [{"iteration": 100, "loss": 0.2, "psnr": 20.0, "gaussians": 1000}, {"iteration": 200, "loss": 0.1}],

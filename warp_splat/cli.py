@@ -120,19 +120,23 @@ def parse(arguments: list[str]) -> Any:
     if values.get("config"):
         from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
 
-        values = _over(read_config(values["config"]), values)
+        file = read_config(values["config"])
+        if file.get("minutes"):
+            _check_minutes(file)
+        values = _over(file, values)
     if values.get("start_checkpoint"):
         values = _continued(values)
     if config_type is TrainConfig:
         _check_parts(values.get("parts", ""), given)
+        _check_minutes(given)
     if values.get("start_checkpoint"):
         return TrainConfig(**values)
     if config_type is TrainConfig:
-        preset = values.get("preset", "")
+        preset = values.get("preset", "fast" if values.get("minutes") else "")
         defaults = [PRESETS[preset]]
         if "source_path" not in values:
             defaults = [EMBEDDED_DEFAULTS[""], PRESETS[preset], EMBEDDED_DEFAULTS[preset]]
-        values = {**{name: value for table in defaults for name, value in table.items()}, **values}
+        values = {**{name: value for table in defaults for name, value in table.items()}, **values, "preset": preset}
     return config_type(**values)
 
 
@@ -147,13 +151,19 @@ def _continued(given: dict) -> dict:
         if given.get(name, kept) != kept:
             kept = "none" if kept == "" else kept
             raise InputError(f"--{name} {given[name]}: expected {kept}, as in {source} ({reason}); leave it out.")
+    if given.get("minutes") and not options["minutes"]:
+        raise InputError(
+            f"--minutes: expected a training that began with it and does not end yet, found {source}; name a later end "
+            "with --iterations."
+        )
     return _over(options, given)
 
 
 def _over(kept: dict, given: dict) -> dict:
     """Options of a file, and over them those that are given; ``--no-NAME`` of a part takes it out of the file's."""
     used = [name for name in kept.get("parts", "").split(",") if given.get(name) is not False]
-    return {**kept, "parts": ",".join(used), **given}
+    ended = {"minutes": 0.0, "settle_from_iter": 0} if "iterations" in given else {}
+    return {**kept, **ended, "parts": ",".join(used), **given}
 
 
 def _check_parts(parts: str, given: dict) -> None:
@@ -167,6 +177,16 @@ def _check_parts(parts: str, given: dict) -> None:
             )
         if named.count(name) > 1:
             raise InputError(f"--parts {parts}: expected each part once, got {name} twice; leave one out.")
+
+
+def _check_minutes(given: dict) -> None:
+    """Raise InputError if the time given is none, or steps are given that it decides about."""
+    minutes = given.get("minutes", 0.0)
+    if "minutes" in given and not minutes > 0:
+        raise InputError(f"--minutes: expected more than 0, got {minutes:g}; leave it out to train by --iterations.")
+    steps = [item.name for item in flags_of(TrainConfig) if item.metadata["schedule"] and item.name in given]
+    if minutes and steps:
+        raise InputError(f"--minutes: expected no --{steps[0]} beside it, since it plans the steps; leave one out.")
 
 
 def _function_of(config: Any) -> Callable[[Any], int]:

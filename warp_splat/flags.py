@@ -14,9 +14,10 @@ def flag(default: Any, help: str, *names: str, **metadata: Any) -> Any:
     """A dataclass field that is also a command-line flag: its default, its help, further names.
 
     ``metadata`` may have ``choices``, a tuple; ``many``, the type of a list's elements; ``least`` and ``most``, bounds
-    of a number if those are not 0 and none. Without a ``group`` it is one of the few that ``--help`` lists first.
+    of a number if those are not 0 and none; ``schedule``: a step of the schedule, which ``--minutes`` plans. Without a
+    ``group`` it is one of the few that ``--help`` lists first.
     """
-    usual = {"choices": None, "many": None, "group": "", "least": 0, "most": math.inf}
+    usual = {"choices": None, "many": None, "group": "", "least": 0, "most": math.inf, "schedule": False}
     metadata = {"help": help, "names": names, **usual, **metadata}
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata=metadata)

@@ -82,31 +82,38 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
 
 
 def plot_training(path: str | Path, history: Sequence[Mapping[str, float]], split: str = "test") -> None:
-    """Draw loss, PSNR and number of Gaussians over the iterations, a panel for each that was recorded.
+    """Draw loss, PSNR and number of Gaussians over the iterations and PSNR over seconds, as far as they were recorded.
 
     Args:
         path: the file to write, such as .png.
-        history: records with ``iteration`` and any of ``loss``, ``psnr`` [dB] and ``gaussians``, in order.
+        history: records with ``iteration`` and any of ``loss``, ``psnr`` [dB], ``gaussians`` and ``seconds``, in order.
         split: of which views the PSNR is.
 
     Raises:
         InputError: if nothing was recorded; if the file cannot be written.
     """
-    panels = (("loss", "loss", BLUE), ("psnr", f"{split} PSNR [dB]", ORANGE), ("gaussians", "Gaussians", GREEN))
-    series = {key: [(record["iteration"], record[key]) for record in history if key in record] for key, *_ in panels}
-    drawn = [panel for panel in panels if series[panel[0]]]
+    quality = f"{split} PSNR [dB]"
+    panels = (
+        ("iteration", "loss", "loss", BLUE),
+        ("iteration", "psnr", quality, ORANGE),
+        ("seconds", "psnr", quality, ORANGE),
+        ("iteration", "gaussians", "Gaussians", GREEN),
+    )
+    drawn = []
+    for x, key, title, color in panels:
+        points = [(record[x], record[key]) for record in history if x in record and key in record]
+        drawn += [(x, key, title, color, np.array(points, dtype=np.float64).T)] * bool(points)
     if not drawn:
         raise InputError("history: expected records with loss, psnr or gaussians, got none.")
-    figure, grid = new_panels(2.5, 1, len(drawn), sharex=True)
-    for axes, (key, title, color) in zip(np.ravel(grid), drawn, strict=True):
-        iterations, values = np.array(series[key], dtype=np.float64).T
-        plain_axes(axes, title, "iteration")
+    figure, grid = new_panels(2.5, 1, len(drawn))
+    for axes, (x, key, title, color, (along, values)) in zip(np.ravel(grid), drawn, strict=True):
+        plain_axes(axes, title, x)
         if key == "loss":
-            axes.plot(iterations, values, color=color, linewidth=0.6, alpha=0.25)
-            values = _smooth(values)
-        axes.plot(iterations, values, color=color, linewidth=1.8, marker="o" if key == "psnr" else "", markersize=4)
+            axes.plot(along, values, color=color, linewidth=0.6, alpha=0.25)
+        smooth = _smooth(values) if key == "loss" else values
+        axes.plot(along, smooth, color=color, linewidth=1.8, marker="o" if key == "psnr" else "", markersize=4)
         if key == "psnr":
-            label_point(axes, (iterations[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
+            label_point(axes, (along[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
         else:
             axes.set_ylim(bottom=0)
         axes.yaxis.set_major_formatter(_thousands)

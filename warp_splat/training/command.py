@@ -21,6 +21,8 @@ from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.training import memory
+from warp_splat.training.config_file import write_config
+from warp_splat.training.deadline import Deadline, plan_training
 from warp_splat.training.opening import Say, open_scene, refuse_other_training, resolve, speaker, write_inputs
 from warp_splat.training.options import ReportOptions, TrainConfig, check_train
 from warp_splat.training.record import (
@@ -67,6 +69,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     say = speaker(config.report.quiet)
     run = Run(Path(config.report.model_path), time.perf_counter())
     scene = open_scene(config, begun, say)
+    if config.learn.minutes and not begun:
+        config = plan_training(scene, config, processes, say)
     trainer = Trainer(scene, config, processes)
     _tell(trainer, run, say)
     with model_folder.claimed(run.folder) if processes.rank == 0 else nullcontext(), _memory_explained(trainer):
@@ -123,19 +127,19 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
             if processes.rank == 0 or processes.lost:
                 run.saved = save_model(trainer, run)
                 print(f"Model after {run.iteration} iterations: {run.saved}")
-            if run.kept is not None and run.iteration < trainer.config.learn.iterations:
+            if run.kept is not None and run.iteration < trainer.config.learn.end:
                 print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
     return 0
 
 
 def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say) -> int:
     """Evaluate and tell; returns the process's exit code."""
-    end = trainer.config.learn.iterations
+    end = trainer.config.learn.end
     if viewer:
         viewer.show_end()
     if trainer.processes.rank == 0:
         finish(trainer, run, say)
-    if viewer and run.iteration == end:
+    if viewer and run.iteration >= end:
         viewer.linger()
     if run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration):
         elsewhere = f"The model is not in {run.folder}, but in {run.saved}; see the warning, and move it."
@@ -171,17 +175,17 @@ def _memory_explained(trainer: Trainer):
 
 
 def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
-    end, report, processes = trainer.config.learn.iterations, trainer.config.report, trainer.processes
-    checks = {end * k // EVALUATIONS for k in range(1, EVALUATIONS)}
-    whole_checks = {*report.test_iterations, end}
-    saves = set(report.save_iterations) - {end}
-    profiled, before_profile = max(end - report.profile, run.iteration), run.seconds
+    learn, report, processes = trainer.config.learn, trainer.config.report, trainer.processes
+    checks = {learn.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
+    profiled, before_profile = max(learn.end - report.profile, run.iteration), run.seconds
+    deadline = Deadline(learn, processes.count)
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     often = {"mininterval": pause, "maxinterval": pause, "miniters": 0}
-    bar = tqdm(total=end, initial=run.iteration, disable=report.quiet, unit="it", **often)
+    bar = tqdm(total=learn.end_or_plan, initial=run.iteration, disable=report.quiet, unit="it", **often)
     trainer.check_identical(run.iteration)
     with bar, timers.profile(report.profile > 0) as stages:
-        for iteration in range(run.iteration + processes.count, end + 1, processes.count):
+        while run.iteration < (end := trainer.config.learn.end):
+            iteration, whole_checks = run.iteration + processes.count, {*report.test_iterations, end}
             if processes.reaches(iteration, [profiled + 1]):
                 stages.clear()
                 before_profile = run.seconds
@@ -190,9 +194,11 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
                 trainer.update(run.iteration)
             run.losses.append(trainer.differentiate(iteration))
             run.iteration = iteration
-            run.seconds += time.perf_counter() - start
+            done = time.perf_counter()
+            run.seconds += done - start
+            run.spent += done - start
             wish = processes.largest(STOP if interrupted else KEEP if _keeping_is_due(report, run) else 0)
-            stop = wish == STOP or iteration == end
+            stop = wish == STOP or iteration >= end
             check, whole = (processes.reaches(iteration, marks) for marks in (checks | whole_checks, whole_checks))
             named = processes.reaches(iteration, report.checkpoint_iterations)
             if check:
@@ -201,11 +207,18 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
                 keep(trainer, run, named)
             if stop and not check:  # after the checkpoint: a run that goes on from there never had this record
                 _check(trainer, run, bar, whole=False)
-            if processes.reaches(iteration, saves) and not stop:
+            if processes.reaches(iteration, report.save_iterations) and not stop:
                 save_or_warn(trainer, run)
             bar.update(processes.count)
             if stop:
                 break
+            run.spent += time.perf_counter() - done
+            if trainer.config.learn.minutes and (cooldown := deadline.due(iteration, run.spent, processes)):
+                trainer.settle(iteration + 1, cooldown)
+                profiled = max(trainer.config.learn.end - report.profile, iteration)
+                bar.total = trainer.config.learn.end
+                if processes.rank == 0:
+                    write_config(run.folder, trainer.config)
             if viewer:
                 viewer.between_steps(interrupted)
     run.dropped = trainer.quarantine.read(processes)

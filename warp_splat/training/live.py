@@ -99,7 +99,7 @@ class TrainingViewer:
         self.viewer.refresh()
 
     def _tell(self) -> None:
-        run, end = self.run, self.trainer.config.learn.iterations
+        run, end = self.run, self.trainer.config.learn.end_or_plan
         self._bar.value = 100.0 * run.iteration / end
         lines = [f"iteration {run.iteration:,} of {end:,}" + ", paused" * self.paused]
         if run.seconds:

@@ -39,7 +39,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     Raises:
         InputError: if an option cannot be had here, or the output folder not be used.
     """
-    data, machine, iterations = config.data, config.machine, config.learn.iterations
+    data, machine, iterations, end = config.data, config.machine, config.learn.iterations, config.learn.end
     quiet = config.report.quiet or processes.rank > 0
     threads = machine.threads or max(1, pool.get_threads() // processes.local_count)
     choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
@@ -57,8 +57,8 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
             f"{here}; change it, or start anew."
         )
     done = begun.count("iteration") if begun else 0
-    if begun and done > iterations:  # at the end, what is written there is written again
-        raise InputError(f"--iterations {iterations}: expected at least {done}, as in {begun.path}; name a later end.")
+    if begun and done > end:  # at the end, what is written there is written again
+        raise InputError(f"--iterations {end}: expected at least {done}, as in {begun.path}; name a later end.")
     folder = _choose_folder(config, begun)
     say = speaker(quiet)
     device = settle_device(launch.prepare(machine.device, threads), machine.device, [config.model.adjoint], say)
@@ -132,7 +132,7 @@ def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: boo
     """Write what this training was given: options, cameras, points."""
     others = {"train_test_exp": False, "linear_light": scene.linear}
     model_folder.write_cfg_args(folder, {**config.flat(), **others})
-    write_config(folder, config)
+    write_config(folder, config.changed(minutes=0.0))  # a clock cannot be repeated, what it decides can
     model_folder.write_cameras(folder, scene.test, scene.train)
     remove_leftovers(folder)
     if not (continues and (folder / "input.ply").exists()):

@@ -135,8 +135,8 @@ class Optimizer:
             "quats": options.rotation_lr,
             **{name: rate(iteration) if callable(rate) else rate for name, rate in self._part_rates.items()},
         }
-        cooldown = min(options.cooldown, options.iterations)
-        late = power(0.1, max(iteration - options.iterations + cooldown, 0), max(cooldown, 1))
+        cooldown = int(min(options.cooldown, options.end))
+        late = power(0.1, max(iteration - options.falls_from, 0), max(cooldown, 1))
         for name, rate in rates.items():
             self._groups[name]["lr"] = rate * self.scale * late
 

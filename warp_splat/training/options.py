@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -17,7 +18,7 @@ from warp_splat.config import (
     PROJECTIONS,
 )
 from warp_splat.errors import InputError
-from warp_splat.flags import check_numbers, data, flag, growing, learning, machinery, rendering, reporting
+from warp_splat.flags import check_numbers, data, flag, flags_of, growing, learning, machinery, rendering, reporting
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.parts import AUTO, PARTS
 
@@ -59,23 +60,52 @@ class ModelOptions:
 class LearnOptions:
     """How it learns; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
-    iterations: int = flag(30_000, "images to train on, one in a step of each process; schedules count images", least=1)
+    iterations: int = flag(
+        30_000, "images to train on, one in a step of each process; schedules count images", least=1, schedule=True
+    )
+    minutes: float = flag(0.0, "instead of --iterations: plan a training that ends after so long, from its first step")
 
     lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss", most=1)
     position_lr_init: float = learning(0.00016, "rate of the means at the start (times the scene's extent)")
     position_lr_final: float = learning(0.0000016, "rate of the means after position_lr_max_steps")
-    position_lr_max_steps: int = learning(30_000, "steps over which the means' rate decays", least=1)
+    position_lr_max_steps: int = learning(30_000, "steps over which the means' rate decays", least=1, schedule=True)
     feature_lr: float = learning(0.0025, "rate of the base color; the higher degrees learn 20 times slower")
     opacity_lr: float = learning(0.025, "rate of the opacity logits")
     scaling_lr: float = learning(0.005, "rate of the log scales")
     rotation_lr: float = learning(0.001, "rate of the quaternions")
-    cooldown: int = learning(0, "over this many steps at the end, all rates fall to a tenth")
-    sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1)
+    cooldown: int = learning(0, "over this many steps at the end, all rates fall to a tenth", schedule=True)
+    settle_from_iter: int = learning(
+        0, "from this step nothing grows, the cooldown runs, and training ends; 0: as --iterations says", schedule=True
+    )
+    sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1, schedule=True)
     optimizer_type: str = learning("default", "sparse_adam updates only what the image shows", choices=OPTIMIZERS)
     half_moments: bool = learning(False, "keep Adam's moments in 16 bits, rounded at random: less memory")
     coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
-    coarse_until_iter: int = learning(3000, "by this step the size has doubled to the full one", least=1)
+    coarse_until_iter: int = learning(3000, "by this step the size has doubled to the full one", least=1, schedule=True)
     seed: int = learning(0, "seed of everything random", most=2**63 - 1)
+
+    @property
+    def falls_from(self) -> float:
+        """The step of the cooldown's start; infinite as long as a clock has to say it."""
+        if self.settle_from_iter:
+            return self.settle_from_iter
+        return math.inf if self.minutes else max(self.iterations - self.cooldown, 0)
+
+    @property
+    def end(self) -> float:
+        """The last step; infinite as long as a clock has to say it."""
+        if self.settle_from_iter:
+            return self.settle_from_iter + self.cooldown
+        return math.inf if self.minutes else self.iterations
+
+    @property
+    def end_or_plan(self) -> int:
+        """The last step, as far as one can tell."""
+        return int(self.end) if self.end < math.inf else self.iterations
+
+    def grows_at(self, iteration: int) -> bool:
+        """Whether the set of Gaussians may still change."""
+        return not self.settle_from_iter or iteration < self.settle_from_iter
 
 
 @dataclass(frozen=True)
@@ -184,6 +214,12 @@ FIXED_OPTIONS = {
     "seed": "random numbers continue from the checkpoint's",
     "preset": "other options are those of the checkpoint; name the ones to change",
 }
+
+
+def schedule_of(config: TrainConfig) -> dict[str, int]:
+    """The steps of the schedule, by the names of their options: what ``--minutes`` plans."""
+    values = config.flat()
+    return {item.name: values[item.name] for item in flags_of(TrainConfig) if item.metadata["schedule"]}
 
 
 def check_train(config: TrainConfig) -> None:

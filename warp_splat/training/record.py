@@ -26,6 +26,7 @@ from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.text import format_table
 from warp_splat.training.config_file import OF_ONE_RUN
+from warp_splat.training.plan import as_flags
 from warp_splat.training.seams import having
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
@@ -43,6 +44,7 @@ class Run:
     losses: list[torch.Tensor] = field(default_factory=list)  # since the last record, scalars on the device
     iteration: int = 0
     seconds: float = 0.0  # of training steps alone, without evaluations and pictures
+    spent: float = 0.0  # seconds since the first step, with evaluations, without pauses
     preview: float = 0.0  # when last drawn
     saved: Path | None = None  # the model, at the end
     sha256: str = ""  # of that file: equal where the bytes are (docs/platforms.md says where)
@@ -112,7 +114,7 @@ def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
             tensors["losses"] = torch.stack(run.losses)
         options = {name: value for name, value in trainer.config.flat().items() if name not in OF_ONE_RUN}
         facts |= {"options": options, "iteration": run.iteration, "history": run.history}
-        facts |= {"seconds": run.seconds, "wall": time.perf_counter() - run.start}
+        facts |= {"seconds": run.seconds, "spent": run.spent, "wall": time.perf_counter() - run.start}
         arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
         try:
             for name in [LAST, f"chkpnt{run.iteration}.safetensors"][: 1 + named]:
@@ -132,6 +134,7 @@ def restore(trainer: Trainer, run: Run, checkpoint: Checkpoint) -> None:
     trainer.restore(checkpoint)
     run.iteration = run.kept = checkpoint.count("iteration")
     run.seconds = checkpoint.fact("seconds", float)
+    run.spent = checkpoint.fact("spent", float) if trainer.config.learn.minutes else 0.0
     run.start -= checkpoint.fact("wall", float)
     run.history = checkpoint.fact("history", list)
     for record in run.history:
@@ -174,6 +177,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         "sha256": run.sha256,
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
+        "spent": round(run.spent, 2),
         "processes": trainer.processes.count,
         "peak_memory_mb": peak_memory(),
         "dropped": run.dropped,
@@ -193,13 +197,16 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    state = "Interrupted" if run.iteration < trainer.config.learn.iterations else "Done"
+    state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
     print(
         f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
         f"{split} {metrics_line(means)}, {len(trainer.model)} Gaussians"
     )
     for name, where in lines:
         print(f"  {name:9s} {where}")
+    if trainer.config.learn.settle_from_iter:  # a clock may have said so
+        print(f"  flags     {as_flags(trainer.config)}")
+        print(f"  time      {run.spent:.1f} s from the first step to the last")
     dropped = run.dropped
     if dropped["prunings"]:
         print(f"  warning   {dropped['prunings']} prunings would have removed every Gaussian and were refused")

@@ -128,12 +128,13 @@ class Trainer:
             image, target = (LOSS_CURVES[self.config.data.loss_space](picture) for picture in (image, target))
         # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
         loss = image_loss(image, target, learn.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
-        for compare in having([self.growth], "compare"):
+        growing = [self.growth] if learn.grows_at(iteration) else []
+        for compare in having(growing, "compare"):
             compare(image, target, photograph.mask, out, step)
         loss = self._through("loss", loss, out, step)
         loss.backward()
         with stage("densify"):
-            for observe in having([self.growth], "observe"):
+            for observe in having(growing, "observe"):
                 observe(out, step)
         self.quarantine.pixels += out.dropped.pixel_count
         self.quarantine.gradients += out.dropped.gaussian_count
@@ -153,7 +154,7 @@ class Trainer:
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
         with stage("densify"):
-            changed = self.growth.update(iteration)
+            changed = self.growth.update(iteration) if self.config.learn.grows_at(iteration) else None
         if changed is not None:
             self.check_identical(iteration)
             self.quarantine.prunings += changed.refused
@@ -161,6 +162,11 @@ class Trainer:
             self.optimizer.step(self._radii if changed is None or changed.refused else None)
         for after_step in having((*self.parts, self.growth), "after_step"):
             after_step(iteration)
+
+    def settle(self, begin: int, cooldown: int) -> None:
+        """Let the cooldown begin at a step that is still to come: what was done is what these flags would have done."""
+        self.config = self.config.changed(settle_from_iter=begin, cooldown=cooldown, minutes=0.0)
+        self.optimizer.options = self.config.learn
 
     def warm_up(self) -> None:
         """Compile and load every kernel of a step, changing nothing."""

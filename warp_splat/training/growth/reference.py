@@ -84,7 +84,8 @@ class Reference:
 
     def grows(self, iterations: int) -> bool:
         """Whether a training of this length densifies."""
-        return min(iterations, self.options.densify_until_iter) > self.options.densify_from_iter
+        last, interval = min(iterations, self.options.densify_until_iter) - 1, self.options.densification_interval
+        return last // interval * interval > max(self.options.densify_from_iter, 0)
 
     def state(self) -> dict[str, torch.Tensor]:
         """Statistics since the last densification, [R, N] with a row for each process, and the random state."""

@@ -48,7 +48,7 @@ class PoseOptions:
     """Poses and lenses that are learned."""
 
     pose_lr: float = learning(0.0005, "rate of --parts pose at its start, in shares of the pictures' width")
-    pose_from_iter: int = learning(0, "step from which poses move")
+    pose_from_iter: int = learning(0, "step from which poses move", schedule=True)
     pose_reg: float = learning(0.1, "weight of the squared distance from the given poses and lenses in the loss")
     pose_intrinsics: str = learning("", "what of the lens --parts pose refines, too", choices=("", "focal", "all"))
 

@@ -1,0 +1,249 @@
+"""A training for a given time: plans against their own steps added up, ends by false clocks, the same bytes again."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from test_checkpoints import begin, state_of, steps
+from test_train import SCENE, fails
+
+from warp_splat.cli import main, parse
+from warp_splat.errors import InputError
+from warp_splat.flags import flags_of
+from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.formats.model_folder import ply_path
+from warp_splat.runtime.distributed import ALONE
+from warp_splat.training.deadline import Deadline, plan_training
+from warp_splat.training.options import LearnOptions, TrainConfig, schedule_of
+from warp_splat.training.plan import (
+    Cost,
+    Reached,
+    StepTime,
+    Task,
+    as_flags,
+    comparable,
+    of_length,
+    plan_for,
+    seconds_of,
+)
+from warp_splat.training.record import keep, restore
+
+TASK, COST = Task(500_000, 10_000, 200_000), Cost(0.004, 3e-7, 5e-8)
+FAST = parse(["train", "-s", "x", "--preset", "fast"])
+
+
+def test_costs_are_found_again():
+    places = [(10_000, 30_000), (10_000, 500_000), (200_000, 500_000)]
+    found = Cost.of([StepTime(n, p, COST.step + COST.gaussian * n + COST.pixel * p) for n, p in places])
+    assert vars(found) == pytest.approx(vars(COST))
+    seconds = (0.021, 0.02, 0.05)  # fewer pixels took longer
+    noisy = Cost.of([StepTime(*place, took) for place, took in zip(places, seconds, strict=True)])
+    assert min(vars(noisy).values()) >= 0
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 3.7])
+def test_seconds_are_those_of_the_steps_added_up(factor):
+    config = of_length(FAST, factor, TASK)
+    learn, expected = config.learn, 0.0
+    for step in range(1, learn.iterations + 1):
+        side = [4, 2, 1][min(2 * step // learn.coarse_until_iter, 2)]
+        share = min(step / (learn.iterations - learn.cooldown), 1.0)
+        gaussians = TASK.start + share * (config.grow.max_gaussians - TASK.start)
+        expected += COST.step + COST.gaussian * gaussians + COST.pixel * TASK.pixels / side**2
+    assert seconds_of(config, COST, TASK) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("minutes", [0.2, 1, 5, 60])
+def test_plans_take_their_time_and_keep_the_shape(minutes):
+    plan = plan_for(FAST, COST, 60.0 * minutes, TASK)
+    assert 0.99 * 60 * minutes < seconds_of(plan, COST, TASK) <= 60 * minutes
+    assert TASK.start <= plan.grow.max_gaussians <= TASK.most
+    factor = plan.learn.iterations / FAST.learn.iterations
+    before, after = schedule_of(FAST), schedule_of(plan)
+    for name, value in before.items():
+        assert after[name] == pytest.approx(factor * value, rel=2e-3, abs=1.0), name
+    others = {name for name, value in plan.flat().items() if value != FAST.flat()[name]}
+    assert others == {name for name in before if before[name]} | ({"max_gaussians"} if factor < 1 else set())
+
+
+def test_a_slower_machine_gets_fewer_steps_and_gaussians():
+    slow = Cost(*(10 * value for value in vars(COST).values()))
+    few, many = (plan_for(FAST, cost, 60.0, TASK) for cost in (slow, COST))
+    assert few.learn.iterations < many.learn.iterations / 4 and few.grow.max_gaussians < many.grow.max_gaussians
+
+
+def test_a_shape_without_a_cooldown_gets_one():
+    plan = plan_for(parse(["train", "-s", "x"]), COST, 60.0, TASK)
+    assert plan.learn.cooldown == pytest.approx(0.2 * plan.learn.iterations, abs=1)
+
+
+def test_flags_of_a_plan_are_the_plan():
+    plan = plan_for(FAST, COST, 60.0, TASK).changed(settle_from_iter=99)
+    again = parse(["train", "-s", "x", "--preset", "fast", *as_flags(plan).split()])
+    assert again == plan and again.learn.end == 99 + plan.learn.cooldown
+    assert "pose" not in as_flags(plan) and "--pose_from_iter 0" in as_flags(plan.changed(parts="pose"))
+
+
+def test_what_can_be_compared():
+    table = [Reached("desk", 480_000, 1.0, 1000, 30_000, 25.25), Reached("room", 5_000_000, 1.0, 1000, 30_000, 29.0)]
+    plan = FAST.changed(iterations=1200)
+    assert comparable(table, plan, TASK).startswith("Comparable trainings reached 25.2 dB (desk, 1000 steps) on held")
+    other = comparable(table, FAST.changed(iterations=1600), TASK)
+    assert other.startswith("Nothing comparable was measured for 0.50 megapixels and 1600 steps.")
+    assert "desk, 0.48 megapixels, 1000 steps: 25.2 dB; room, 5.00 megapixels" in other
+    assert comparable([], plan, TASK) == "No training was measured to compare this one with."
+
+
+def taken(learn: LearnOptions, pace, spent: float = 0.0) -> tuple[float, int, int]:
+    """Seconds at the end, the step before the cooldown and its length, where step k takes pace(k) seconds."""
+    deadline, iteration, end, settled = Deadline(learn), 0, np.inf, (0, 0)
+    while iteration < end:
+        iteration += 1
+        spent += pace(iteration)
+        if end == np.inf and (cooldown := deadline.due(iteration, spent)):
+            settled = (iteration, cooldown)
+            end = iteration + 1 + cooldown
+    return spent, *settled
+
+
+LEARN = plan_for(FAST, COST, 60.0, TASK).changed(minutes=1.0).learn
+PACES = {
+    "as planned": lambda k: 60.0 / LEARN.iterations,
+    "twice as fast": lambda k: 30.0 / LEARN.iterations,
+    "half as fast": lambda k: 120.0 / LEARN.iterations,
+    "slower as it grows": lambda k: 60.0 / LEARN.iterations * min(0.5 + 1.5 * k / LEARN.iterations, 1.5),
+    "half as fast from the middle": lambda k: 60.0 / LEARN.iterations * (1 + (k > LEARN.iterations / 2)),
+    "noisy": lambda k: 60.0 / LEARN.iterations * (0.5 + (k * 7919 % 101) / 100),
+}
+
+
+@pytest.mark.parametrize("name", PACES)
+def test_trainings_end_in_time(name):
+    seconds, begun, cooldown = taken(LEARN, PACES[name])
+    assert abs(seconds - 60) < 0.05 * 60
+    assert begun >= LEARN.coarse_until_iter and LEARN.cooldown // 4 <= cooldown <= LEARN.cooldown
+    if name in ("as planned", "twice as fast", "noisy"):
+        assert cooldown > 0.95 * LEARN.cooldown
+
+
+def test_the_full_size_and_a_cooldown_come_even_where_time_is_up():
+    seconds, begun, cooldown = taken(LEARN, lambda k: 600.0 / LEARN.iterations)
+    assert seconds > 60 and cooldown == LEARN.cooldown // 4
+    assert LEARN.coarse_until_iter <= begun <= LEARN.coarse_until_iter + 20
+
+
+def test_the_first_process_decides():
+    class Told(type(ALONE)):
+        rank = 1
+
+        def largest(self, value):
+            assert value == 0
+            return 7
+
+    assert Deadline(LEARN).due(LEARN.coarse_until_iter + 50, 1e9, Told()) == 7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("settled", [22, 55])
+def test_bytes_are_those_of_the_flags(settled, scene, tmp_path):
+    """Settled while the set grows, and beyond the planned end; a part's rates fall to the planned end."""
+    options = {"parts": "exposure", "cooldown": 12, "coarse": 2, "coarse_until_iter": 10, "densify_until_iter": 33}
+    trainer, run = begin(scene, tmp_path / "a", minutes=1.0, **options)
+    (tmp_path / "a").mkdir()
+    steps(trainer, run, settled - 5)
+    run.spent = 30.0
+    keep(trainer, run)
+    trainer, run = begin(scene, tmp_path / "a", minutes=1.0, **options)
+    restore(trainer, run, load_checkpoint(tmp_path / "a"))  # what is left of the time is kept
+    assert run.spent == 30.0 and trainer.config.learn.end == np.inf
+    steps(trainer, run, settled)
+    trainer.settle(settled + 1, 9)
+    assert trainer.config.learn.end == settled + 10 and trainer.config.learn.minutes == 0
+    steps(trainer, run, settled + 10)
+    found, facts = state_of(trainer, run)
+    trainer, run = begin(scene, tmp_path, settle_from_iter=settled + 1, **{**options, "cooldown": 9})
+    steps(trainer, run, settled + 10)
+    expected, others = state_of(trainer, run)
+    assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
+    assert {**facts, "options": 0} == {**others, "options": 0}
+
+
+def test_rates_fall_and_the_set_stays_once_settled(scene, tmp_path):
+    trainer, run = begin(scene, tmp_path, settle_from_iter=21, cooldown=10)
+    assert trainer.config.learn.end == 31
+    rates, sizes = [], []
+    for iteration in range(1, 32):
+        steps(trainer, run, iteration)
+        rates.append(trainer.optimizer._groups["opacities"]["lr"])
+        sizes.append(len(trainer.model))
+    assert rates[:21] == [trainer.config.learn.opacity_lr] * 21
+    np.testing.assert_allclose(rates[20:], trainer.config.learn.opacity_lr * 0.1 ** np.linspace(0, 1, 11))
+    assert len(set(sizes)) > 1 and len(set(sizes[20:])) == 1
+
+
+@pytest.mark.slow
+def test_a_whole_training_by_the_clock_is_repeated_by_its_options(tmp_path, capsys):
+    common = ["train", "-s", str(SCENE), "--eval", "-r", "4", "--densification_interval", "5"]
+    assert main([*common, "-m", str(tmp_path / "a"), "--minutes", "0.02"]) == 0
+    out = capsys.readouterr().out
+    assert "Plan for 0.02 minutes" in out and "ms a step with 4500 Gaussians" in out
+    options = tomllib.loads((tmp_path / "a" / "config.toml").read_text())
+    end = options["settle_from_iter"] + options["cooldown"]
+    assert options["minutes"] == 0 and options["preset"] == "fast" and f"Done after {end} iterations" in out
+    assert f"  flags     {as_flags(TrainConfig(**options))}" in out
+    config = ["--config", str(tmp_path / "a" / "config.toml")]
+    assert main(["train", *config, "-m", str(tmp_path / "b"), "--quiet"]) == 0
+    a, b = (ply_path(tmp_path / name, end).read_bytes() for name in "ab")
+    assert a == b
+    first, again = (json.loads((tmp_path / name / "history.json").read_text()) for name in "ab")
+    assert [{**record, "seconds": 0} for record in first] == [{**record, "seconds": 0} for record in again]
+
+
+def test_a_densification_has_to_fit(scene):
+    config = TrainConfig(device="cpu", minutes=1e-4)
+    with pytest.raises(InputError, match=r"^--minutes 0.0001: expected time for one densification .* found"):
+        plan_training(scene, config, ALONE, str)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--minutes 0", "--minutes: expected more than 0, got 0; leave it out to train by --iterations."),
+        ("--minutes -2", "--minutes: expected more than 0, got -2"),
+        ("--minutes nan", "--minutes: expected more than 0, got nan"),
+        ("--minutes inf", "--minutes: expected a finite number"),
+        ("--minutes 3 --iterations 100", "--minutes: expected no --iterations beside it, since it plans the steps"),
+        ("--minutes 3 --densify_until_iter 100", "--minutes: expected no --densify_until_iter beside it"),
+    ],
+)
+def test_what_cannot_be(flags, message, capsys):
+    assert message in fails(capsys, "train", *flags.split())
+
+
+def test_files_and_checkpoints(scene, tmp_path, capsys):
+    """A file's steps are a shape; its minutes want none beside them. A training that goes on keeps its minutes."""
+    file = tmp_path / "a.toml"
+    file.write_text("minutes = 3\niterations = 5\n")
+    assert "expected no --iterations beside it" in fails(capsys, "train", "--config", str(file))
+    file.write_text("settle_from_iter = 3\niterations = 500\n")
+    config = parse(["train", "-s", "x", "--config", str(file), "--minutes", "2"])
+    assert config.learn.end == 1003 and config.data.preset == "fast" and config.learn.iterations == 500
+    assert plan_for(config, COST, 120.0, TASK).learn.settle_from_iter == 0
+    assert parse(["train", "--config", str(file), "--iterations", "8"]).learn.end == 8
+    trainer, run = begin(scene, tmp_path, minutes=2.0)
+    keep(trainer, run)
+    resume = ["train", "--resume", str(tmp_path)]
+    assert parse(resume).learn.end == parse([*resume, "--minutes", "4"]).learn.end == np.inf
+    assert parse([*resume, "--iterations", "70"]).learn.end == 70
+    trainer.settle(20, 5)
+    keep(trainer, run)
+    assert parse(resume).learn.end == 25
+    assert "expected a training that began with it" in fails(capsys, *resume, "--minutes", "4")
+
+
+def test_schedules_are_marked():
+    marked = {item.name for item in flags_of(TrainConfig) if item.metadata["schedule"]}
+    assert marked == {name for name in TrainConfig().flat() if name.endswith("_iter")} | {
+        *("iterations", "position_lr_max_steps", "cooldown", "sh_interval", "opacity_reset_interval")
+    }

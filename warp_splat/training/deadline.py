@@ -1,0 +1,132 @@
+"""A training that ends in time: the machine is measured before the first step, and a clock is asked after each."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from warp_splat.errors import InputError
+from warp_splat.runtime.distributed import ALONE, Processes
+from warp_splat.scene.types import Scene
+from warp_splat.training.memory import expected_gaussians
+from warp_splat.training.options import LearnOptions, TrainConfig
+from warp_splat.training.plan import Cost, Reached, StepTime, Task, as_flags, comparable, plan_for, seconds_of
+from warp_splat.training.trainer import Trainer
+
+REACHED = Path(__file__).with_name("reached.json")  # what benchmarks/minutes.py measured
+REPEATS = 5  # steps of which one is timed: their median
+WINDOW = 20  # parts of a training: as far back as the pace is looked at, which is from one evaluation to the next
+FEWEST = 10  # steps by which a pace is known
+KEPT = 4  # a cooldown is never shorter than one part in so many of the planned one
+
+
+class Deadline:
+    """Whether to settle now, so that the last step of the cooldown ends in time.
+
+    It sees seconds and no clock. Only what is still to come may change: :attr:`LearnOptions.settle_from_iter`, and the
+    length of the cooldown. So a training with these flags from its beginning makes the same bytes.
+
+    Args:
+        learn: as planned.
+        count: images in a step.
+    """
+
+    def __init__(self, learn: LearnOptions, count: int = 1):
+        self.seconds, self.cooldown = 60.0 * learn.minutes, learn.cooldown
+        self.full_size = learn.coarse_until_iter if learn.coarse > 1 else 0
+        self.past: deque[tuple[int, float]] = deque(maxlen=max(learn.iterations // (WINDOW * count), FEWEST))
+        self.near = math.inf  # the step since which the end is near by each pace that was seen
+
+    def due(self, iteration: int, spent: float, processes: Processes = ALONE) -> int:
+        """The steps of a cooldown that begins now; 0: not yet. All processes call it; the first one's clock counts.
+
+        Args:
+            iteration: the last one that was done.
+            spent: seconds since the first step.
+            processes: those that train together.
+        """
+        steps = 0
+        if iteration >= self.full_size:
+            self.past.append((iteration, spent))
+            first, then = self.past[0]
+            left = (self.seconds - spent) * (iteration - first) / max(spent - then, 1e-9)
+            if left > self.cooldown + iteration - first:
+                self.near = math.inf
+            elif len(self.past) == self.past.maxlen:
+                self.near = min(self.near, iteration)
+            # in time, by a pace that has been the same for a while; late, by the few steps there are
+            late = left <= self.cooldown / 2 and len(self.past) >= FEWEST
+            if late or (left <= self.cooldown and first >= self.near):
+                steps = max(round(left), self.cooldown // KEPT, 1)
+        return processes.largest(steps if processes.rank == 0 else 0)
+
+
+def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: Callable[[str], None]) -> TrainConfig:
+    """The options that a training of ``config.learn.minutes`` begins with: measured, planned, and told.
+
+    Raises:
+        InputError: if there is too little time for one change of the set of Gaussians.
+    """
+    minutes = config.learn.minutes
+    say("Measuring this machine (kernels are compiled first, once on a machine, about 40 s) ...")
+    trial = Trainer(scene, config.changed(settle_from_iter=1, minutes=0.0), processes)  # its set stays as it is
+    trial.warm_up()
+    camera, start = scene.train[0].camera, len(trial.model)
+    pixels = camera.width * camera.height
+    task = Task(pixels, start, config.grow.max_gaussians or expected_gaussians(start, pixels)[0])
+    measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
+    for row in measured:
+        say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")
+    cost = Cost.of(measured)
+    plan = plan_for(config, cost, 60.0 * minutes, task)
+    say(f"Plan for {minutes:g} minutes ({seconds_of(plan, cost, task):.0f} s by these figures): {as_flags(plan)}")
+    if trial.growth.grows(config.learn.iterations):
+        steps = plan.learn.iterations
+        if not Trainer(scene, plan, processes).growth.grows(steps - plan.learn.cooldown):
+            raise InputError(
+                f"--minutes {minutes:g}: expected time for one densification at least, found time for {steps} steps "
+                "before the end; give more, or smaller images (-r)."
+            )
+    table = [Reached(**entry) for entry in json.loads(REACHED.read_text())] if REACHED.is_file() else []
+    say(comparable(table, plan, task))
+    return plan
+
+
+def _measured(trial: Trainer, task: Task) -> list[StepTime]:
+    """Steps of the smallest size and the full one, and of as many Gaussians as there may be."""
+    found, end = [], trial.config.learn.iterations
+    for iteration in (1, end):
+        found.append(_of_step(trial, iteration))
+    if task.most > task.start:
+        _multiply(trial, task.most)
+        found.append(_of_step(trial, end))
+    return found
+
+
+def _of_step(trial: Trainer, iteration: int) -> StepTime:
+    """Of the size and the degree that an iteration has."""
+    seconds = []
+    for _ in range(1 + REPEATS):  # the first one brings memory and photographs
+        begun = time.perf_counter()
+        trial.differentiate(iteration).item()  # waits for a GPU
+        trial.update(iteration)
+        seconds.append(time.perf_counter() - begun)
+    camera, _ = trial.photographs.at_size(trial.scene.train[0], iteration)
+    return StepTime(len(trial.model), camera.width * camera.height, statistics.median(seconds[1:]))
+
+
+def _multiply(trial: Trainer, count: int) -> None:
+    """Copies of the Gaussians, smaller, so that together they cover as much as before: what growth makes of them."""
+    present = len(trial.model)
+    raw = {name: tensor.detach() for name, tensor in trial.model.parameters.items()}
+    raw["scales"].sub_(0.5 * torch.log(torch.tensor(count / present)).item())
+    rows = torch.arange(count - present, device=trial.device) % present
+    everything = torch.arange(present, device=trial.device)
+    trial.optimizer.replace(everything, {name: tensor[rows] for name, tensor in raw.items()})

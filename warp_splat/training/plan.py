@@ -1,0 +1,135 @@
+"""From minutes to steps, sizes and Gaussians: arithmetic alone, on what was measured elsewhere.
+
+The options of a training are the shape of a schedule: a plan stretches or shrinks all its steps by one factor, until
+what they cost adds up to the time. Below the shape's own length there are also fewer Gaussians, by the square root of
+that factor. A clock decides on the end itself (:mod:`warp_splat.training.deadline`), so that a plan has to be good, but
+not exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from warp_splat.flags import flags_of
+from warp_splat.training.options import TrainConfig, schedule_of
+
+COOLDOWN = 0.2  # share of the steps, where the shape has none: the end needs a beginning
+SHORTEST, LONGEST = 1e-4, 1e4  # times the shape
+SAMPLES = 1000  # steps whose costs are added up
+LIKE = 1.5  # factor between the steps and between the pixels of two trainings, up to which they are comparable
+
+
+class StepTime(NamedTuple):
+    """What a step takes."""
+
+    gaussians: int
+    pixels: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds of a step: a part of its own, one of each Gaussian, and one of each pixel."""
+
+    step: float
+    gaussian: float
+    pixel: float
+
+    @classmethod
+    def of(cls, measured: Sequence[StepTime]) -> Cost:
+        """The costs, none negative, with the least squared error relative to each measurement."""
+        rows = np.array([(1.0, m.gaussians, m.pixels, m.seconds) for m in measured], dtype=np.float64)
+        size = rows[:, :3].max(0)  # so that the columns are of one order
+        weighted = rows / rows[:, 3:]
+        found = nnls(weighted[:, :3] / size, np.ones(len(rows)))[0] / size
+        return cls(*found.tolist())
+
+
+class Task(NamedTuple):
+    """What of a scene a plan depends on."""
+
+    pixels: int  # of a photograph at its full size
+    start: int  # Gaussians at the start
+    most: int  # Gaussians that the shape is made for
+
+
+def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:
+    """What a training takes by the costs of its steps; Gaussians are added evenly until the cooldown."""
+    learn = config.learn
+    steps = (np.arange(SAMPLES) + 0.5) * learn.iterations / SAMPLES
+    doublings = (learn.coarse.bit_length() - 1) * steps // learn.coarse_until_iter
+    sides = np.minimum(2.0**doublings / learn.coarse, 1.0)
+    grown = np.minimum(steps / max(learn.iterations - learn.cooldown, 1), 1.0)
+    most = max(config.grow.max_gaussians or task.most, task.start)
+    gaussians = task.start + grown * (most - task.start)
+    each = cost.step + cost.gaussian * gaussians + cost.pixel * task.pixels * sides**2
+    return float(each.mean()) * learn.iterations
+
+
+def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
+    """The same shape over ``factor`` times as many steps, with a cooldown."""
+    least = {item.name: max(item.metadata["least"], 1) for item in flags_of(TrainConfig) if item.metadata["schedule"]}
+    steps = schedule_of(config)
+    steps["cooldown"] = steps["cooldown"] or round(COOLDOWN * steps["iterations"])
+    steps = {name: max(round(factor * value), least[name]) if value > 0 else value for name, value in steps.items()}
+    most = max(round(task.most * min(factor, 1.0) ** 0.5), task.start)
+    return config.changed(**steps | {"settle_from_iter": 0}, max_gaussians=most)  # the clock says when to settle
+
+
+def plan_for(config: TrainConfig, cost: Cost, seconds: float, task: Task) -> TrainConfig:
+    """The shape ``config`` over as many steps as fit into ``seconds``, and one at least."""
+    low, high = np.log(SHORTEST), np.log(LONGEST)
+    for _ in range(40):
+        middle = (low + high) / 2
+        if seconds_of(of_length(config, float(np.exp(middle)), task), cost, task) <= seconds:
+            low = middle
+        else:
+            high = middle
+    return of_length(config, float(np.exp(low)), task)
+
+
+def as_flags(config: TrainConfig) -> str:
+    """The schedule as flags of the command line; those of growths and parts that are at work."""
+    used = {config.grow.growth, *config.model.parts.split(",")}
+    idle = {name for group, options in config.plugins.items() if group not in used for name in vars(options)}
+    idle -= {name for group in used if group in config.plugins for name in vars(config.plugins[group])}
+    if not config.learn.settle_from_iter:
+        idle.add("settle_from_iter")
+    shown = {name: value for name, value in schedule_of(config).items() if name not in idle}
+    shown |= {"coarse": config.learn.coarse, "max_gaussians": config.grow.max_gaussians}
+    return " ".join(f"--{name} {value}" for name, value in shown.items())
+
+
+class Reached(NamedTuple):
+    """What a training reached, as benchmarks/minutes.py noted it."""
+
+    scene: str
+    pixels: int
+    minutes: float
+    iterations: int
+    gaussians: int
+    psnr: float
+
+
+def comparable(table: Sequence[Reached], config: TrainConfig, task: Task) -> str:
+    """A sentence: what scenes of about this size reached by about as many steps, or what the table has else."""
+    steps = config.learn.iterations
+    if not table:
+        return "No training was measured to compare this one with."
+    near = [
+        entry
+        for entry in table
+        if max(entry.pixels, task.pixels) <= LIKE * min(entry.pixels, task.pixels)
+        and max(entry.iterations, steps) <= LIKE * min(entry.iterations, steps)
+    ]
+    if near:
+        told = (f"{entry.psnr:.1f} dB ({entry.scene}, {entry.iterations} steps)" for entry in near)
+        return f"Comparable trainings reached {', '.join(told)} on held-out views; another scene is another matter."
+    told = (f"{e.scene}, {e.pixels / 1e6:.2f} megapixels, {e.iterations} steps: {e.psnr:.1f} dB" for e in table)
+    here = f"{task.pixels / 1e6:.2f} megapixels and {steps} steps"
+    return f"Nothing comparable was measured for {here}. There is: {'; '.join(told)}."
