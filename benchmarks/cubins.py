@@ -44,8 +44,8 @@ PROPERTIES = re.compile(r"Function (\S+):\s+REG:(\d+) STACK:(\d+) SHARED:(\d+)")
 def modules() -> dict[str, wp.Module]:
     """What runs on CUDA, by the name under which it is listed."""
     found = {
-        "project": make_project(affine.PROJECTION, reach_of, 1).module,
-        "project, ellipsoid": make_project(ellipsoid.PROJECTION, reach_of, 1).module,
+        "project": make_project(affine.PROJECTION, reach_of, 1, None).module,
+        "project, ellipsoid": make_project(ellipsoid.PROJECTION, reach_of, 1, None).module,
         "adjoint of pose": adj_camera.make_adj_pose(1).module,
         "adjoint of intrinsics": adj_camera.make_adj_intrinsics(1).module,
         "shade": sh_colors.make_shade(1).module,

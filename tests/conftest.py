@@ -49,7 +49,7 @@ def pytest_sessionstart():
     if worker := os.environ.get("PYTEST_XDIST_WORKER"):
         options, variant = RasterOptions(), variant_of(RasterOptions())
         projections = [
-            make_project(projection_of(RasterOptions(projection=name)), falloff_of(options).reach_of, LANES)
+            make_project(projection_of(RasterOptions(projection=name)), falloff_of(options).reach_of, LANES, None)
             for name in ("affine", "ellipsoid")
         ]
         blends = [make_blend(variant), make_adj_shade(LANES), make_reverse("manual", variant)]

@@ -16,6 +16,7 @@ _HOMES = {
     "Lens": "lenses",
     "RasterOptions": "config",
     "RenderOutput": "raster.api",
+    "Shutter": "lenses.shutter",
     "check_gradients": "raster.gradcheck",
     "get_threads": "runtime.pool",
     "load_scene": "scene",
@@ -31,6 +32,7 @@ __all__ = [
     "Lens",
     "RasterOptions",
     "RenderOutput",
+    "Shutter",
     "check_gradients",
     "get_threads",
     "load_scene",
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
     from warp_splat.errors import InputError
     from warp_splat.kernels.falloff import Falloff
     from warp_splat.lenses import Lens
+    from warp_splat.lenses.shutter import Shutter
     from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
     from warp_splat.raster.camera_parameters import CameraParameters
     from warp_splat.raster.gradcheck import check_gradients

@@ -9,6 +9,9 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.lenses import Lens, angle_of_view, check_picture
+from warp_splat.lenses.shutter import Shutter, rotation_vector
+
+MOST_SHARE = 0.5  # of its height by which a picture may move up or down while it is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +28,12 @@ class Camera:
         rotation: rotation part of camera_from_world, [3, 3], orthonormal with determinant +1.
         translation: translation part of camera_from_world, [3], world units.
         lens: its distortion, a :class:`warp_splat.Lens`; None: a pinhole's, which has none.
+        shutter: how it moves while its rows are read, a :class:`warp_splat.Shutter`; rotation and translation are then
+            those of the middle. None: it stands still.
 
     Raises:
-        InputError: if a value is missing its shape, not finite, or out of range, or the lens folds inside the picture.
+        InputError: if a value is missing its shape, not finite, or out of range, the lens folds inside the picture, or
+            the shutter moves the picture by more than half its height.
     """
 
     width: int
@@ -39,6 +45,7 @@ class Camera:
     rotation: np.ndarray
     translation: np.ndarray
     lens: Lens | None = None
+    shutter: Shutter | None = None
 
     def __post_init__(self):
         for name in ("width", "height"):
@@ -72,6 +79,44 @@ class Camera:
             if not isinstance(self.lens, Lens):
                 raise InputError(f"Camera lens: expected a warp_splat.Lens or None, got {self.lens!r:.80}.")
             check_picture(self.lens, *self._picture)
+        if self.shutter is not None:
+            if not isinstance(self.shutter, Shutter):
+                raise InputError(f"Camera shutter: expected a warp_splat.Shutter or None, got {self.shutter!r:.80}.")
+            share = abs(self.shutter.turn[0]) * self.fy / self.height
+            if share > MOST_SHARE:
+                raise InputError(
+                    "Camera shutter: expected a turn that moves the picture up or down by at most half of its "
+                    f"height while it is read, got {share:.2f}; check fy and the poses."
+                )
+
+    @classmethod
+    def rolling(cls, first: Camera, last: Camera) -> Camera:
+        """``first`` with a rolling shutter: from its pose, when its first row is read, to that of ``last``.
+
+        The center moves on a line at one speed, the rotation about one axis (:class:`warp_splat.Shutter`).
+
+        Raises:
+            InputError: if it turns by more than a radian, or moves the picture by more than half its height.
+        """
+        turned = last.rotation @ first.rotation.T
+        cosine = 0.5 * (np.trace(turned) - 1)
+        if cosine < 0:
+            raise InputError(
+                "Camera.rolling: expected a turn of at most 1 rad from the first row to the last, got "
+                f"{math.acos(max(cosine, -1)):.3g}; check the poses."
+            )
+        turn = tuple(rotation_vector(turned))
+        rotation, _ = Shutter(turn).moved(0.5, first.rotation, first.translation)
+        shift, center = rotation @ (last.center - first.center), 0.5 * (first.center + last.center)
+        shutter = Shutter(turn, tuple(shift))
+        return replace(first, rotation=rotation, translation=-rotation @ center, shutter=shutter)
+
+    def at(self, row: float) -> Camera:
+        """The camera that stands still where this one is when the middle of ``row`` is read, from 0 to height - 1."""
+        if self.shutter is None:
+            return self
+        pose = self.shutter.moved((row + 0.5) / self.height - 0.5, self.rotation, self.translation)
+        return replace(self, rotation=pose[0], translation=pose[1], shutter=None)
 
     @property
     def center(self) -> np.ndarray:

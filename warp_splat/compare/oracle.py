@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warp_splat.compare import exact_lenses
+from warp_splat.compare import exact_lenses, exact_shutter
 
 BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.2  # Gaussians nearer than this are culled
@@ -145,18 +145,21 @@ def _double(value):
 def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
     """Gaussians as the camera sees them. Its numbers may be tensors that want gradients."""
     world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
-    points = means @ world_to_camera.T + translation
+    points, seen = means @ world_to_camera.T + translation, world_to_camera
+    if getattr(camera, "shutter", None):
+        points, along = exact_shutter.exposed(points, camera)
+        seen = along @ world_to_camera
     depth, live = exact_lenses.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
     live = live & (depth > NEAR) & (quats.norm(dim=1) > 0)
     points = torch.where(live[:, None], points, points.new_tensor([0.3, 0, 1]))  # no division by zero, no gradient
     x, y, z = points.unbind(1)
 
-    sigma = world_to_camera @ covariances(quats, scales) @ world_to_camera.T
+    sigma = seen @ covariances(quats, scales) @ seen.mT
     if projection == "ellipsoid":
         live = live & (z**2 > OUTLINE_REACH**2 * sigma[:, 2, 2])
         means2d, sharp = outlines(points, sigma, live, camera)
     elif projection == "unscented":
-        axes = world_to_camera @ rotation_matrices(quats) * scales[:, None]
+        axes = seen @ rotation_matrices(quats) * scales[:, None]
         means2d, sharp = exact_lenses.unscented(points, axes, camera)
     elif camera.lens:
         means2d, to_pixels = exact_lenses.seen(points, camera)

@@ -85,8 +85,8 @@ def rasterize(
         opacities: [N], in 0..1.
         sh: spherical-harmonics coefficients, [N, K, 3] with K = 1, 4, 9 or 16; or the pair ([N, 1, 3], [N, K-1, 3])
             as trainers keep them, which saves a copy. Color = max(0, 0.5 + sum of coefficients times basis).
-        camera: world to camera in COLMAP's axes, with or without a lens; :class:`CameraParameters`, if it wants
-            gradients.
+        camera: world to camera in COLMAP's axes, with or without a lens or a rolling shutter;
+            :class:`CameraParameters`, if it wants gradients.
         background: RGB behind everything; a tensor [3] receives a gradient.
         adjoint: how the pixel loop is differentiated; one image, one gradient up to rounding. "manual": by hand.
             "stepwise": reverse loop by hand, its body by Warp. "reversible": the whole loop by Warp, transmittance

@@ -15,11 +15,11 @@ from warp_splat.errors import InputError
 from warp_splat.kernels.project.adj_camera import make_adj_intrinsics, make_adj_pose
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import Types
+from warp_splat.lenses.shutter import cross, rotated
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.runtime.launch import lanes_of, launch_in_lanes, view
 from warp_splat.runtime.sums import in_pairs
 
-TERMS = 16  # of the power series: up to half a turn to the last bit, a whole turn to 3e-11
 LONGEST = 2.0 * math.pi  # rotation vector; a longer one says what a shorter one does
 
 
@@ -44,6 +44,8 @@ class CameraParameters:
     def __init__(self, base: Camera, twist: torch.Tensor | None = None, intrinsics: torch.Tensor | None = None):
         if not isinstance(base, Camera):
             raise InputError(f"base: expected a warp_splat.Camera, got {type(base).__name__}.")
+        if base.shutter is not None:
+            raise InputError("base: expected a camera without a rolling shutter, whose motion is not learned.")
         self.base = base
         self.twist = _checked("twist", twist, [0.0] * 6)
         self.intrinsics = _checked("intrinsics", intrinsics, [base.fx, base.fy, base.cx, base.cy])
@@ -61,7 +63,7 @@ class CameraParameters:
                 "twist: expected finite numbers, of which the rotation vector is at most 2 pi long, got "
                 f"{twist.tolist()}; turn the base camera instead."
             )
-        pose = _turned(np.concatenate([self.base.rotation, self.base.translation[:, None]], 1), twist[:3, None], 1)
+        pose = rotated(np.concatenate([self.base.rotation, self.base.translation[:, None]], 1), twist[:3, None], 1)
         fx, fy, cx, cy = _numbers(self.intrinsics)
         return replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, rotation=pose[:, :3], translation=pose[:, 3] + twist[3:])
 
@@ -99,7 +101,7 @@ def twist_gradient(
     turn, shift = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
     turn, shift = (part[0] + part[1] + part[2] for part in (turn, shift))
     now = _numbers(twist)
-    turn = _turned(turn - _cross(now[3:], shift), -now[:3], 2)  # by the left Jacobian of the rotation, transposed
+    turn = rotated(turn - cross(now[3:], shift), -now[:3], 2)  # by the left Jacobian of the rotation, transposed
     return torch.tensor(np.concatenate([turn, shift])).to(twist)
 
 
@@ -141,29 +143,6 @@ def _sums(
 
     launch_in_lanes(make, lanes, count, with_output, like.device)
     return in_pairs(sums).cpu().numpy()
-
-
-def _turned(vectors: np.ndarray, axis: np.ndarray, order: int) -> np.ndarray:
-    """Vectors [3] or columns [3, M] turned by a rotation vector (``order`` 1), or the mean while it turns them (2)."""
-    across = _cross(axis, vectors)
-    x, y, z = axis.ravel().tolist()
-    square = x * x + y * y + z * z
-    return vectors + _series(square, order) * across + _series(square, order + 1) * _cross(axis, across)
-
-
-def _series(square: float, order: int) -> float:
-    """Sum of (-square)^k / (2 k + order)!: of angle^2, sin(angle) / angle for 1, (1 - cos(angle)) / angle^2 for 2.
-
-    Smooth at 0, and the same on every processor, unlike the library's sine.
-    """
-    value = 0.0
-    for k in reversed(range(TERMS)):
-        value = 1.0 / math.factorial(2 * k + order) - square * value
-    return value
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.roll(a, -1, 0) * np.roll(b, -2, 0) - np.roll(a, -2, 0) * np.roll(b, -1, 0)
 
 
 def _numbers(tensor: torch.Tensor) -> np.ndarray:

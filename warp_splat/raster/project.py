@@ -26,6 +26,7 @@ from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
+from warp_splat.raster.moving import exposed_by, motion_of, with_motion
 from warp_splat.runtime.launch import launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
@@ -52,7 +53,7 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
     cam.antialiasing = int(options.antialiasing)
     cam.alpha_min = options.alpha_min
-    if camera.lens or options.projection == "unscented":
+    if camera.lens or camera.shutter or options.projection == "unscented":
         numbers = camera.lens.numbers if camera.lens else ()
         cam.lens = vec16(*numbers, *[0.0] * (LIMIT - len(numbers)), lens_limit(limits))
     return cam
@@ -95,7 +96,8 @@ def project(
         learned, limits, camera = (camera.twist, camera.intrinsics), camera.base, camera.camera
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     driver = driver or driver_of(gaussians.means.device)
-    kernel = make_project(projection_of(options, camera.lens), falloff_of(options).reach_of, driver.lanes)
+    projection, reach_of = projection_of(options, camera.lens), falloff_of(options).reach_of
+    kernel = make_project(projection, reach_of, driver.lanes, exposed_by(camera, options, driver.lanes))
     return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, driver, dropped or Dropped()))
 
 
@@ -103,6 +105,7 @@ def _project_geometry(
     cam: CameraView,
     kernel: wp.Kernel,
     lanes: int,
+    motion: np.ndarray | None,
     inputs: Sequence[torch.Tensor],
     outputs: Sequence[torch.Tensor],
     adj_inputs: Sequence[torch.Tensor] = (),
@@ -116,6 +119,7 @@ def _project_geometry(
         cam: camera.
         kernel: of the projection.
         lanes: Gaussians that a kernel takes at once.
+        motion: of the camera, if it has a rolling shutter.
         inputs: means, quats, scales, opacities.
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
         adj_inputs: of all inputs.
@@ -124,10 +128,10 @@ def _project_geometry(
     count = len(outputs[-1])
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
-    _project_groups(kernel, cam, lanes, *([tensor[:whole] for tensor in table] for table in tables))
+    _project_groups(kernel, cam, lanes, motion, *([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
         last = [[_filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
-        _project_groups(kernel, cam, lanes, *last)
+        _project_groups(kernel, cam, lanes, motion, *last)
         for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
             tensor[whole:] = group[: count - whole]
 
@@ -138,7 +142,7 @@ def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     return full
 
 
-def _project_groups(kernel, cam, lanes, inputs, outputs, adj_inputs, adj_outputs) -> None:
+def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj_outputs) -> None:
     """See :func:`_project_geometry`; N is a multiple of ``lanes``."""
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
@@ -146,14 +150,22 @@ def _project_groups(kernel, cam, lanes, inputs, outputs, adj_inputs, adj_outputs
     def in_groups(tensors, types):
         sizes = [wp.types.type_size_in_bytes(dtype) // 4 for dtype in types]
         shapes = [(-1, size) if size > 1 else (-1,) for size in sizes]
-        return [view(t.view(shape), dtype) for t, shape, dtype in zip(tensors, shapes, types, strict=False)]
+        rows = [t if t.dim() == 3 else t.view(shape) for t, shape in zip(tensors, shapes, strict=False)]
+        return [view(row, dtype) for row, dtype in zip(rows, types, strict=False)]
 
+    adj_quats = adj_inputs[1] if adj_inputs else None
+    if motion is not None:
+        inputs = [inputs[0], with_motion(inputs[1], motion, lanes), *inputs[2:]]
+    if motion is not None and adj_inputs:
+        adj_inputs = [adj_inputs[0], with_motion(adj_inputs[1], 0.0, lanes), *adj_inputs[2:]]
     adjoint = {}
     if adj_inputs:
         adj_in, adj_out = in_groups(adj_inputs, types_in), in_groups(adj_outputs[:4], types_out)
         adjoint = {"adj_inputs": [cam, *adj_in], "adj_outputs": [*adj_out, None, None]}
     given, found = [cam, *in_groups(inputs, types_in)], in_groups(outputs, types_out)
     _launch_groups(kernel, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
+    if motion is not None and adj_inputs:
+        adj_quats.copy_(adj_inputs[1][:, 0].reshape_as(adj_quats))
 
 
 def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
@@ -187,7 +199,7 @@ class Project(torch.autograd.Function):
         )
         set_all(0, *splats[:-1])
         set_all(int(UNSEEN), splats.radii)
-        _project_geometry(cam, kernel, lanes, _shapes(gaussians), _geometry(splats))
+        _project_geometry(cam, kernel, lanes, motion_of(camera), _shapes(gaussians), _geometry(splats))
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
         ctx.save_for_backward(*gaussians, *splats, twist, intrinsics)
@@ -218,7 +230,8 @@ class Project(torch.autograd.Function):
             adj_placed = torch.zeros_like(adj_means) if wants_twist else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
             adj_inputs = _shapes(adj._replace(means=adj_placed))
-            _project_geometry(ctx.cam, ctx.kernel, lanes, _shapes(given), outputs, adj_inputs, adj_outputs)
+            motion = motion_of(ctx.camera)
+            _project_geometry(ctx.cam, ctx.kernel, lanes, motion, _shapes(given), outputs, adj_inputs, adj_outputs)
             adj_twist = adj_intrinsics = None
             if wants_twist:
                 adj_means += adj_placed

@@ -45,6 +45,20 @@ def through(family: Family) -> Projection:
 
 def image_of(notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True) -> tuple:
     """Where a point of the camera is seen [px], the derivative of that [2][3] if asked for, and whether it is seen."""
+    places, excess, seen = bent(notes, family, x, y, z, linear)
+    found, slopes = [], []
+    for axis, place in enumerate(places):
+        focal, middle = (notes.given(f"camera.{name}[{axis}]") for name in ("focal", "principal"))
+        slopes.append([focal * Number(notes, slope) for slope in place.slopes])
+        found.append(focal * (Number(notes, place.name) * excess) + middle)
+    return found, slopes, seen
+
+
+def bent(notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True) -> tuple:
+    """What the lens makes of a point that it follows, and its slopes if asked for; how much farther out the point is.
+
+    And whether it is seen.
+    """
     limit, one = notes.given(f"camera.lens[{LIMIT}]"), notes.given("1.0")
     seen, excess = one, one
     if family.wide:
@@ -59,12 +73,7 @@ def image_of(notes: Notes, family: Family, x: Number, y: Number, z: Number, line
         Number(notes, number.name, _unit(axis, one.name) if linear else ()) for axis, number in enumerate((x, y, z))
     ]
     coefficients = [notes.given(f"camera.lens[{index}]") for index in range(family.count)]
-    found, slopes = [], []
-    for axis, place in enumerate(family.formula(coefficients, *variables)):
-        focal, middle = (notes.given(f"camera.{name}[{axis}]") for name in ("focal", "principal"))
-        slopes.append([focal * Number(notes, slope) for slope in place.slopes])
-        found.append(focal * (Number(notes, place.name) * excess) + middle)
-    return found, slopes, seen
+    return family.formula(coefficients, *variables), excess, seen
 
 
 def _unit(axis: int, one: str | None) -> tuple[str | None, ...]:

@@ -27,6 +27,7 @@ from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
+from warp_splat.kernels.project.pieces import make_pieces
 from warp_splat.kernels.simd import (
     LANES,
     TYPES,
@@ -39,7 +40,6 @@ from warp_splat.kernels.simd import (
     pick,
     real,
     root,
-    rounded_down,
     rounded_up,
     some,
     times,
@@ -47,93 +47,32 @@ from warp_splat.kernels.simd import (
     whole,
 )
 
-# of a quaternion's largest entry; beyond, a power of two comes first, so that squares neither vanish nor overflow
-SMALL, ENLARGED = wp.constant(2.0**-30), wp.constant(2.0**90)
-LARGE, REDUCED = wp.constant(2.0**30), wp.constant(2.0**-70)
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
 INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
 
 
 @functools.cache
-def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> wp.Kernel:
+def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expose: wp.Function | None) -> wp.Kernel:
     """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU.
 
-    ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`).
+    ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`). ``expose``: the camera moves while
+    its rows are read (:mod:`.rolling`).
     """
     number, integer, row2, row3, row4 = TYPES[lanes]
     lens, outline = projection.functions(lanes)
+    pieces = make_pieces(lanes)
+    largest, all_finite, rotation, taken_along, covariance, covers_pixel, offset, turned_or_not, sized_or_one = pieces
 
     @wp.func
-    def largest(a: number, b: number, c: number, d: number):
-        """The largest magnitude, without a gradient: it chooses a factor that normalization takes out again."""
-        return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
-
-    @wp.func_grad(largest)
-    def adj_largest(a: number, b: number, c: number, d: number, adj_ret: number):
-        pass
+    def quat_of(turns: wp.array[row4], g: int):
+        w, x, y, z = columns(turns[g])
+        return w, x, y, z
 
     @wp.func
-    def all_finite(
-        mx: number,
-        my: number,
-        mz: number,
-        qw: number,
-        qx: number,
-        qy: number,
-        qz: number,
-        sx: number,
-        sy: number,
-        sz: number,
-        opacity: number,
-    ):
-        """Mask: 0 times what is not finite is NaN; wp.isfinite is a call per number on the CPU."""
-        none = fill(0.0, opacity)
-        nought = fma(mx, none, fma(my, none, fma(mz, none, times(opacity, none))))
-        nought = fma(qw, none, fma(qx, none, fma(qy, none, fma(qz, none, nought))))
-        return equal(fma(sx, none, fma(sy, none, fma(sz, none, nought))), none)
-
-    @wp.func
-    def rotation(qw: number, qx: number, qy: number, qz: number, size: number):
-        """The matrix of a quaternion whose largest entry is ``size``, row by row."""
-        one = fill(1.0, size)
-        two = fill(2.0, size)
-        small = less(size, fill(SMALL, size))
-        large = less(fill(LARGE, size), size)
-        scale = pick(small, fill(ENLARGED, size), pick(large, fill(REDUCED, size), one))
-        w = times(qw, scale)
-        x = times(qx, scale)
-        y = times(qy, scale)
-        z = times(qz, scale)
-        per_norm = inverse(root(fma(w, w, fma(x, x, fma(y, y, times(z, z))))))
-        w = times(w, per_norm)
-        x = times(x, per_norm)
-        y = times(y, per_norm)
-        z = times(z, per_norm)
-        return (
-            one - times(two, fma(y, y, times(z, z))),
-            times(two, times(x, y) - times(w, z)),
-            times(two, fma(x, z, times(w, y))),
-            times(two, fma(x, y, times(w, z))),
-            one - times(two, fma(x, x, times(z, z))),
-            times(two, times(y, z) - times(w, x)),
-            times(two, times(x, z) - times(w, y)),
-            times(two, fma(y, z, times(w, x))),
-            one - times(two, fma(x, x, times(y, y))),
-        )
-
-    @wp.func
-    def covariance(a10: number, a11: number, a12: number, a20: number, a21: number, a22: number):
-        """A A', and its determinant as a sum of squares."""
-        c0 = times(a11, a22) - times(a12, a21)
-        c1 = times(a12, a20) - times(a10, a22)
-        c2 = times(a10, a21) - times(a11, a20)
-        return (
-            fma(a10, a10, fma(a11, a11, times(a12, a12))),
-            fma(a10, a20, fma(a11, a21, times(a12, a22))),
-            fma(a20, a20, fma(a21, a21, times(a22, a22))),
-            fma(c0, c0, fma(c1, c1, times(c2, c2))),
-        )
+    def quat_before_motion(turns: wp.array2d[row4], g: int):
+        w, x, y, z = columns(turns[g, 0])
+        return w, x, y, z
 
     @wp.func
     def reaches(opacity: vec16, alpha_min: float):
@@ -162,26 +101,19 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
     ):
         pass
 
-    @wp.func
-    def covers_pixel(mean: number, extent: number, size: float):
-        """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
-        first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
-        last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
-        return fill(1.0, mean) - less(last, first)
-
-    @wp.func_grad(covers_pixel)
-    def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
-        pass
-
-    parts = {"all_finite": all_finite, "lens": lens, "rotation": rotation, "covariance": covariance}
+    parts = {"all_finite": all_finite, "lens": lens, "offset": offset, "rotation": rotation, "covariance": covariance}
+    parts |= {"turned_or_not": turned_or_not, "sized_or_one": sized_or_one}
     parts |= {"outline": outline} if outline else {}
+    parts |= {"taken_along": taken_along} if expose else {}
+    parts |= {"quat_of": quat_before_motion if expose else quat_of}
+    turns = wp.array2d[row4] if expose else wp.array[row4]
 
     @kernel_of_parts(DIFFERENTIABLE, **parts)
     def project(
         first: int,  # group of Gaussians of this slice
         camera: CameraView,
         means: wp.array[row3],  # [N / lanes] world
-        quats: wp.array[row4],  # [N / lanes] wxyz, any norm
+        quats: turns,  # [N / lanes] wxyz, any norm; with a shutter [N / lanes, 3], for `expose`
         scales: wp.array[row3],  # [N / lanes] world
         opacities: wp.array[number],  # [N / lanes] 0..1
         # out: zero where culled; the caller clears them, all but the radii
@@ -194,7 +126,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
     ):
         g = first + wp.tid()
         mx, my, mz = columns(means[g])
-        qw, qx, qy, qz = columns(quats[g])
+        qw, qx, qy, qz = quat_of(quats, g)
         sx, sy, sz = columns(scales[g])
         opacity = opacities[g]
         zero = fill(0.0, opacity)
@@ -205,9 +137,9 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
         here = times(valid, less(zero, real(radii_out[g])))
         radii_out[g] = whole(valid - one)  # CULLED or INVALID
-        ox = (pick(here, mx, zero) - fill(camera.center[0], one)) - fill(camera.center_low[0], one)
-        oy = (pick(here, my, zero) - fill(camera.center[1], one)) - fill(camera.center_low[1], one)
-        oz = (pick(here, mz, zero) - fill(camera.center[2], one)) - fill(camera.center_low[2], one)
+        ox, oy, oz = offset(camera, here, mx, my, mz)
+        if wp.static(expose is not None):
+            ox, oy, oz, n00, n01, n02, n10, n11, n12, n20, n21, n22 = expose(camera, quats, g, ox, oy, oz)
         r20 = turn(camera, 2, 0, one)
         r21 = turn(camera, 2, 1, one)
         r22 = turn(camera, 2, 2, one)
@@ -221,15 +153,13 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int) -> w
         z = pick(here, depth, one)
         if wp.static(projection.wide):
             z = fma(r20, ox, fma(r21, oy, times(r22, oz)))
-        size = pick(here, size, one)
-        qw = pick(here, qw, one)
-        qx = pick(here, qx, zero)
-        qy = pick(here, qy, zero)
-        qz = pick(here, qz, zero)
+        qw, qx, qy, qz, size = turned_or_not(here, qw, qx, qy, qz, size)
         m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation(qw, qx, qy, qz, size)
-        sx = pick(here, sx, one)
-        sy = pick(here, sy, one)
-        sz = pick(here, sz, one)
+        if wp.static(expose is not None):
+            m00, m10, m20 = taken_along(n00, n01, n02, n10, n11, n12, n20, n21, n22, m00, m10, m20)
+            m01, m11, m21 = taken_along(n00, n01, n02, n10, n11, n12, n20, n21, n22, m01, m11, m21)
+            m02, m12, m22 = taken_along(n00, n01, n02, n10, n11, n12, n20, n21, n22, m02, m12, m22)
+        sx, sy, sz = sized_or_one(here, sx, sy, sz)
         x = fma(turn(camera, 0, 0, one), ox, fma(turn(camera, 0, 1, one), oy, times(turn(camera, 0, 2, one), oz)))
         y = fma(turn(camera, 1, 0, one), ox, fma(turn(camera, 1, 1, one), oy, times(turn(camera, 1, 2, one), oz)))
         px, py, j00, j01, j02, j10, j11, j12 = lens(camera, x, y, z)

@@ -1,0 +1,177 @@
+"""Rolling shutter: against pictures rendered row by row, and in float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import torch
+from scipy.spatial.transform import Rotation
+
+from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, rasterize
+from warp_splat.compare import oracle, truth
+from warp_splat.kernels.project import affine
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.drivers import CPU
+from warp_splat.raster.project import project
+
+SHUTTER = Shutter((0.02, 0.05, -0.03), (0.05, 0.02, -0.08))
+ERROR = 1e-5
+
+
+def moving(name, shutter=SHUTTER):
+    scene = scenes.SCENES[name]()
+    return replace(scene, camera=replace(scene.camera, shutter=shutter))
+
+
+def row_by_row(scene):
+    """Of each row, what a camera renders that stands still where this one is then."""
+    views = [
+        rasterize(*scene.parameters(), scene.camera.at(row), scene.background).image for row in range(height(scene))
+    ]
+    return torch.stack([view[row] for row, view in enumerate(views)])
+
+
+def height(scene):
+    return scene.camera.height
+
+
+def test_rows_are_those_of_cameras_that_stand_still(device):
+    scene = moving("degree2").to(device)
+    still = replace(scene.camera, shutter=None)
+    wanted = row_by_row(scene)
+    rolling, frozen = (
+        rasterize(*scene.parameters(), camera, scene.background).image for camera in (scene.camera, still)
+    )
+    off = [float((image - wanted).square().mean().sqrt()) for image in (rolling, frozen)]
+    assert off[0] < 2e-3 and off[0] < 0.06 * off[1], off
+
+
+def test_means_are_where_their_row_sees_them(device):
+    """Fixed-point steps until nothing moves, against two steps of Newton's method."""
+    scene = moving("degree2").to(device)
+    out = rasterize(*scene.parameters(), scene.camera)
+    seen = (out.radii > 0).nonzero()[:, 0].tolist()
+    assert len(seen) > 50
+    for index in seen:
+        mean, row = scene.means[index].double().cpu().numpy(), 0.5 * height(scene)
+        for _ in range(60):
+            camera = scene.camera.at(np.clip(row, -0.15 * height(scene), 1.15 * height(scene)) - 0.5)
+            place = camera.pixels((camera.rotation @ mean + camera.translation)[None])[0]
+            row = place[1]
+        np.testing.assert_allclose(out.means2d[index].cpu().numpy(), place, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("degree2", RasterOptions(depth=True)),
+        ("needles", RasterOptions()),
+        ("inside", RasterOptions(depth=True, antialiasing=True)),
+        ("near_and_behind", RasterOptions()),
+        pytest.param("fisheye", RasterOptions(depth=True), marks=pytest.mark.slow),
+        *(
+            pytest.param(name, RasterOptions(projection=projection), marks=pytest.mark.long)
+            for name, projection in (
+                ("opencv", "affine"),
+                ("panorama", "affine"),
+                ("degree2", "ellipsoid"),
+                ("degree2", "unscented"),
+                ("fisheye", "unscented"),
+            )
+        ),
+    ],
+    ids=str,
+)
+def test_image_and_gradients_are_those_in_float64(name, options, device):
+    scene = moving(name).to(device)
+    leaves = [tensor.requires_grad_() for tensor in scene.parameters()]
+    out = rasterize(*leaves, scene.camera, scene.background, options=options)
+    exact = moving(name).to("cpu", torch.float64)
+    exact_leaves = [tensor.requires_grad_() for tensor in exact.parameters()]
+    wanted = oracle.exact_render(*exact_leaves, exact.camera, exact.background, **truth.for_oracle(options))
+    sure = ~wanted.fragile
+    assert (out.image.cpu() - wanted.image)[sure].abs().max() < ERROR
+    weights = torch.randn(wanted.image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights *= sure[..., None]
+    found = torch.autograd.grad((out.image * weights.float().to(device)).sum(), leaves)
+    expected = torch.autograd.grad((wanted.image * weights).sum(), exact_leaves)
+    for one, other in zip(found, expected, strict=True):
+        assert (one.cpu() - other).norm() < ERROR * other.norm()
+
+
+def test_nothing_that_only_other_rows_see_is_lost(device):
+    """A Gaussian beyond the picture of the middle row, which the first rows see; one behind its camera."""
+    camera = Camera(
+        20, 40, 30.0, 30.0, 10.0, 20.0, np.eye(3), np.zeros(3), shutter=Shutter((0.0, 0.9, 0.0), (0.0, 0.0, 0.0))
+    )
+    first = camera.at(3)
+    ray = first.rays(np.array([[10.0, 3.5]]))[0]
+    near = replace(camera, shutter=Shutter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    for view, point in ((camera, 4.0 * first.rotation.T @ ray), (near, np.array([0.0, -0.05, 0.15]))):
+        means = torch.tensor(point[None], dtype=torch.float32, device=device)
+        one = torch.ones(1, 1, device=device)
+        quats = one * torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
+        given = (means, quats, 0.01 * one.expand(1, 3), 0.9 * one[0], torch.ones(1, 1, 3, device=device))
+        assert rasterize(*given, view).alpha.max() > 0.3
+        assert rasterize(*given, replace(view, shutter=None)).alpha.max() == 0
+
+
+def test_two_poses_make_a_shutter():
+    first = scenes.SCENES["off_center"]().camera
+    turn = Rotation.from_rotvec([0.1, -0.3, 0.2]).as_matrix()
+    last = replace(first, rotation=turn @ first.rotation, translation=turn @ first.translation + [0.1, 0.2, -0.3])
+    rolling = Camera.rolling(first, last)
+    for pose, row in ((first, -0.5), (last, first.height - 0.5)):
+        still = rolling.at(row)
+        np.testing.assert_allclose(still.rotation, pose.rotation, atol=1e-14)
+        np.testing.assert_allclose(still.translation, pose.translation, atol=1e-14)
+    middle = rolling.at(0.5 * first.height - 0.5)
+    np.testing.assert_allclose(middle.rotation, rolling.rotation)
+    np.testing.assert_allclose(middle.center, 0.5 * (first.center + last.center))
+    np.testing.assert_allclose(rolling.shutter.turn, [0.1, -0.3, 0.2], atol=1e-14)
+    assert first.at(3) is first
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda c: Shutter((1, 2)), r"Shutter turn: expected three finite numbers, got \(1, 2\)"),
+        (lambda c: Shutter(shift=(0, 0, np.nan)), "Shutter shift: expected three finite numbers"),
+        (lambda c: Shutter((0, 57, 0)), "Shutter turn: expected at most 1 rad from the first row to the last, got 57"),
+        (lambda c: replace(c, shutter=0.1), r"Camera shutter: expected a warp_splat\.Shutter or None, got 0.1"),
+        (
+            lambda c: replace(c, shutter=Shutter((0.9, 0, 0))),
+            "Camera shutter: expected a turn that moves .* by at most half",
+        ),
+        (
+            lambda c: Camera.rolling(c, replace(c, rotation=-np.eye(3)[[1, 0, 2]] @ c.rotation)),
+            "Camera.rolling: expected a turn of at most 1 rad",
+        ),
+        (
+            lambda c: draw(replace(c, shutter=SHUTTER), projection=affine.PROJECTION),
+            r"options\.projection: expected one by name for a camera with a rolling shutter",
+        ),
+        (lambda c: CameraParameters(replace(c, shutter=SHUTTER)), "base: expected a camera without a rolling shutter"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(InputError, match=message):
+        make(scenes.SCENES["single"]().camera)
+
+
+def draw(camera, **options):
+    return rasterize(*scenes.SCENES["single"]().parameters(), camera, options=RasterOptions(**options))
+
+
+@pytest.mark.slow
+def test_one_at_a_time_as_on_a_gpu_is_the_same():
+    """The kernels of a GPU, against sixteen Gaussians at once."""
+    scene, found = moving("degree2"), []
+    for driver in (CPU, replace(CPU, lanes=1)):
+        given = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
+        splats = project(Gaussians(*given[:4], given[4][:, :1], given[4][:, 1:]), scene.camera, RasterOptions(), driver)
+        upstream = [torch.ones_like(part) for part in splats[:5]]
+        found.append([*splats[:6], *torch.autograd.grad(splats[:5], given, upstream)])
+    for sixteen, one in zip(*found, strict=True):
+        torch.testing.assert_close(sixteen, one, rtol=5e-5, atol=1e-5 * max(float(one.detach().abs().max()), 1e-9))
