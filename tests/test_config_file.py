@@ -107,7 +107,7 @@ def test_help_of_each_command_is_short_at_its_head(command, capsys):
         ("train --iterations 0", "--iterations: expected at least 1, got 0."),
         (
             "train --parts random_background,weather",
-            "--parts: expected auto, or some of random_background, exposure, pose, depth, floaters between commas",
+            "--parts: expected auto, or some of random_background, sky, exposure, pose, depth, floaters between commas",
         ),
         ("view model --port 65536", "--port: expected 1 to 65535, got 65536."),
         ("render -m model --threads -1", "--threads: expected at least 0, got -1."),

@@ -112,7 +112,7 @@ def test_rates_cannot_fall_to_nothing(scene, tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_resumes_to_the_same_bytes(kind, scene, tmp_path):
-    options = {"parts": "exposure,pose,depth,floaters", "exposure": kind, "vignetting": True}
+    options = {"parts": "sky,exposure,pose,depth,floaters", "exposure": kind, "vignetting": True}
     trainer, run = begin(scene, tmp_path, **options)
     steps(trainer, run, 24)
     expected, _ = state_of(trainer, run)

@@ -175,7 +175,7 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
         main(["train", "--help"])
     assert "--gain_lr FLOAT" in capsys.readouterr().out
     begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
-    assert "--parts: expected auto, or some of random_background, exposure, pose, depth, floaters, gain" in fails(
+    assert "--parts: expected auto, or some of random_background, sky, exposure, pose, depth, floaters, gain" in fails(
         capsys, *begun, "--parts", "weather"
     )
     assert "--growth: expected one of reference, budget, mcmc, faint" in fails(capsys, *begun, "--growth", "weather")

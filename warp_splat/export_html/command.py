@@ -43,7 +43,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
     check_numbers(config)
-    _, (splats, _), trained = model_folder.open_model(config.model)
+    iteration, (splats, _), trained = model_folder.open_model(config.model)
     cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
     kept = pack.shown(splats, config.max_gaussians)
     options = {
@@ -56,6 +56,8 @@ def export_html(config: ExportHtmlConfig) -> int:
     write_text(path, page)
     size, total = len(page) / 1e6, len(splats.means)
     print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
+    if model_folder.read_environment(config.model, iteration) is not None:
+        print("  The page does not have what was learned behind the Gaussians (--parts sky): it is black there.")
     if bent := sum(camera.lens is not None for _, camera in cameras):
         print(f"  {bent} cameras have lenses with distortion; the page shows what pinholes would see from there.")
     if size > LARGE:

@@ -9,7 +9,7 @@ import numpy as np
 from warp_splat.config import ConvertConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path
+from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_environment
 from warp_splat.formats.splats import COEFFICIENTS, LOG_SCALES, SH_C0, SplatArrays, SplatFile, sigmoid, unit_quats
 
 ROUNDING = 1e-6  # smaller changes, as a share of the largest value, are those of float32
@@ -33,6 +33,8 @@ def convert(config: ConvertConfig) -> int:
     degree = COEFFICIENTS.index(after.splats.sh.shape[1])
     print(f"{config.target}: {len(after.splats.means)} Gaussians, SH degree {degree}")
     notes = losses(before, after) + notes
+    if read_environment(config.source, iteration) is not None:
+        notes.append("what was learned behind the Gaussians (--parts sky), which no format has")
     print(f"  lost: {'; '.join(notes)}" if notes else "  nothing lost but rounding of float32")
     return 0
 

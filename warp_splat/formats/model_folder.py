@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 
 CAMERAS = "cameras.json"
+ENVIRONMENT = "environment.json"
 
 
 def default_model_path() -> Path:
@@ -243,6 +244,40 @@ def read_refined(folder: str | Path, iteration: int) -> dict[str, Camera]:
         InputError: if the file is damaged.
     """
     return dict(read_cameras(ply_path(folder, iteration).parent))
+
+
+def write_environment(ply: Path, harmonics: np.ndarray | None) -> None:
+    """Beside a model's Gaussians, write what lies behind them: coefficients as those of a Gaussian, [16, 3].
+
+    None: nothing does; what an earlier training wrote there is removed.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    if harmonics is None:
+        (ply.parent / ENVIRONMENT).unlink(missing_ok=True)
+    else:
+        write_text(ply.parent / ENVIRONMENT, json.dumps({"harmonics": harmonics.tolist()}, allow_nan=False))
+
+
+def read_environment(path: str | Path, iteration: int) -> np.ndarray | None:
+    """What lies behind the Gaussians of a model folder, or of a file in one, [16, 3] float32; None if nothing does.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    beside = Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
+    file = beside.parent / ENVIRONMENT
+    if not file.exists():
+        return None
+    with reading(file, "harmonics as training writes them"):
+        try:
+            harmonics = np.array(json.loads(file.read_text(encoding="utf-8"))["harmonics"], np.float32)
+        except (KeyError, TypeError, ValueError) as error:
+            raise Unexpected(f"other JSON ({error!s:.100})") from error
+        if harmonics.shape != (16, 3) or not np.isfinite(harmonics).all():
+            raise Unexpected(f"numbers of shape {list(harmonics.shape)}, or such that are not finite")
+    return harmonics
 
 
 def _camera(entry: dict) -> Camera:

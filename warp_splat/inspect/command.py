@@ -37,6 +37,7 @@ def inspect(config: InspectConfig) -> int:
     findings += verdicts.check_cameras(subject)
     findings += geometry.check_reprojection(subject, measured)
     findings += geometry.check_coverage(subject, measured)
+    findings += geometry.check_sky(subject)
     findings += geometry.check_axes(subject)
     findings += brightness.check_exposure(subject, measured)
     findings += verdicts.check_names(subject)

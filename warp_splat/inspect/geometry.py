@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.inspect.subject import Finding, Subject
+from warp_splat.scene.horizon import NEEDED, share_of_sky
 from warp_splat.scene.images import Photo
 from warp_splat.scene.types import visible
 from warp_splat.text import few
@@ -107,6 +108,15 @@ def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
     level = "error" if unseen == 1 else "warning" if unseen > UNSEEN and not subject.random_points else "ok"
     yield Finding("unseen points", level, f"{100 * unseen:.1f} % of the points lie outside every image.")
     yield from _check_spread(subject, points)
+
+
+def check_sky(subject: Subject) -> Iterator[Finding]:
+    """How much of the photographs looks up to where there are no points."""
+    if subject.photos and len(subject.points) and not subject.random_points:
+        share = share_of_sky([photo.camera for photo in subject.photos], subject.points)
+        text = f"{100 * share:.1f} % of the photographs look up to where there are no points"
+        needed = share >= NEEDED
+        yield Finding("sky", "note" if needed else "ok", f"{text}{': train with --parts sky' * needed}.")
 
 
 def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:

@@ -8,18 +8,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
-from warp_splat.formats.model_folder import is_file_of_gaussians, open_model
+from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, read_environment
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.command import load_trained_scene, make_picture, options_of, with_refined_cameras
+from warp_splat.rendering.command import backdrop, load_trained_scene, make_picture, options_of, with_refined_cameras
 from warp_splat.runtime import launch
 from warp_splat.scene.types import Scene, View
 
@@ -31,12 +30,13 @@ class Opened(NamedTuple):
     trained: dict  # options of its training
     scene: Scene
     setting: ViewSetting  # of the training views
+    harmonics: np.ndarray | None  # behind the Gaussians, [16, 3]
 
     def picture(self, splats: SplatArrays) -> Callable[[Camera], np.ndarray]:
         """A function from a camera to what ``splats`` look like, [H, W, 3] uint8."""
-        background = self.setting.background
-        model = GaussianModel.from_splats(splats).to(background.device)
-        return make_picture(model, bool(background.any()), self.setting.options, self.scene.linear)
+        model = GaussianModel.from_splats(splats).to(self.setting.background.device)
+        white = bool(self.trained.get("white_background"))
+        return make_picture(model, white, self.setting.options, self.scene.linear, self.harmonics)
 
     def psnr(self, splats: SplatArrays, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders."""
@@ -67,8 +67,11 @@ def open_finished(model: str, source_path: str, iteration: int, device: str, thr
     iteration, file, trained = open_file(model, iteration)
     scene = load_trained_scene(model, source_path, trained, print)
     scene = with_refined_cameras(scene, model, iteration)
-    background = torch.full((3,), float(bool(trained.get("white_background"))), device=used)
-    return Opened(file, trained, scene, ViewSetting(scene.train, options_of(trained), background))
+    harmonics = read_environment(model, iteration)
+    if harmonics is not None:
+        print(f"What {model} has learned behind its Gaussians stays as it is; a file of Gaussians does not have it.")
+    background = backdrop(bool(trained.get("white_background")), harmonics, used)
+    return Opened(file, trained, scene, ViewSetting(scene.train, options_of(trained), background), harmonics)
 
 
 def output_of(model: str, output: str, name: str) -> Path:

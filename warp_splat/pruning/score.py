@@ -18,6 +18,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.behind import put_behind
 from warp_splat.raster.blend import blend
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D
 from warp_splat.raster.drivers import driver_of
@@ -45,7 +46,7 @@ class ViewSetting(NamedTuple):
 
     views: Sequence[View]
     options: RasterOptions
-    background: torch.Tensor  # [3]
+    background: torch.Tensor  # [3], or harmonics [16, 3]
 
 
 def carried(gaussians: Gaussians, camera: Camera, setting: ViewSetting, upstream: torch.Tensor) -> Carried:
@@ -63,7 +64,11 @@ def carried(gaussians: Gaussians, camera: Camera, setting: ViewSetting, upstream
     colors, opacities = (tensor.detach().requires_grad_() for tensor in (splats.colors, splats.opacities))
     splats = splats._replace(colors=colors, opacities=opacities)
     bins = driver.bin(splats, camera, options)
-    image, *_ = blend(splats, bins, setting.background, camera, options, "manual", driver, dropped)
+    background = setting.background
+    color = background if background.dim() == 1 else background.new_zeros(3)
+    image, alpha, _ = blend(splats, bins, color, camera, options, "manual", driver, dropped)
+    if background.dim() == 2:
+        image = put_behind(image, alpha, background, camera)
     return Carried(splats, *torch.autograd.grad(image, (colors, opacities), upstream))
 
 

@@ -28,9 +28,10 @@ STAGES, THINNED = 5, 1 / 3  # of training: how often Gaussians are left out, and
 #: - 31.51 (30.99) dB: three times, left out in stages
 RATES = {"feature_lr": 0.0075, "opacity_lr": 0.075, "scaling_lr": 0.015, "rotation_lr": 0.003}
 RATES |= {"position_lr_init": 1.6e-4, "position_lr_final": 1.6e-5}
-#: Options of the model's training that hold here; its cameras, if they were refined, are so already.
+#: Options of the model's training that hold here; what was learned of cameras and background is so already.
 SAME = {"white_background", "projection", "lambda_dssim", "loss_space", "parts", "opacity_reg"}
 SAME |= {"exposure", "vignetting", "random_background"}
+LEARNED = {"pose", "sky"}  # parts of which the model has what they found
 NEVER = 2**31  # a step that does not come
 
 
@@ -119,6 +120,7 @@ def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps
     """
     degree = COEFFICIENTS.index(file.splats.sh.shape[1])
     trainer = Trainer(replace(scene, start=file), _config(file, steps, degree, trained, setting.background.device))
+    trainer.background = setting.background
     total = len(trainer.model)
     for number in range(1, steps + 1):
         stage = math.ceil(number / max(1, THINNED * steps / STAGES))
@@ -138,7 +140,7 @@ def _config(file: SplatFile, steps: int, degree: int, trained: dict, device: tor
     """Options of a training that neither grows nor resets, at all degrees from its first step on."""
     known = {item.name: item for item in flags_of(TrainConfig) if item.name in SAME}
     same = {name: trained[name] for name, item in known.items() if name in trained and fits(trained[name], item)}
-    same["parts"] = ",".join(name for name in same.get("parts", "").split(",") if name in PARTS and name != "pose")
+    same["parts"] = ",".join(name for name in same.get("parts", "").split(",") if name in {*PARTS} - LEARNED)
     return TrainConfig(
         **RATES,
         **same,

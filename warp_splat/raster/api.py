@@ -14,6 +14,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.raster.behind import put_behind
 from warp_splat.raster.beside import Blended, blend_beside
 from warp_splat.raster.blend import blend
 from warp_splat.raster.camera_parameters import CameraParameters
@@ -179,7 +180,10 @@ def render(
     adjoint: str = "manual",
     features: torch.Tensor | None = None,
 ) -> RenderOutput:
-    """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted."""
+    """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted.
+
+    The background may be harmonics [16, 3], too: see :func:`put_behind`.
+    """
     driver, dropped, walk = driver_of(gaussians.means.device), Dropped(), Walk()
     with stage("project"):
         splats = project(gaussians, camera, options, driver, dropped)
@@ -189,7 +193,10 @@ def render(
         drawn = around(splats, seen, crossing)
         bins = driver.bin(drawn, seen, options)
     with stage("blend"):
-        image, alpha, depth = blend(drawn, bins, background, seen, options, adjoint, driver, dropped, walk)
+        color = background if background.dim() == 1 else background.new_zeros(3)
+        image, alpha, depth = blend(drawn, bins, color, seen, options, adjoint, driver, dropped, walk)
+    if background.dim() == 2:
+        image = put_behind(image, alpha, background, camera)
     more = {}
     if features is not None or options.normals or options.median_depth or options.strongest:
         with stage("channels"):

@@ -65,7 +65,9 @@ def render_model(config: RenderConfig) -> int:
     options, linear = options_of(trained), is_linear(scene, trained)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
-        picture = make_picture(model.to(device), bool(trained.get("white_background")), options, linear)
+        white = bool(trained.get("white_background"))
+        harmonics = model_folder.read_environment(config.model_path, iteration)
+        picture = make_picture(model.to(device), white, options, linear, harmonics)
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -79,8 +81,7 @@ def render_model(config: RenderConfig) -> int:
                 extra = {"split": "test", "gaussians": len(model)}
                 where = None
                 if model_folder.read_refined(folder, iteration):
-                    background = torch.full((3,), float(bool(trained.get("white_background"))), device=device)
-                    where = where_taken(model.activated(), background, options, scene.extent)
+                    where = where_taken(model.activated(), backdrop(white, harmonics, device), options, scene.extent)
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
@@ -193,17 +194,30 @@ def _refined(view: View, cameras: Mapping[str, Camera], model_path: str) -> View
     return replace(view, camera=camera.resized(view.camera.width, view.camera.height), original=camera)
 
 
+def backdrop(white_background: bool, harmonics: np.ndarray | None, device: torch.device) -> torch.Tensor:
+    """What lies behind Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
+    if harmonics is None:
+        return torch.full((3,), float(white_background), device=device)
+    return torch.from_numpy(harmonics).to(device)
+
+
 def make_picture(
-    model: GaussianModel, white_background: bool, options: RasterOptions, linear: bool = False
+    model: GaussianModel,
+    white_background: bool,
+    options: RasterOptions,
+    linear: bool = False,
+    harmonics: np.ndarray | None = None,
 ) -> Callable[[Camera], np.ndarray]:
     """A function from a camera to the model's image, [H, W, 3] uint8; ``linear``: its colors are in linear light."""
-    draw = make_renderer(model, white_background, options)
+    draw = make_renderer(model, white_background, options, harmonics)
     return lambda camera: to_bytes(draw(camera).image, linear)
 
 
-def make_renderer(model: GaussianModel, white_background: bool, options: RasterOptions) -> Callable[..., RenderOutput]:
+def make_renderer(
+    model: GaussianModel, white_background: bool, options: RasterOptions, harmonics: np.ndarray | None = None
+) -> Callable[..., RenderOutput]:
     """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients."""
-    background = torch.full((3,), float(white_background), device=model.device)
+    background = backdrop(white_background, harmonics, model.device)
     with torch.no_grad():
         gaussians = model.activated()
 

@@ -120,17 +120,20 @@ def launch_in_lanes(
     count: int,
     arguments: Callable[[Types, slice], tuple[list, list]],
     device: torch.device | str = "cpu",
+    run: int = 1,
 ) -> None:
     """Launch ``make(lanes)``, a kernel for so many rows at once, on ``count`` rows, ``make(1)`` on those left over.
 
-    ``arguments`` gives inputs and outputs for a slice of the rows, as arrays of those types (:func:`lanes_of`).
+    ``arguments`` gives inputs and outputs for a slice of the rows, as arrays of those types (:func:`lanes_of`). An
+    index of the kernel takes ``run`` groups of rows.
     """
     whole = count - count % lanes
     for size, rows in ((lanes, slice(0, whole)), (1, slice(whole, count))):
         groups = (rows.stop - rows.start) // size
         if groups:
-            bounds = even_slices(groups, SMALLEST_SLICE // size)
-            launch(make(size), groups, *arguments(TYPES[size], rows), bounds=bounds, device=device)
+            runs = -(-groups // run)
+            bounds = even_slices(runs, max(SMALLEST_SLICE // (size * run), 1))
+            launch(make(size), runs, *arguments(TYPES[size], rows), bounds=bounds, device=device)
 
 
 def lanes_of(dtype: type, *tensors: torch.Tensor) -> list:

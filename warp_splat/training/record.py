@@ -73,6 +73,8 @@ def save_model(trainer: Trainer, run: Run) -> Path:
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     try:
         _save_cameras(trainer, run.folder, path.parent)
+        behind = trainer.behind.cpu().numpy()
+        model_folder.write_environment(path, behind if behind.ndim > 1 else None)
         for files in having(trainer.parts, "files"):
             for name, value in files().items():
                 write_json(run.folder / name, value)

@@ -22,12 +22,13 @@ they run in this order:
     parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, dense float32, with a name that no other
                                             has; lr is a number, or a function of the iteration
     camera(camera, step) -> camera          to render with
-    background(color, step) -> color        [3], to render on
+    background(color, step) -> color        [3], to render on; or harmonics [16, 3] of the direction
     image(image, out, step) -> image        [H, W, 3], of what was rendered, which is compared
     photograph(photograph, step)            what it is compared with; with ``reads_alpha``, it has its transparency
 
 For what is shown and saved, a part may have:
 
+    behind(color) -> color                  as ``background``, of pictures, without gradients
     refined(camera, view) -> camera         of a photograph, held out or not, as it is learned by now
     files() -> {name: value}                JSON files of the model's folder
 

@@ -173,7 +173,7 @@ class Trainer:
         view = self.scene.train[0]
         step = Step(0, view)
         camera = self._through("camera", view.camera.resized(TILE, TILE), step)
-        out = self._render(camera, self.background, self._through("asks", self.options, step))
+        out = self._render(camera, self.behind, self._through("asks", self.options, step))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.adam.zero_grad()
         self.optimizer.load()
@@ -257,10 +257,15 @@ class Trainer:
             gaussians = self.model.activated(self.degree)
         return render(gaussians, camera, background, replace(options, sh_degree=self.degree), self.config.model.adjoint)
 
+    @property
+    def behind(self) -> torch.Tensor:
+        """What pictures have behind the Gaussians: a color [3], or harmonics [16, 3]."""
+        return self._through("behind", self.background)
+
     def look(self, camera: Camera, depth: bool = False) -> RenderOutput:
         """The present model seen by ``camera``, without gradients; nothing of the training changes."""
         with torch.no_grad():
-            return self._render(camera, self.background, replace(self.options, depth=depth))
+            return self._render(camera, self.behind, replace(self.options, depth=depth))
 
     def picture(self, camera: Camera) -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8."""
@@ -277,7 +282,7 @@ class Trainer:
         """A function from a held-out view to where the model says that it was taken, if parts refine cameras."""
         if not having(self.parts, "refined") or not self.scene.test:
             return None
-        return where_taken(self.model.activated(self.degree), self.background, self.options, self.scene.extent)
+        return where_taken(self.model.activated(self.degree), self.behind, self.options, self.scene.extent)
 
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
-from warp_splat.formats.model_folder import open_model
+from warp_splat.formats.model_folder import open_model, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of, with_refined_cameras
@@ -36,7 +36,8 @@ def view_model(config: ViewConfig) -> int:
     model = GaussianModel.from_splats(gaussians.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
     scene = _find_scene(config, trained, iteration)
-    draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained))
+    harmonics = read_environment(config.model, iteration)
+    draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained), harmonics)
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (

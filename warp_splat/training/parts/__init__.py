@@ -24,6 +24,13 @@ class BackgroundOptions:
 
 
 @dataclass(frozen=True)
+class SkyOptions:
+    """What is beyond everything."""
+
+    sky_lr: float = learning(0.01, "rate of the colors of --parts sky at its start")
+
+
+@dataclass(frozen=True)
 class FloatersOptions:
     """A price on opacity."""
 
@@ -70,6 +77,7 @@ class DepthOptions:
 #: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
     "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
+    "sky": Entry(SkyOptions, "warp_splat.training.parts.sky.Sky"),
     "exposure": Entry(ExposureOptions, "warp_splat.training.parts.exposure.Exposure"),
     "pose": Entry(PoseOptions, "warp_splat.training.parts.pose.Pose"),
     "depth": Entry(DepthOptions, "warp_splat.training.parts.depth.Depth"),

@@ -1,0 +1,101 @@
+"""What lies behind the Gaussians, in place of one color: harmonics of the direction, differentiable in torch."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+import warp as wp
+from torch.autograd.function import once_differentiable
+
+from warp_splat.camera import Camera
+from warp_splat.kernels.environment import RUN, make_adj_put_behind, make_put_behind
+from warp_splat.kernels.simd import Types, vec48
+from warp_splat.lenses import Lens
+from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
+from warp_splat.runtime.sums import in_pairs
+from warp_splat.runtime.timers import stage
+
+KEPT = 4  # pictures, by size and lens, whose rays are kept
+
+
+def put_behind(
+    image: torch.Tensor, alpha: torch.Tensor, harmonics: torch.Tensor, camera: Camera | CameraParameters
+) -> torch.Tensor:
+    """The image with the environment where it is transparent, differentiable in all but the camera.
+
+    Args:
+        image: [H, W, 3], of the Gaussians on black.
+        alpha: [H, W].
+        harmonics: coefficients as those of a Gaussian, [16, 3]; the color is max(0, 0.5 + their sum).
+        camera: what each pixel sees; where its lens sees nothing, the image stays. Of one that learns, the lens is that
+            of its base.
+    """
+    base, pose = (camera.base, camera.camera) if isinstance(camera, CameraParameters) else (camera, camera)
+    rays, seen = _rays(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base.lens)
+    if seen is not None:
+        alpha = alpha.masked_fill(~torch.from_numpy(seen).to(alpha.device), 1.0)
+    with stage("environment"):
+        return _PutBehind.apply(image, alpha, harmonics, pose.rotation, torch.from_numpy(rays).to(image.device))
+
+
+def load_kernels(device: torch.device) -> None:
+    """Compile and load them, for many pixels at once and for those left over."""
+    for lanes in {driver_of(device).lanes, 1}:
+        load(make_put_behind(lanes), device)
+        load(make_adj_put_behind(lanes), device)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _rays(
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see something, [H, W], if not all."""
+    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
+    places = np.stack(np.broadcast_arrays(x, y[:, None]), -1).reshape(-1, 2)
+    rays = lens.undistorted(places) if lens else np.concatenate([places, np.ones((len(places), 1))], 1)
+    seen = np.isfinite(rays).all(1)
+    rays[~seen] = (0.0, 0.0, 1.0)
+    return rays.astype(np.float32), None if seen.all() else seen.reshape(height, width)
+
+
+class _PutBehind(torch.autograd.Function):
+    """See :func:`put_behind`; ``rays`` are [H * W, 3]."""
+
+    @staticmethod
+    def forward(ctx, image, alpha, harmonics, rotation, rays):
+        image, alpha, harmonics = (tensor.detach().contiguous() for tensor in (image, alpha, harmonics))
+        ctx.rotation = wp.mat33(*rotation.ravel())
+        behind, made = torch.empty_like(image), torch.empty_like(image)
+        ctx.save_for_backward(alpha, rays, behind)
+
+        def arguments(types: Types, rows: slice) -> tuple[list, list]:
+            tables = (table.view(-1, 3)[rows] for table in (rays, image, behind, made))
+            seen, colors, *out = lanes_of(types.row3, *tables)
+            alphas = lanes_of(types.number, alpha.view(-1)[rows])
+            return [ctx.rotation, *lanes_of(vec48, harmonics), seen, *alphas, colors], out
+
+        launch_in_lanes(make_put_behind, driver_of(image.device).lanes, alpha.numel(), arguments, image.device)
+        return made
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj):
+        with stage("adjoint of environment"):
+            alpha, rays, behind = ctx.saved_tensors
+            adj, lanes, count = adj.contiguous(), driver_of(alpha.device).lanes, alpha.numel()
+            runs = -(-(count // lanes) // RUN)
+            adj_alpha, sums = torch.empty_like(alpha), alpha.new_empty(runs + -(-(count % lanes) // RUN), 48)
+
+            def arguments(types: Types, rows: slice) -> tuple[list, list]:
+                tables = (table.view(-1, 3)[rows] for table in (rays, behind, adj))
+                alphas, adj_alphas = lanes_of(types.number, alpha.view(-1)[rows], adj_alpha.view(-1)[rows])
+                seen, colors, given = lanes_of(types.row3, *tables)
+                made = lanes_of(vec48, sums[runs if rows.start else 0 :])
+                return [ctx.rotation, seen, alphas, colors, given], [adj_alphas, *made]
+
+            launch_in_lanes(make_adj_put_behind, lanes, count, arguments, alpha.device, run=RUN)
+            return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None

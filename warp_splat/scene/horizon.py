@@ -1,0 +1,42 @@
+"""Whether photographs show a sky: directions above the horizon in which structure from motion found no point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from warp_splat.camera import Camera
+from warp_splat.scene.types import visible
+
+CELLS = 24  # along the longer side of a photograph
+NEEDED = 0.015  # share from which on a sky is worth to learn; indoors plain walls make up to 0.010
+VIEWS, POINTS = 60, 100_000  # that are looked at, at most
+
+
+def share_of_sky(cameras: Sequence[Camera], points: np.ndarray) -> float:
+    """The share of the photographs' cells that look up, and have no point [P, 3] in them, beside them or above them.
+
+    Up is where most cameras have it. A plain ceiling looks the same.
+    """
+    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    points = points[:: -(-len(points) // POINTS) or 1].astype(np.float64)
+    return float(np.mean([_sky(camera, points, up).mean() for camera in cameras[:: -(-len(cameras) // VIEWS)]]))
+
+
+def _sky(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The cells of one photograph that show sky, [rows, columns] bool."""
+    longest = max(camera.width, camera.height)
+    columns, rows = (max(round(CELLS * size / longest), 1) for size in (camera.width, camera.height))
+    shown = points[visible(camera, points)] @ camera.rotation.T + camera.translation
+    column, row = np.minimum(camera.pixels(shown) / longest * CELLS, (columns - 1, rows - 1)).astype(np.int64).T
+    free = np.ones((rows + 2, columns + 2), bool)
+    for down in range(3):
+        for right in range(3):
+            free[row + down, column + right] = False
+    x, y = (np.arange(columns) + 0.5) * longest / CELLS, (np.arange(rows) + 0.5) * longest / CELLS
+    rays = camera.rays(np.stack(np.broadcast_arrays(x, y[:, None]), -1).reshape(-1, 2)) @ camera.rotation
+    sky = free[1:-1, 1:-1] & (rays @ up > 0).reshape(rows, columns)  # not, where a lens sees nothing
+    right, down = (camera.rotation @ up)[:2]
+    turns = (0 if down < 0 else 2) if abs(down) > abs(right) else (1 if right > 0 else 3)  # until up is up
+    return np.rot90(np.logical_and.accumulate(np.rot90(sky, turns)), -turns)
