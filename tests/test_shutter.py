@@ -1,6 +1,7 @@
 """Rolling shutter: against pictures rendered row by row, and in float64."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +9,14 @@ import scenes
 import torch
 from scipy.spatial.transform import Rotation
 
-from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, rasterize
+from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, check_gradients, rasterize
 from warp_splat.compare import oracle, truth
+from warp_splat.config import ADJOINTS
 from warp_splat.kernels.project import affine
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU
-from warp_splat.raster.project import project
+from warp_splat.raster.project import Project, project
+from warp_splat.runtime import launch, pool
 
 SHUTTER = Shutter((0.02, 0.05, -0.03), (0.05, 0.02, -0.08))
 ERROR = 1e-5
@@ -152,7 +155,16 @@ def test_two_poses_make_a_shutter():
             lambda c: draw(replace(c, shutter=SHUTTER), projection=affine.PROJECTION),
             r"options\.projection: expected one by name for a camera with a rolling shutter",
         ),
-        (lambda c: CameraParameters(replace(c, shutter=SHUTTER)), "base: expected a camera without a rolling shutter"),
+        (
+            lambda c: CameraParameters(c, last_twist=torch.zeros(6)),
+            "last_twist: expected a base with a rolling shutter",
+        ),
+        (
+            lambda c: draw(
+                CameraParameters(replace(c, shutter=SHUTTER), last_twist=torch.tensor([2.0, 0, 0, 0, 0, 0]))
+            ),
+            "Camera.rolling: expected a turn of at most 1 rad",
+        ),
     ],
 )
 def test_bad_input(make, message):
@@ -175,3 +187,120 @@ def test_one_at_a_time_as_on_a_gpu_is_the_same():
         found.append([*splats[:6], *torch.autograd.grad(splats[:5], given, upstream)])
     for sixteen, one in zip(*found, strict=True):
         torch.testing.assert_close(sixteen, one, rtol=5e-5, atol=1e-5 * max(float(one.detach().abs().max()), 1e-9))
+
+
+def exact_pose(camera, twist):
+    """Rotation and center [3] of a camera that is turned and moved by a twist."""
+    w = twist[:3]
+    turn = torch.linalg.matrix_exp(torch.linalg.cross(w.expand(3, 3), torch.eye(3, dtype=torch.float64)).T)
+    rotation = turn @ torch.tensor(camera.rotation)
+    return rotation, -rotation.T @ (turn @ torch.tensor(camera.translation) + twist[3:])
+
+
+def exact_camera(base, twist, last_twist, intrinsics):
+    """The camera of :class:`CameraParameters` as torch has it, by its own exponential and logarithm."""
+    (first, begin), (last, end) = exact_pose(base.at(-0.5), twist), exact_pose(base.at(base.height - 0.5), last_twist)
+    turned = last @ first.T
+    sine = 0.5 * torch.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+    w = sine * (sine.norm().asin() / sine.norm())
+    half = torch.linalg.matrix_exp(0.5 * torch.linalg.cross(w.expand(3, 3), torch.eye(3, dtype=torch.float64)).T)
+    rotation = half @ first
+    pose = {"rotation": rotation, "translation": -rotation @ (0.5 * (begin + end))}
+    fx, fy, cx, cy = intrinsics
+    shutter = SimpleNamespace(turn=w, shift=rotation @ (end - begin))
+    more = {"width": base.width, "height": base.height, "lens": base.lens, "reach": base.reach, "shutter": shutter}
+    return SimpleNamespace(fx=fx, fy=fy, cx=cx, cy=cy, **pose, **more)
+
+
+def leaves(base, start):
+    return CameraParameters(
+        base,
+        torch.tensor(start, dtype=torch.float64, requires_grad=True),
+        last_twist=torch.tensor([-0.7 * part for part in start], dtype=torch.float64, requires_grad=True),
+    )
+
+
+HERE, THERE = (0.0,) * 6, (0.03, -0.02, 0.05, 0.02, 0.04, -0.03)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "adjoint", "start"),
+    [
+        ("degree2", RasterOptions(depth=True), "manual", HERE),
+        ("degree2", RasterOptions(antialiasing=True), "manual", THERE),
+        *(("degree2", RasterOptions(), adjoint, HERE) for adjoint in ADJOINTS[1:]),
+        ("needles", RasterOptions(), "manual", THERE),
+        ("inside", RasterOptions(depth=True), "manual", THERE),
+        pytest.param("fisheye", RasterOptions(depth=True), "manual", THERE, marks=pytest.mark.slow),
+        *(
+            pytest.param(name, RasterOptions(projection=projection), "manual", THERE, marks=pytest.mark.long)
+            for name, projection in (("opencv", "affine"), ("degree2", "ellipsoid"), ("fisheye", "unscented"))
+        ),
+    ],
+    ids=str,
+)
+def test_gradients_of_both_poses_are_those_in_float64(name, options, adjoint, start, device):
+    scene, exact = moving(name).to(device), moving(name).to("cpu", torch.float64)
+    parameters = leaves(scene.camera, start)
+    wanted = [parameters.twist, parameters.last_twist, parameters.intrinsics]
+    camera = exact_camera(scene.camera, *wanted)
+    out = oracle.exact_render(*exact.parameters(), camera, exact.background, **truth.for_oracle(options))
+    with torch.no_grad():
+        other = exact_camera(scene.camera, wanted[0] + 0.01, wanted[1] - 0.01, 1.02 * wanted[2])
+        aim = oracle.exact_render(*exact.parameters(), other, exact.background, **truth.for_oracle(options))
+    upstream = ((out.image - aim.image) * ~out.fragile[..., None]).detach()
+    expected = torch.autograd.grad((out.image * upstream).sum(), wanted)
+    drawn = rasterize(*scene.parameters(), parameters, scene.background, adjoint, options)
+    found = torch.autograd.grad((drawn.image * upstream.float().to(device)).sum(), wanted)
+    for one, other in zip(found, expected, strict=True):
+        for part, true in zip(one.split(len(one) // 2), other.split(len(one) // 2), strict=True):
+            assert (part - true).norm() < ERROR * true.norm(), (found, expected)
+
+
+def test_a_camera_that_learns_stays_where_it_is():
+    """And away from the base it is that of the two poses."""
+    scene = moving("off_center")
+    for start in (HERE, THERE):
+        parameters = leaves(scene.camera, start)
+        exact = exact_camera(scene.camera, parameters.twist, parameters.last_twist, parameters.intrinsics)
+        camera = parameters.camera
+        np.testing.assert_allclose(camera.rotation, exact.rotation.detach(), atol=1e-14)
+        np.testing.assert_allclose(camera.translation, exact.translation.detach(), atol=1e-13)
+        np.testing.assert_allclose(camera.shutter.turn, exact.shutter.turn.detach(), atol=1e-13)
+        np.testing.assert_allclose(camera.shutter.shift, exact.shutter.shift.detach(), atol=1e-13)
+
+
+@pytest.mark.slow
+def test_check_gradients_agrees():
+    scene = moving("degree2")
+    names = ["rotation", "last_rotation", "last_translation", "focal"]
+    report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), parameters=names)
+    assert [row.verdict for row in report.rows] == ["agrees"] * 4, str(report)
+
+
+def test_check_gradients_names_the_last_row_if_it_is_off(monkeypatch):
+    backward = Project.backward
+
+    def spoiled(ctx, *upstream):
+        *gradients, last = backward(ctx, *upstream)[:9]
+        last[4] *= 1.02
+        return *gradients, last, *[None] * 5
+
+    monkeypatch.setattr(Project, "backward", staticmethod(spoiled))
+    scene = moving("degree1")
+    names = ["translation", "last_rotation", "last_translation"]
+    report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), parameters=names)
+    assert report.named("off") == ["last_translation"] and report.worst is None, str(report)
+
+
+def test_any_number_of_threads(monkeypatch):
+    monkeypatch.setattr(launch, "SMALLEST_SLICE", 32)
+    scene, before = scenes.cloud(0, 1003, scenes.make_camera(64, 48), degree=1), pool.get_threads()
+    results = []
+    for threads in (1, 2, 3):
+        pool.set_threads(threads)
+        parameters = CameraParameters(replace(scene.camera, shutter=SHUTTER))
+        rasterize(*scene.parameters(), parameters).image.square().sum().backward()
+        results.append(torch.cat([parameters.twist.grad, parameters.last_twist.grad, parameters.intrinsics.grad]))
+    pool.set_threads(before)
+    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])

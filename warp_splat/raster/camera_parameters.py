@@ -17,6 +17,7 @@ from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import Types
 from warp_splat.lenses.shutter import cross, rotated
 from warp_splat.raster.data import Gaussians, Splats2D
+from warp_splat.raster.moving import Tangent
 from warp_splat.runtime.launch import lanes_of, launch_in_lanes, view
 from warp_splat.runtime.sums import in_pairs
 
@@ -36,17 +37,26 @@ class CameraParameters:
             units], both in the camera's axes and applied on the left of camera_from_world: ``x_camera = exp(w)
             (rotation @ x_world + translation) + v``; w is at most a whole turn. None: a leaf of zeros, float64.
         intrinsics: fx, fy, cx, cy [px], [4]. None: a leaf of those of ``base``, float64.
+        last_twist: likewise where the last row of a rolling shutter stands; ``twist`` is then of the first.
 
     Raises:
-        InputError: if ``base`` is no camera, or a tensor has not its shape or holds no real numbers.
+        InputError: if ``base`` is no camera, a tensor has not its shape or holds no real numbers, or a camera without a
+            rolling shutter is given a last twist.
     """
 
-    def __init__(self, base: Camera, twist: torch.Tensor | None = None, intrinsics: torch.Tensor | None = None):
+    def __init__(
+        self,
+        base: Camera,
+        twist: torch.Tensor | None = None,
+        intrinsics: torch.Tensor | None = None,
+        last_twist: torch.Tensor | None = None,
+    ):
         if not isinstance(base, Camera):
             raise InputError(f"base: expected a warp_splat.Camera, got {type(base).__name__}.")
-        if base.shutter is not None:
-            raise InputError("base: expected a camera without a rolling shutter, whose motion is not learned.")
+        if base.shutter is None and last_twist is not None:
+            raise InputError("last_twist: expected a base with a rolling shutter (Camera.rolling); leave it out.")
         self.base = base
+        self.last_twist = _checked("last_twist", last_twist, [0.0] * 6) if base.shutter else None
         self.twist = _checked("twist", twist, [0.0] * 6)
         self.intrinsics = _checked("intrinsics", intrinsics, [base.fx, base.fy, base.cx, base.cy])
 
@@ -57,15 +67,24 @@ class CameraParameters:
         Raises:
             InputError: if the numbers make none.
         """
-        twist = _numbers(self.twist)
-        if not np.isfinite(twist).all() or (twist[:3] * twist[:3]).sum() > LONGEST**2:
-            raise InputError(
-                "twist: expected finite numbers, of which the rotation vector is at most 2 pi long, got "
-                f"{twist.tolist()}; turn the base camera instead."
-            )
-        pose = rotated(np.concatenate([self.base.rotation, self.base.translation[:, None]], 1), twist[:3, None], 1)
         fx, fy, cx, cy = _numbers(self.intrinsics)
-        return replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, rotation=pose[:, :3], translation=pose[:, 3] + twist[3:])
+        base = replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy)
+        if self.last_twist is None:
+            return _twisted(base, "twist", self.twist)
+        first = _twisted(base.at(-0.5), "twist", self.twist)
+        return Camera.rolling(first, _twisted(base.at(base.height - 0.5), "last_twist", self.last_twist))
+
+
+def _twisted(base: Camera, name: str, tensor: torch.Tensor) -> Camera:
+    """A camera elsewhere. Raises InputError if the numbers make none."""
+    twist = _numbers(tensor)
+    if not np.isfinite(twist).all() or (twist[:3] * twist[:3]).sum() > LONGEST**2:
+        raise InputError(
+            f"{name}: expected finite numbers, of which the rotation vector is at most 2 pi long, got "
+            f"{twist.tolist()}; turn the base camera instead."
+        )
+    pose = rotated(np.concatenate([base.rotation, base.translation[:, None]], 1), twist[:3, None], 1)
+    return replace(base, rotation=pose[:, :3], translation=pose[:, 3] + twist[3:])
 
 
 def _checked(name: str, tensor: torch.Tensor | None, start: list[float]) -> torch.Tensor:
@@ -81,16 +100,10 @@ def _checked(name: str, tensor: torch.Tensor | None, start: list[float]) -> torc
     return tensor
 
 
-def twist_gradient(
-    camera: Camera,
-    cam: CameraView,
-    lanes: int,
-    twist: torch.Tensor,
-    gaussians: Gaussians,
-    adj: Gaussians,
-    adj_placed: torch.Tensor,
-) -> torch.Tensor:
-    """Of the twist, like it; ``adj_placed`` is the part of ``adj.means`` that did not come through colors."""
+def pose_gradient(
+    camera: Camera, cam: CameraView, lanes: int, gaussians: Gaussians, adj: Gaussians, adj_placed: torch.Tensor
+) -> Tangent:
+    """Of the pose; ``adj_placed`` is the part of ``adj.means`` that did not come through colors."""
 
     def arguments(types: Types, rows: slice) -> list:
         means = lanes_of(types.row3, gaussians.means[rows], adj.means[rows], adj_placed[rows])
@@ -99,10 +112,15 @@ def twist_gradient(
 
     sums = _sums(make_adj_pose, lanes, gaussians.means, 6, arguments)
     turn, shift = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
-    turn, shift = (part[0] + part[1] + part[2] for part in (turn, shift))
+    return Tangent(*(part[0] + part[1] + part[2] for part in (turn, shift)))
+
+
+def twist_gradient(pose: Tangent, twist: torch.Tensor) -> torch.Tensor:
+    """Of the twist, like it."""
     now = _numbers(twist)
-    turn = rotated(turn - cross(now[3:], shift), -now[:3], 2)  # by the left Jacobian of the rotation, transposed
-    return torch.tensor(np.concatenate([turn, shift])).to(twist)
+    turn = pose.turn - cross(now[3:], pose.shift)
+    turn = rotated(turn, -now[:3], 2)  # by the left Jacobian of the rotation, transposed
+    return torch.tensor(np.concatenate([turn, pose.shift])).to(twist)
 
 
 def intrinsics_gradient(
@@ -113,8 +131,9 @@ def intrinsics_gradient(
     opacities: torch.Tensor,
     splats: Splats2D,
     adj: Splats2D,
+    time: np.ndarray,
 ) -> torch.Tensor:
-    """Of the intrinsics, like them."""
+    """Of the intrinsics, like them; ``time`` [2]: what they get through the time of a row (:mod:`.moving`)."""
 
     def arguments(types: Types, rows: slice) -> list:
         found = [cam, *lanes_of(types.number, opacities[rows])]
@@ -124,7 +143,8 @@ def intrinsics_gradient(
         return found
 
     sums = _sums(make_adj_intrinsics, lanes, opacities, 4, arguments)
-    return torch.tensor(sums / [camera.fx, camera.fy, 1.0, 1.0]).to(intrinsics)
+    sums = sums / [camera.fx, camera.fy, 1.0, 1.0]
+    return torch.tensor(sums + np.array([0.0, time[0], 0.0, time[1]]) / camera.height).to(intrinsics)
 
 
 def _sums(

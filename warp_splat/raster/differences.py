@@ -40,6 +40,7 @@ from warp_splat.raster.project import project
 SHAPES = ("means", "quats", "scales", "opacities")
 INPUTS = (*SHAPES, "sh", "background")
 CAMERA = ("rotation", "translation", "focal", "principal")  # halves of the twist and of the intrinsics
+LAST_ROW = ("last_rotation", "last_translation")  # of the last twist, where there is a rolling shutter
 INTERMEDIATES = ("means2d", "conics", "opacities2d", "colors", "depths")
 LEAST = 2.0**-14  # the smallest step, relative to a parameter's natural size
 RUNGS = range(1, 10)  # steps h tried: LEAST times 2^rung
@@ -78,6 +79,13 @@ class Trial:
         return gap if gap < math.inf else math.inf
 
 
+def inputs_of(camera: Camera | CameraParameters) -> tuple[str, ...]:
+    """The names of what is given: of the Gaussians, and of a camera that learns."""
+    if not isinstance(camera, CameraParameters):
+        return INPUTS
+    return INPUTS + CAMERA + (LAST_ROW if camera.last_twist is not None else ())
+
+
 class MovableScene:
     """The scene rendered once with gradients, and again with one parameter moved."""
 
@@ -96,6 +104,8 @@ class MovableScene:
         self.camera = camera.base if isinstance(camera, CameraParameters) else camera
         if isinstance(camera, CameraParameters):
             values |= dict(zip(CAMERA, (*camera.twist.split(3), *camera.intrinsics.split(2)), strict=True))
+            if camera.last_twist is not None:
+                values |= dict(zip(LAST_ROW, camera.last_twist.split(3), strict=True))
         self.inputs = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         with torch.enable_grad():
             self.out = self._render(self.inputs)
@@ -143,7 +153,8 @@ class MovableScene:
         if CAMERA[0] not in inputs:
             return self.camera
         rotation, translation, focal, principal = (inputs[name] for name in CAMERA)
-        return CameraParameters(self.camera, torch.cat([rotation, translation]), torch.cat([focal, principal]))
+        last = torch.cat([inputs[name] for name in LAST_ROW]) if self.camera.shutter else None
+        return CameraParameters(self.camera, torch.cat([rotation, translation]), torch.cat([focal, principal]), last)
 
     def _stack(self, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None) -> torch.Tensor:
         """[H, W, 4 or 5], all of about the same size."""
@@ -190,6 +201,7 @@ def _natural(scene: MovableScene, name: str) -> torch.Tensor | float:
     if name == "sh":
         return float(value.square().mean().sqrt()) or 1.0
     pixel = scene.out.depths / scene.camera.fx  # at the Gaussian, world units
+    name = name.removeprefix("last_")
     if name in CAMERA:  # the image moves by a pixel, by a focal length at its edge
         typical = float(pixel[pixel > 0].median()) if (pixel > 0).any() else 1.0
         focal = max(scene.camera.fx, scene.camera.fy)

@@ -29,11 +29,12 @@ from warp_splat.raster.checks import (
 )
 from warp_splat.raster.differences import (
     CAMERA,
-    INPUTS,
     INTERMEDIATES,
+    LAST_ROW,
     RUNGS,
     MovableScene,
     Trial,
+    inputs_of,
     try_direction,
     try_directions,
 )
@@ -134,7 +135,7 @@ def check_gradients(
         opacities: [N].
         sh: [N, K, 3], or the pair.
         camera: pinhole camera; with :class:`CameraParameters`, "rotation", "translation" (the twist), "focal" and
-            "principal" are checked, too.
+            "principal" are checked, too, with a rolling shutter also "last_rotation" and "last_translation".
         background: RGB.
         adjoint: the mode to check; also "generated" and "plain" (known to be wrong), which are there to be compared.
         options: what to compute; with ``depth``, it is part of the loss.
@@ -154,8 +155,7 @@ def check_gradients(
             if the falloff of ``options`` is none.
     """
     options = _check(adjoint, options, camera, parameters, directions, tolerance, seed)
-    inputs = INPUTS + CAMERA if isinstance(camera, CameraParameters) else INPUTS
-    names = inputs if parameters is None else tuple(parameters)
+    names = inputs_of(camera) if parameters is None else tuple(parameters)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = check_background(background, means.device)
     with own_explained(options):
@@ -166,7 +166,7 @@ def check_gradients(
         explain_invalid(scene.out.invalid, quats)
     trials = {name: try_directions(scene, name, directions, tolerance) for name in names}
     rows = tuple(_judge(name, trials[name], tolerance) for name in names)
-    off = [row for row in rows if row.verdict == "off" and row.name not in ("background", *CAMERA)]
+    off = [row for row in rows if row.verdict == "off" and row.name not in ("background", *CAMERA, *LAST_ROW)]
     worst = None
     if off:
         name = max(off, key=lambda row: row.error).name
@@ -206,7 +206,7 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
     """The options to use. Raises InputError for what :func:`check_gradients` itself demands of its arguments."""
     if not is_one_of(adjoint, MODES):
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
-    known = INPUTS + INTERMEDIATES + (CAMERA if isinstance(camera, CameraParameters) else ())
+    known = inputs_of(camera) + INTERMEDIATES
     if parameters is not None and not (
         isinstance(parameters, (list, tuple)) and parameters and all(is_one_of(name, known) for name in parameters)
     ):

@@ -23,10 +23,10 @@ from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES, vec16
 from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.lenses import Lens
-from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, twist_gradient
+from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, pose_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.raster.moving import exposed_by, motion_of, with_motion
+from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
 from warp_splat.runtime.launch import launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
@@ -91,9 +91,10 @@ def project(
     dropped: Dropped | None = None,
 ) -> Splats2D:
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
-    learned, limits = (None, None), camera
+    learned, limits = (None, None, None), camera
     if isinstance(camera, CameraParameters):
-        learned, limits, camera = (camera.twist, camera.intrinsics), camera.base, camera.camera
+        learned = (camera.twist, camera.intrinsics, camera.last_twist)
+        limits, camera = camera.base, camera.camera
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     driver = driver or driver_of(gaussians.means.device)
     projection, reach_of = projection_of(options, camera.lens), falloff_of(options).reach_of
@@ -110,7 +111,7 @@ def _project_geometry(
     outputs: Sequence[torch.Tensor],
     adj_inputs: Sequence[torch.Tensor] = (),
     adj_outputs: Sequence[torch.Tensor] = (),
-) -> None:
+) -> list[torch.Tensor]:
     """The geometry of N Gaussians; or, with adjoints, the adjoint of that, added to ``adj_inputs``.
 
     In groups of ``lanes``: the last ones are filled up with zeros, which are no Gaussians.
@@ -124,16 +125,20 @@ def _project_geometry(
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
         adj_inputs: of all inputs.
         adj_outputs: of all outputs; those of the last two are not read.
+
+    Returns:
+        With adjoints and a motion, what holds its gradient (:func:`.moving.motion_gradient`).
     """
     count = len(outputs[-1])
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
-    _project_groups(kernel, cam, lanes, motion, *([tensor[:whole] for tensor in table] for table in tables))
+    turns = _project_groups(kernel, cam, lanes, motion, *([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
         last = [[_filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
-        _project_groups(kernel, cam, lanes, motion, *last)
+        turns += _project_groups(kernel, cam, lanes, motion, *last)
         for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
             tensor[whole:] = group[: count - whole]
+    return turns
 
 
 def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
@@ -142,8 +147,8 @@ def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     return full
 
 
-def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj_outputs) -> None:
-    """See :func:`_project_geometry`; N is a multiple of ``lanes``."""
+def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj_outputs) -> list[torch.Tensor]:
+    """See :func:`_project_geometry`; N is a multiple of ``lanes``. Likewise."""
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
 
@@ -164,8 +169,10 @@ def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj
         adjoint = {"adj_inputs": [cam, *adj_in], "adj_outputs": [*adj_out, None, None]}
     given, found = [cam, *in_groups(inputs, types_in)], in_groups(outputs, types_out)
     _launch_groups(kernel, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
-    if motion is not None and adj_inputs:
-        adj_quats.copy_(adj_inputs[1][:, 0].reshape_as(adj_quats))
+    if motion is None or adj_quats is None:
+        return []
+    adj_quats.copy_(adj_inputs[1][:, 0].reshape_as(adj_quats))
+    return [adj_inputs[1]]
 
 
 def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
@@ -188,9 +195,8 @@ class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
     @staticmethod
-    def forward(
-        ctx, means, quats, scales, opacities, sh_dc, sh_rest, twist, intrinsics, camera, cam, kernel, driver, dropped
-    ):
+    def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, *more):
+        *learned, camera, cam, kernel, driver, dropped = more
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
         count, new, lanes = means.shape[0], means.new_empty, driver.lanes
         splats = Splats2D(
@@ -202,7 +208,7 @@ class Project(torch.autograd.Function):
         _project_geometry(cam, kernel, lanes, motion_of(camera), _shapes(gaussians), _geometry(splats))
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
-        ctx.save_for_backward(*gaussians, *splats, twist, intrinsics)
+        ctx.save_for_backward(*gaussians, *splats, *learned)
         ctx.camera, ctx.cam, ctx.kernel, ctx.driver, ctx.dropped = camera, cam, kernel, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
         return tuple(splats)
@@ -212,9 +218,10 @@ class Project(torch.autograd.Function):
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
             given = Gaussians(*ctx.saved_tensors[: len(Gaussians._fields)])
-            splats = Splats2D(*ctx.saved_tensors[len(given) : -2])
-            twist, intrinsics = ctx.saved_tensors[-2:]
-            wants_twist, wants_intrinsics = ctx.needs_input_grad[len(given) : len(given) + 2]
+            splats = Splats2D(*ctx.saved_tensors[len(given) : -3])
+            twist, intrinsics, last_twist = ctx.saved_tensors[-3:]
+            wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
+            wants_pose = wants_twist or wants_last
             adj_splats = Splats2D(*(adj.contiguous() for adj in adj_outputs[:5]), splats.extents, splats.radii)
             lanes, count, device = ctx.driver.lanes, len(given.means), given.means.device
             seen, rest = view(splats.radii, wp.int32), given.sh_rest
@@ -227,18 +234,24 @@ class Project(torch.autograd.Function):
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
             set_all(0, *shapes)
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
-            adj_placed = torch.zeros_like(adj_means) if wants_twist else adj_means  # else added to the colors' part
+            adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
             adj_inputs = _shapes(adj._replace(means=adj_placed))
             motion = motion_of(ctx.camera)
-            _project_geometry(ctx.cam, ctx.kernel, lanes, motion, _shapes(given), outputs, adj_inputs, adj_outputs)
-            adj_twist = adj_intrinsics = None
-            if wants_twist:
+            turns = _project_geometry(
+                ctx.cam, ctx.kernel, lanes, motion, _shapes(given), outputs, adj_inputs, adj_outputs
+            )
+            adj_twist = adj_intrinsics = adj_last = None
+            adj_motion = motion_gradient(turns, lanes, wants_pose or wants_intrinsics)
+            if wants_pose:
                 adj_means += adj_placed
-                adj_twist = twist_gradient(ctx.camera, ctx.cam, lanes, twist, given, adj, adj_placed)
+                pose = pose_gradient(ctx.camera, ctx.cam, lanes, given, adj, adj_placed)
+                first, last = pose_gradients(ctx.camera.shutter, pose, adj_motion)
+                adj_twist = twist_gradient(first, twist) if wants_twist else None
+                adj_last = twist_gradient(last, last_twist) if wants_last else None
             if wants_intrinsics:
                 adj_intrinsics = intrinsics_gradient(
-                    ctx.camera, ctx.cam, lanes, intrinsics, given.opacities, splats, adj_splats
+                    ctx.camera, ctx.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3]
                 )
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
@@ -248,7 +261,13 @@ class Project(torch.autograd.Function):
                 launch(quarantine, count, [seen], found, device=device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
-        return *(tensor if wants else None for tensor, wants in wanted), adj_twist, adj_intrinsics, *[None] * 5
+        return (
+            *(tensor if wants else None for tensor, wants in wanted),
+            adj_twist,
+            adj_intrinsics,
+            adj_last,
+            *[None] * 5,
+        )
 
 
 def _geometry(splats: Splats2D) -> list[torch.Tensor]:
