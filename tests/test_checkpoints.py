@@ -127,7 +127,7 @@ def results(folder):
     """What a run has measured, without times."""
     history = json.loads((folder / "history.json").read_text())
     entry = json.loads((folder / "results.json").read_text())["ours_60"]
-    timed = ("seconds", "iterations_per_second", "peak_memory_mb")
+    timed = ("seconds", "spent", "iterations_per_second", "peak_memory_mb")
     return [{k: v for k, v in item.items() if k not in timed} for item in (*history, entry)]
 
 

@@ -80,7 +80,7 @@ def test_a_shape_without_a_cooldown_gets_one():
 
 def test_flags_of_a_plan_are_the_plan():
     plan = plan_for(FAST, COST, 60.0, TASK).changed(settle_from_iter=99)
-    again = parse(["train", "-s", "x", "--preset", "fast", *as_flags(plan).split()])
+    again = parse(["train", "-s", "x", *as_flags(plan).split()])
     assert again == plan and again.learn.end == 99 + plan.learn.cooldown
     assert "pose" not in as_flags(plan) and "--pose_from_iter 0" in as_flags(plan.changed(parts="pose"))
 

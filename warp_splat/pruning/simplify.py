@@ -53,7 +53,7 @@ def simplify(config: SimplifyConfig) -> int:
     else:
         count = _count(config, total, lambda count: written_bytes(output, file._replace(splats=thinning.to(count))))
     splats = made(count)
-    splats = fewer_harmonics(splats, opened.setting, _squared_error(opened, splats))
+    splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
     write(output, file, splats)
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
@@ -127,7 +127,7 @@ def _most(total: int, good: Callable[[int], bool]) -> int:
     return low
 
 
-def _squared_error(opened: Opened, splats: SplatArrays) -> float:
+def squared_error(opened: Opened, splats: SplatArrays) -> float:
     """Of the training views, summed over pixels and channels, colors 0..1."""
     picture, error = opened.picture(splats), 0.0
     for view in opened.scene.train:

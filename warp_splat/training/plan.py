@@ -102,7 +102,8 @@ def as_flags(config: TrainConfig) -> str:
         idle.add("settle_from_iter")
     shown = {name: value for name, value in schedule_of(config).items() if name not in idle}
     shown |= {"coarse": config.learn.coarse, "max_gaussians": config.grow.max_gaussians}
-    return " ".join(f"--{name} {value}" for name, value in shown.items())
+    preset = f"--preset {config.data.preset} " if config.data.preset else ""
+    return preset + " ".join(f"--{name} {value}" for name, value in shown.items())
 
 
 class Reached(NamedTuple):

@@ -136,7 +136,7 @@ def restore(trainer: Trainer, run: Run, checkpoint: Checkpoint) -> None:
     trainer.restore(checkpoint)
     run.iteration = run.kept = checkpoint.count("iteration")
     run.seconds = checkpoint.fact("seconds", float)
-    run.spent = checkpoint.fact("spent", float) if trainer.config.learn.minutes else 0.0
+    run.spent = checkpoint.fact("spent", float) if "spent" in checkpoint.facts else 0.0  # older ones have no minutes
     run.start -= checkpoint.fact("wall", float)
     run.history = checkpoint.fact("history", list)
     for record in run.history:
