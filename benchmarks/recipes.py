@@ -1,0 +1,230 @@
+"""Ingredients of recipes beside `--preset fast`, at one budget: quality, processor time, Gaussians in pixels.
+
+A run trains in this process, on one thread. Its seconds are the processor's, of its steps alone. What has been run is
+kept in a folder and not repeated; several of these programs may run at once, and share the work.
+
+    python benchmarks/recipes.py --runs output/recipes --fox path/to/fox --church path/to/church [--out docs/benchmarks]
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import torch
+import work
+from common import machine, write_table
+
+from warp_splat.evaluation.metrics import psnr, ssim
+from warp_splat.evaluation.perceptual import flip
+from warp_splat.gaussians import logarithm
+from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
+from warp_splat.runtime import launch
+from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
+from warp_splat.scene.start import random_points
+from warp_splat.scene.types import Scene
+from warp_splat.training.growth import budget
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.trainer import Trainer
+
+METRICS = {"psnr": psnr, "ssim": ssim, "flip": flip}
+HALVED = {"fox": 2, "church": 2, "embedded": 1, "embedded, no points": 1}  # by this, an edge of the photographs
+MARKS = 20  # measurements over a run
+BASE, GROW = "--preset fast", {"growth": "budget"}
+FULL = ("church", 18_337)  # a budget of as many as there are points
+HALVES = budget.halves
+
+
+class Recipe(NamedTuple):
+    """What is changed of ``--preset fast``, and where it is measured."""
+
+    options: dict
+    seeds: dict[tuple[str, int], int]  # of (scene, budget)
+    code: dict = {}  # noqa: RUF012 - in place of what the growth to a budget has by these names
+    score: Callable | None = None  # likewise
+
+
+def fainter(raw: dict, split: torch.Tensor) -> dict:
+    """Halves whose opacity is 0.6 of the whole's."""
+    both = HALVES(raw, split)
+    opacities = 0.6 * torch.sigmoid(raw["opacities"][split].double()).numpy()
+    logits = torch.from_numpy(logarithm(opacities) - logarithm(1.0 - opacities)).float()
+    return {**both, "opacities": torch.cat([logits, logits])}
+
+
+EACH = {("fox", 30_000): 1, ("church", 30_000): 1, ("embedded", 30_000): 1}
+FOX, WITHOUT = {("fox", 30_000): 1}, {("embedded, no points", 60_000): 1}
+ALL = dict.fromkeys([*EACH, ("fox", 60_000)], 3) | {FULL: 1, ("embedded", 50_000): 1} | WITHOUT
+OFTEN = {"EVERY": 8}  # as when these were tried
+SHORT = {"iterations": 2700, "cooldown": 750, "densify_from_iter": 225, "densify_until_iter": 2100}
+RECIPES = {
+    BASE: Recipe({}, ALL),
+    "--growth budget": Recipe(GROW, ALL),
+    "--growth mcmc": Recipe({"growth": "mcmc"}, EACH | WITHOUT),
+    "budget, a look in every 8th step": Recipe(GROW, EACH, OFTEN),
+    "budget, score: gradient alone": Recipe(GROW, FOX, OFTEN, lambda b: b.gradient / b.views.clamp_min(1.0)),
+    "budget, score: error alone": Recipe(GROW, FOX, OFTEN, lambda b: b.error / b.looks.clamp_min(1.0)),
+    "budget, halves of 0.6 the opacity": Recipe(GROW, FOX, {**OFTEN, "halves": fainter}),
+    "budget, three quarters of the steps": Recipe(GROW | SHORT | {"coarse_until_iter": 1125}, FOX, OFTEN),
+    "budget, full size from step 2400": Recipe(GROW | {"coarse_until_iter": 2400}, EACH),
+    "budget, none relocated": Recipe(GROW, {FULL: 1}, {"MOVED": 0.0}),
+}
+
+
+@contextmanager
+def changed(recipe: Recipe) -> Iterator[None]:
+    """The code as the recipe has it."""
+    score = recipe.score or budget.Budget._score
+    with patch.multiple(budget, **{"EVERY": budget.EVERY, **recipe.code}), patch.object(budget.Budget, "_score", score):
+        yield
+
+
+def scene_of(name: str, place: Path) -> Scene:
+    """Read, at its size."""
+    scene = load_scene(place, eval=True, resolution=HALVED[name], report=str)
+    if not name.endswith("no points"):
+        return scene
+    points, colors = random_points([view.camera for view in scene.train])
+    return replace(scene, points=points, colors=colors)
+
+
+def measure(scene: Scene, options: dict) -> dict:
+    """Train, and measure on the held-out views."""
+    trainer = Trainer(scene, TrainConfig(**options, device="cpu"))
+    trainer.warm_up()
+    seconds, curve, iterations = 0.0, [], options["iterations"]
+    marks = {iterations * mark // MARKS for mark in range(1, MARKS + 1)}
+    for iteration in range(1, iterations + 1):
+        start = time.process_time()
+        if iteration > 1:
+            trainer.update(iteration - 1)
+        trainer.differentiate(iteration)
+        seconds += time.process_time() - start
+        if iteration in marks:
+            curve.append((iteration, seconds, trainer.evaluate(scene.test), len(trainer.model)))
+    pairs = [(trainer.picture(view.camera), view.picture) for view in scene.test]
+    gaussians = trainer.model.activated(trainer.degree)
+    counts = work.mean([work.count(gaussians, view.camera, trainer.options) for view in scene.test])
+    return {
+        **{name: float(np.mean([metric(*pair) for pair in pairs])) for name, metric in METRICS.items()},
+        "seconds": seconds,
+        "gaussians": len(trainer.model),
+        "pairs": counts.pairs,
+        "curve": curve,
+    }
+
+
+def options_of(scene: str, limit: int, seed: int, recipe: Recipe) -> dict:
+    """Of a training."""
+    embedded = EMBEDDED_DEFAULTS["fast"] if scene.startswith("embedded") else {}
+    return {**PRESETS["fast"], **embedded, "max_gaussians": limit, "seed": seed, **recipe.options}
+
+
+def train_all(runs: Path, places: dict[str, Path]) -> None:
+    """Train what no other program has begun."""
+    scenes = {}
+    jobs = [(seed, *job) for job in jobs_of() for seed in range(job[-1])]
+    for seed, name, scene, limit, _ in sorted(jobs, key=lambda job: (job[1] not in list(RECIPES)[:2], job[0])):
+        path = file_of(runs, name, scene, limit, seed)
+        if scene not in places or path.exists():
+            continue
+        path.touch(exist_ok=False)
+        if scene not in scenes:
+            scenes[scene] = scene_of(scene, places[scene])
+        try:
+            with changed(RECIPES[name]):
+                found = measure(scenes[scene], options_of(scene, limit, seed, RECIPES[name]))
+            path.write_text(json.dumps(found))
+            print(scene, limit, name, seed, round(found["psnr"], 2), round(found["seconds"]), flush=True)
+        finally:
+            if not path.stat().st_size:
+                path.unlink()
+
+
+def jobs_of() -> list[tuple[str, str, int, int]]:
+    """Recipe, scene, budget and number of seeds."""
+    return [(name, *place, seeds) for name, recipe in RECIPES.items() for place, seeds in recipe.seeds.items()]
+
+
+def file_of(runs: Path, name: str, scene: str, limit: int, seed: int) -> Path:
+    """Where a run is kept."""
+    word = "".join(letter if letter.isalnum() else "_" for letter in name)
+    return runs / f"{scene}_{limit}_{word}_{seed}.json"
+
+
+def load(runs: Path, name: str, scene: str, limit: int, seeds: int) -> dict[int, dict]:
+    """The runs that are finished, by seed."""
+    paths = {seed: file_of(runs, name, scene, limit, seed) for seed in range(seeds)}
+    return {seed: json.loads(p.read_text()) for seed, p in paths.items() if p.exists() and p.stat().st_size}
+
+
+def seconds_to(curve: list, quality: float) -> float:
+    """When a run first had this PSNR, between two measurements; infinite if never."""
+    before = (0.0, curve[0][2])
+    for _, seconds, value, _ in curve:
+        if value >= quality:
+            return before[0] + (seconds - before[0]) * max(quality - before[1], 0.0) / max(value - before[1], 1e-9)
+        before = (seconds, value)
+    return float("inf")
+
+
+def row_of(runs: Path, name: str, scene: str, limit: int, seeds: int) -> tuple | None:
+    """Means over the seeds that have been run, beside ``--preset fast`` with the same."""
+    beside = load(runs, BASE, scene, limit, 3)
+    pairs = [(run, beside[seed]) for seed, run in load(runs, name, scene, limit, seeds).items() if seed in beside]
+    if not pairs:
+        return None
+    found = [run for run, _ in pairs]
+    mean = {key: np.mean([run[key] for run in found]) for key in found[0] if key != "curve"}
+    quality = [run["psnr"] for run in found]
+    gain = [run["psnr"] - other["psnr"] for run, other in pairs]
+    shares = [seconds_to(run["curve"], other["psnr"]) / other["seconds"] for run, other in pairs]
+    reached = f"{100 * np.mean(shares):.0f} %" if np.isfinite(shares).all() else "never"
+    return (
+        *(scene, limit, name, len(found), f"{mean['psnr']:.2f}"),
+        f"{min(quality):.2f} to {max(quality):.2f}" if len(found) > 1 else "",
+        *("" if name == BASE else f"{np.mean(gain):+.2f}", f"{mean['ssim']:.4f}", f"{mean['flip']:.4f}"),
+        *(f"{mean['pairs'] / 1e6:.1f}", f"{mean['seconds']:.0f}", "" if name == BASE else reached),
+    )
+
+
+HEADERS = (
+    *("scene", "budget", "recipe", "seeds", "PSNR dB", "from to", "gain", "SSIM", "FLIP", "Mpairs", "s"),
+    "time to the PSNR of fast",
+)
+NOTE = (
+    "Held-out views; means over seeds. fox: 270 x 480 px, church: 384 x 256 px, half of their edges; embedded: whole. "
+    "s: of the processor, of the steps on one thread; the machine did other work, too, so a few percent mean nothing. "
+    "Mpairs: Gaussians blended into pixels, of a view. Last column: share of the seconds of `--preset fast` after "
+    "which a run first had its final PSNR."
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=Path, required=True, help="folder for what has been run")
+    parser.add_argument("--fox", type=Path, help="photographs of 540 x 960 px")
+    parser.add_argument("--church", type=Path, help="photographs of 768 x 512 px")
+    parser.add_argument("--only_table", action="store_true", help="train nothing more")
+    parser.add_argument("--out", type=Path, help="folder for recipes.md and recipes.json")
+    arguments = parser.parse_args()
+    launch.prepare("cpu", 1)
+    arguments.runs.mkdir(parents=True, exist_ok=True)
+    embedded = embedded_scene()
+    places = {"fox": arguments.fox, "church": arguments.church, "embedded": embedded, "embedded, no points": embedded}
+    if not arguments.only_table:
+        train_all(arguments.runs, {name: place for name, place in places.items() if place})
+    rows = [row for job in jobs_of() if (row := row_of(arguments.runs, *job))]
+    rows.sort(key=lambda row: (list(HALVED).index(row[0]), row[1]))
+    write_table("recipes", arguments.out, HEADERS, rows, NOTE, {"headers": HEADERS, "rows": rows, "machine": machine()})
+
+
+if __name__ == "__main__":
+    main()
