@@ -69,6 +69,11 @@ def footprint(camera: str, projection: str, size: str, key: str = "psnr", per: s
     return float(row[key]) / (float(row[per]) if per else 1.0)
 
 
+def shutter(way: str, key: str) -> list[float]:
+    """Figures of shutter.json, of one way to draw."""
+    return [record[key] for record in data("shutter")["records"] if record["way"] == way]
+
+
 def worst(table: str, scene: str, variant: str) -> float:
     """The largest of the six gradients' relative errors."""
     found = (row for row in rows(table) if (row["scene"], row["variant"]) == (scene, variant))

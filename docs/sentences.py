@@ -252,6 +252,12 @@ def sentences() -> dict[str, list[tuple]]:
                 f"{max(float(row['error']) for row in f.rows('cameras_gradients')):.1e}".replace("e-0", "e-"),
             ),
             (
+                "find the means to within {} px, one step to within {} px.",
+                *(f.small(max(f.shutter(way, "off"))) for way in ("two steps", "one step")),
+            ),
+            ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
+            ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
+            (
                 "takes {} % longer with a camera that learns (one thread, {}).",
                 f.one(100 * f.data("cameras")["added"] / f.data("cameras")["step"]),
                 f.data("cameras")["machine"],

@@ -1,5 +1,6 @@
 """Rolling shutter: against pictures rendered row by row, and in float64."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,11 +13,14 @@ from scipy.spatial.transform import Rotation
 from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, check_gradients, rasterize
 from warp_splat.compare import oracle, truth
 from warp_splat.config import ADJOINTS
+from warp_splat.formats import model_folder
 from warp_splat.kernels.project import affine
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import Project, project
+from warp_splat.rendering.camera_paths import look_at
 from warp_splat.runtime import launch, pool
+from warp_splat.viewer.browser_camera import framed
 
 SHUTTER = Shutter((0.02, 0.05, -0.03), (0.05, 0.02, -0.08))
 ERROR = 1e-5
@@ -304,3 +308,22 @@ def test_any_number_of_threads(monkeypatch):
         results.append(torch.cat([parameters.twist.grad, parameters.last_twist.grad, parameters.intrinsics.grad]))
     pool.set_threads(before)
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
+
+
+def test_cameras_json_keeps_it(tmp_path):
+    camera = moving("single").camera
+    entry = {"img_name": "a.png", **model_folder.camera_entry(camera)}
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    [(_, found)] = model_folder.read_cameras(tmp_path)
+    assert found.shutter == camera.shutter
+    (tmp_path / "cameras.json").write_text(json.dumps([entry | {"shutter": {"turn": [0, 57, 0], "shift": [0, 0, 0]}}]))
+    with pytest.raises(InputError, match=r"a camera with other values .*Shutter turn: expected at most 1 rad"):
+        model_folder.read_cameras(tmp_path)
+
+
+def test_a_window_shows_the_middle():
+    camera = moving("single").camera
+    shown, _ = framed(camera, 2 * camera.width, 3 * camera.height)
+    assert shown.shutter is None and np.array_equal(shown.rotation, camera.rotation)
+    path = look_at(camera, np.zeros(3), np.ones(3), np.array([0.0, -1.0, 0.0]))
+    assert path.shutter is None

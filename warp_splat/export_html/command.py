@@ -60,6 +60,8 @@ def export_html(config: ExportHtmlConfig) -> int:
         print("  The page does not have what was learned behind the Gaussians (--parts sky): it is black there.")
     if bent := sum(camera.lens is not None for _, camera in cameras):
         print(f"  {bent} cameras have lenses with distortion; the page shows what pinholes would see from there.")
+    if rolling := sum(camera.shutter is not None for _, camera in cameras):
+        print(f"  {rolling} cameras have rolling shutters; the page shows what they see when their middle row is read.")
     if size > LARGE:
         print("  This is large, and phones lack the memory; --max_gaussians N keeps the N that matter most.")
     return 0

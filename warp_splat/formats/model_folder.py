@@ -12,6 +12,7 @@ import re
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.formats.splats import SplatFile
 from warp_splat.lenses import Lens
+from warp_splat.lenses.shutter import Shutter
 
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
@@ -207,11 +209,12 @@ def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: S
 
 
 def camera_entry(camera: Camera) -> dict[str, object]:
-    """A camera as ``cameras.json`` has it, with principal point and lens, which the reference's lacks."""
+    """A camera as ``cameras.json`` has it; the reference's lacks principal point, lens and shutter."""
     pose = {"position": camera.center.tolist(), "rotation": camera.rotation.T.tolist()}
     focal = {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
     lens = {"lens": {"model": camera.lens.model, "coefficients": camera.lens.coefficients}} if camera.lens else {}
-    return {"width": camera.width, "height": camera.height, **pose, **focal, **lens}
+    shutter = {"shutter": asdict(camera.shutter)} if camera.shutter else {}
+    return {"width": camera.width, "height": camera.height, **pose, **focal, **lens, **shutter}
 
 
 def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
@@ -286,5 +289,6 @@ def _camera(entry: dict) -> Camera:
     middle = {"cx": 0.5 * entry["width"], "cy": 0.5 * entry["height"]}
     numbers = {name: entry.get(name, middle.get(name)) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     lens = Lens(entry["lens"]["model"], tuple(entry["lens"]["coefficients"])) if entry.get("lens") else None
+    shutter = Shutter(entry["shutter"]["turn"], entry["shutter"]["shift"]) if entry.get("shutter") else None
     with np.errstate(invalid="ignore"):  # what is not finite, the camera refuses
-        return Camera(**numbers, rotation=rotation, translation=-rotation @ position, lens=lens)
+        return Camera(**numbers, rotation=rotation, translation=-rotation @ position, lens=lens, shutter=shutter)

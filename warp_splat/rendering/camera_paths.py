@@ -34,7 +34,7 @@ def look_at(lens: Camera, place: np.ndarray, target: np.ndarray, up: np.ndarray)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return replace(lens, rotation=rotation, translation=-rotation @ place)
+    return replace(lens, rotation=rotation, translation=-rotation @ place, shutter=None)
 
 
 def orbit_cameras(
@@ -135,7 +135,7 @@ def path_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     rotations = RotationSpline(times, Rotation.from_matrix([cameras[key].rotation for key in kept]))
     moments = np.linspace(0.0, times[-1], count)
     return [
-        replace(lens, rotation=rotation, translation=-rotation @ place)
+        replace(lens, rotation=rotation, translation=-rotation @ place, shutter=None)
         for rotation, place in zip(rotations(moments).as_matrix(), places(moments), strict=True)
     ]
 

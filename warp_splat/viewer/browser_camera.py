@@ -67,12 +67,12 @@ def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
     """A photograph's camera for a window of ``width`` x ``height`` px, and where the photograph lies in it.
 
     The photograph is as large as fits, in the middle; around it the camera sees on. Where its lens cannot, as that of a
-    panorama, a pinhole takes its place.
+    panorama, a pinhole takes its place. It stands still where its middle row was read.
     """
     scale = min(width / camera.width, height / camera.height)
     inner = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
     left, top = (width - inner.width) // 2, (height - inner.height) // 2
-    size = {"width": width, "height": height, "cx": inner.cx + left, "cy": inner.cy + top}
+    size = {"width": width, "height": height, "cx": inner.cx + left, "cy": inner.cy + top, "shutter": None}
     try:
         wide = replace(inner, **size)
     except InputError:
