@@ -28,10 +28,12 @@ from warp_splat.kernels.cuda.strongest import make_strongest
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.project import adj_camera, affine, ellipsoid
+from warp_splat.kernels.project.adj_lens import make_bend
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.kernels.statistics import make_observe
+from warp_splat.lenses.formulas import MODELS
 
 BLOCK = 256
 REGISTERS = 65536  # of a multiprocessor, all architectures below
@@ -58,6 +60,10 @@ def modules() -> dict[str, wp.Module]:
         "pack": tiles.make_pack().module,
         "tiles": tiles.list_tiles.module,
     }
+    for name in ("OPENCV", "OPENCV_FISHEYE"):
+        family = MODELS[name][0]
+        found[f"project, {name}"] = make_project(affine.through(family), reach_of, 1, None).module
+        found[f"adjoint of {name}"] = make_bend(affine.through(family, True), 1).module
     for depth in (False, True):
         suffix, variant = ", depth" if depth else "", BlendVariant(3 + depth)
         found[f"blend{suffix}"] = make_blend_block(variant).module

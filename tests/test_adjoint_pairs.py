@@ -29,6 +29,7 @@ CONSTANT = {
     "rounded_up": "whole numbers",
     "rounded_down": "whole numbers",
     "turn": "nobody asks for the camera's rotation",
+    "still": "the coefficients of a lens alone are asked for",
     "largest": "chooses a factor that normalization takes out again",
     "support": "extents choose tiles",
     "covers_pixel": "masks",

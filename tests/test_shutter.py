@@ -286,9 +286,9 @@ def test_check_gradients_names_the_last_row_if_it_is_off(monkeypatch):
     backward = Project.backward
 
     def spoiled(ctx, *upstream):
-        *gradients, last = backward(ctx, *upstream)[:9]
-        last[4] *= 1.02
-        return *gradients, last, *[None] * 5
+        gradients = backward(ctx, *upstream)
+        gradients[8][4] *= 1.02
+        return gradients
 
     monkeypatch.setattr(Project, "backward", staticmethod(spoiled))
     scene = moving("degree1")

@@ -73,13 +73,13 @@ def _numbers(camera, *names):
 @torch.enable_grad()
 def seen(points, camera):
     """Means [N, 2] px of points in the camera [N, 3], and the derivatives [N, 2, 3] px per world unit."""
+    means2d = on_image(points, camera)
     held, _ = held_in_view(points.clone(), camera)
-    wanted = held.requires_grad
-    held = held if wanted else held.requires_grad_()
+    held = held if held.requires_grad else held.requires_grad_()
     places = _numbers(camera, "fx", "fy") * bend(held, camera.lens)
     rows = [torch.autograd.grad(column.sum(), held, create_graph=True)[0] for column in places.unbind(1)]
     jacobian = torch.stack(rows, 1)
-    return on_image(points, camera), jacobian if wanted else jacobian.detach()
+    return means2d, jacobian if means2d.requires_grad else jacobian.detach()
 
 
 def narrowed(covariances, camera):

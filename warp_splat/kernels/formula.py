@@ -40,6 +40,10 @@ class Notes:
         """A number of the camera."""
         return Number(self, self.note("fill", code))
 
+    def element(self, code: str) -> Number:
+        """A number of an array of the kernel, which gets a gradient."""
+        return Number(self, self.note("element", code))
+
     def product(self, a: Name, b: Name) -> Name:
         """Of what may be zero or one."""
         one = self.steps.get(("fill", "1.0"))
@@ -80,7 +84,7 @@ class Notes:
                     written = [line for line in written if not line.startswith(f"{product} ")]
                     operation, operands = "fma", [*steps[product][1:], other]
             operands += [like] if operation == "fill" else []
-            code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}"}.get(operation)
+            code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}", "element": "{}"}.get(operation)
             code = code.format(*operands) if code else f"{operation}({', '.join(operands)})"
             written.append(f"{name} = {code}")
         return written
@@ -188,7 +192,7 @@ RULES = {
 
 
 def write_function(
-    name: str, notes: Notes, parameters: Sequence[str], results: Sequence[Number], lanes: int
+    name: str, notes: Notes, parameters: Sequence[str], results: Sequence[Number], lanes: int, more: Sequence[str] = ()
 ) -> wp.Function:
     """The function of ``lanes`` numbers, the camera first, that does what was noted.
 
@@ -198,13 +202,16 @@ def write_function(
         parameters: the numbers that it takes.
         results: what it returns.
         lanes: numbers side by side.
+        more: parameters that are no numbers, with their types.
     """
     names = [notes.real(result.name) for result in results]
     body = [*notes.lines(names, parameters[-1]), f"return {', '.join(names)}"]
-    head = f"def {name}(camera: CameraView, {', '.join(f'{parameter}: number' for parameter in parameters)}):"
+    taken = ["camera: CameraView", *(f"{parameter}: number" for parameter in parameters), *more]
+    head = f"def {name}({', '.join(taken)}):"
     source = "\n    ".join([head, *body]) + "\n"
     path = f"<{name} {zlib.crc32(source.encode())} of {lanes}>"
     linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
     known = {**vars(simd), "angle": angle, "CameraView": CameraView, "turn": turn, "number": simd.TYPES[lanes].number}
+
     exec(compile(source, path, "exec"), known)
     return wp.func(known[name])

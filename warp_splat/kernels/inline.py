@@ -20,7 +20,8 @@ from warp_splat.errors import InputError
 def kernel_of_parts(module_options: dict, **parts: wp.Function) -> Callable:
     """A decorator: the kernel with the bodies of ``parts`` in place of ``a, b = part(c, d)``, in a module of its own.
 
-    Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end.
+    Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end. It may
+    call other parts. Parameters beyond the arguments are the kernel's variables of these names.
 
     Raises:
         InputError: if a part does otherwise.
@@ -60,7 +61,8 @@ def _expanded(line: ast.stmt, parts: dict[str, wp.Function], names: dict, taken:
     if isinstance(line, ast.Assign) and isinstance(line.value, ast.Call) and isinstance(line.value.func, ast.Name):
         part = line.value.func.id
         if part in parts:
-            return _inlined(part, parts[part].func, line.targets[0], line.value.args, names, taken)
+            body = _inlined(part, parts[part].func, line.targets[0], line.value.args, names, taken)
+            return [new for old in body for new in _expanded(old, parts, names, taken)]
     return [line]
 
 
@@ -69,7 +71,9 @@ def _inlined(
 ) -> list[ast.stmt]:
     """The body of ``function``, its own names behind that of the part; ``names`` learns what it refers to."""
     definition, known = _parsed(function)
-    given = {parameter.arg: argument for parameter, argument in zip(definition.args.args, arguments, strict=True)}
+    parameters = [parameter.arg for parameter in definition.args.args]
+    given = dict(zip(parameters, [argument.id for argument in arguments], strict=False))
+    given |= {name: name for name in parameters[len(arguments) :]}
     nodes = [node for node in ast.walk(definition) if isinstance(node, ast.Name)]
     own = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
     renamed = {}
@@ -79,7 +83,7 @@ def _inlined(
         if name in known:
             names[renamed.get(name, name)] = known[name]
     for node in nodes:
-        node.id = given[node.id].id if node.id in given else renamed.get(node.id, node.id)
+        node.id = given[node.id] if node.id in given else renamed.get(node.id, node.id)
     body = [
         line for line in definition.body if not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))
     ]

@@ -15,6 +15,7 @@ from warp_splat.errors import InputError
 from warp_splat.kernels.project.adj_camera import make_adj_intrinsics, make_adj_pose
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import Types
+from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import cross, rotated
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.moving import Tangent
@@ -29,7 +30,7 @@ class CameraParameters:
 
     Their gradients are those of the image that is drawn. Sums have one order, whatever the threads and the processor.
     Where the Jacobian of the affine projection is clamped, and how far a lens is followed, stays as ``base`` has it: it
-    does not move with the intrinsics. The coefficients of a lens are not learned.
+    does not move with intrinsics and coefficients.
 
     Args:
         base: the camera to start from.
@@ -38,10 +39,11 @@ class CameraParameters:
             (rotation @ x_world + translation) + v``; w is at most a whole turn. None: a leaf of zeros, float64.
         intrinsics: fx, fy, cx, cy [px], [4]. None: a leaf of those of ``base``, float64.
         last_twist: likewise where the last row of a rolling shutter stands; ``twist`` is then of the first.
+        coefficients: those of ``base.lens``, [K], in its order; they have no unit. None: they are not learned.
 
     Raises:
-        InputError: if ``base`` is no camera, a tensor has not its shape or holds no real numbers, or a camera without a
-            rolling shutter is given a last twist.
+        InputError: if ``base`` is no camera, a tensor has not its shape or holds no real numbers, a camera without a
+            rolling shutter is given a last twist, or one with it, or without a lens, coefficients.
     """
 
     def __init__(
@@ -50,6 +52,7 @@ class CameraParameters:
         twist: torch.Tensor | None = None,
         intrinsics: torch.Tensor | None = None,
         last_twist: torch.Tensor | None = None,
+        coefficients: torch.Tensor | None = None,
     ):
         if not isinstance(base, Camera):
             raise InputError(f"base: expected a warp_splat.Camera, got {type(base).__name__}.")
@@ -59,6 +62,16 @@ class CameraParameters:
         self.last_twist = _checked("last_twist", last_twist, [0.0] * 6) if base.shutter else None
         self.twist = _checked("twist", twist, [0.0] * 6)
         self.intrinsics = _checked("intrinsics", intrinsics, [base.fx, base.fy, base.cx, base.cy])
+        if coefficients is not None:
+            if base.shutter is not None:
+                raise InputError("coefficients: expected None for a camera with a rolling shutter; leave them out.")
+            if not base.lens or not base.lens.coefficients:
+                raise InputError(
+                    "coefficients: expected None for a camera whose lens has none, got some; give the camera a lens "
+                    "that has, such as warp_splat.Lens('OPENCV', (0.0, 0.0, 0.0, 0.0))."
+                )
+            coefficients = _checked("coefficients", coefficients, list(base.lens.coefficients))
+        self.coefficients = coefficients
 
     @property
     def camera(self) -> Camera:
@@ -68,7 +81,10 @@ class CameraParameters:
             InputError: if the numbers make none.
         """
         fx, fy, cx, cy = _numbers(self.intrinsics)
-        base = replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy)
+        lens = self.base.lens
+        if lens and self.coefficients is not None:
+            lens = Lens(lens.model, tuple(_numbers(self.coefficients)))
+        base = replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
         if self.last_twist is None:
             return _twisted(base, "twist", self.twist)
         first = _twisted(base.at(-0.5), "twist", self.twist)

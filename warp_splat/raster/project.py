@@ -15,6 +15,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project.adj_lens import make_bend
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.lens import LIMIT
 from warp_splat.kernels.project.quarantine import quarantine
@@ -26,8 +27,9 @@ from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, pose_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
+from warp_splat.raster.lens_gradient import coefficients_gradient
 from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
-from warp_splat.runtime.launch import launch, pack_struct, view
+from warp_splat.runtime.launch import filled_up, launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
 
@@ -67,8 +69,8 @@ def lens_limit(camera: Camera) -> float:
     return min(slope, math.tan(camera.lens.limit)) if camera.lens else slope
 
 
-def projection_of(options: RasterOptions, lens: Lens | None = None) -> Projection:
-    """The user's own, or that of the file of that name, through the lens if there is one.
+def projection_of(options: RasterOptions, lens: Lens | None = None, learned: bool = False) -> Projection:
+    """The user's own, or that of the file of that name, through the lens if there is one, which may be ``learned``.
 
     Raises:
         InputError: if it knows no lenses.
@@ -80,7 +82,7 @@ def projection_of(options: RasterOptions, lens: Lens | None = None) -> Projectio
             "options.projection: expected affine or unscented for a camera with a lens, got "
             f"{'one of your own' if own else name}; choose one of them, or undistort the photographs."
         )
-    return own or (module.through(lens.family) if lens else module.PROJECTION)
+    return own or (module.through(lens.family, learned) if lens else module.PROJECTION)
 
 
 def project(
@@ -91,15 +93,17 @@ def project(
     dropped: Dropped | None = None,
 ) -> Splats2D:
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
-    learned, limits = (None, None, None), camera
-    if isinstance(camera, CameraParameters):
-        learned = (camera.twist, camera.intrinsics, camera.last_twist)
-        limits, camera = camera.base, camera.camera
-    cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
+    learned, limits, bend = (None, None, None, None), camera, None
     driver = driver or driver_of(gaussians.means.device)
+    if isinstance(camera, CameraParameters):
+        learned = (camera.twist, camera.intrinsics, camera.last_twist, camera.coefficients)
+        limits, camera = camera.base, camera.camera
+        if learned[-1] is not None and learned[-1].requires_grad:
+            bend = make_bend(projection_of(options, camera.lens, learned=True), driver.lanes)
+    cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     projection, reach_of = projection_of(options, camera.lens), falloff_of(options).reach_of
     kernel = make_project(projection, reach_of, driver.lanes, exposed_by(camera, options, driver.lanes))
-    return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, driver, dropped or Dropped()))
+    return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, bend, driver, dropped or Dropped()))
 
 
 def _project_geometry(
@@ -134,17 +138,11 @@ def _project_geometry(
     tables = (inputs, outputs, adj_inputs, adj_outputs)
     turns = _project_groups(kernel, cam, lanes, motion, *([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
-        last = [[_filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
+        last = [[filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
         turns += _project_groups(kernel, cam, lanes, motion, *last)
         for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
             tensor[whole:] = group[: count - whole]
     return turns
-
-
-def _filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
-    full = tensor.new_zeros(rows, *tensor.shape[1:])
-    full[: len(tensor)] = tensor
-    return full
 
 
 def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj_outputs) -> list[torch.Tensor]:
@@ -196,7 +194,7 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, *more):
-        *learned, camera, cam, kernel, driver, dropped = more
+        *learned, camera, cam, kernel, bend, driver, dropped = more
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
         count, new, lanes = means.shape[0], means.new_empty, driver.lanes
         splats = Splats2D(
@@ -209,7 +207,7 @@ class Project(torch.autograd.Function):
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
         ctx.save_for_backward(*gaussians, *splats, *learned)
-        ctx.camera, ctx.cam, ctx.kernel, ctx.driver, ctx.dropped = camera, cam, kernel, driver, dropped
+        ctx.camera, ctx.cam, ctx.kernel, ctx.bend, ctx.driver, ctx.dropped = camera, cam, kernel, bend, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
         return tuple(splats)
 
@@ -218,8 +216,8 @@ class Project(torch.autograd.Function):
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
             given = Gaussians(*ctx.saved_tensors[: len(Gaussians._fields)])
-            splats = Splats2D(*ctx.saved_tensors[len(given) : -3])
-            twist, intrinsics, last_twist = ctx.saved_tensors[-3:]
+            splats = Splats2D(*ctx.saved_tensors[len(given) : -4])
+            twist, intrinsics, last_twist, coefficients = ctx.saved_tensors[-4:]
             wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
             wants_pose = wants_twist or wants_last
             adj_splats = Splats2D(*(adj.contiguous() for adj in adj_outputs[:5]), splats.extents, splats.radii)
@@ -241,7 +239,7 @@ class Project(torch.autograd.Function):
             turns = _project_geometry(
                 ctx.cam, ctx.kernel, lanes, motion, _shapes(given), outputs, adj_inputs, adj_outputs
             )
-            adj_twist = adj_intrinsics = adj_last = None
+            adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
             adj_motion = motion_gradient(turns, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
                 adj_means += adj_placed
@@ -253,6 +251,10 @@ class Project(torch.autograd.Function):
                 adj_intrinsics = intrinsics_gradient(
                     ctx.camera, ctx.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3]
                 )
+            if ctx.bend:
+                adj_coefficients = coefficients_gradient(
+                    ctx.camera, ctx.cam, ctx.bend, lanes, coefficients, given, splats, adj_splats
+                )
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)
@@ -261,13 +263,8 @@ class Project(torch.autograd.Function):
                 launch(quarantine, count, [seen], found, device=device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
-        return (
-            *(tensor if wants else None for tensor, wants in wanted),
-            adj_twist,
-            adj_intrinsics,
-            adj_last,
-            *[None] * 5,
-        )
+        learned = adj_twist, adj_intrinsics, adj_last, adj_coefficients
+        return *(tensor if wants else None for tensor, wants in wanted), *learned, *[None] * 6
 
 
 def _geometry(splats: Splats2D) -> list[torch.Tensor]:

@@ -136,6 +136,15 @@ def launch_in_lanes(
             launch(make(size), runs, *arguments(TYPES[size], rows), bounds=bounds, device=device)
 
 
+def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
+    """With rows of zeros up to so many; the tensor itself, if it has them."""
+    if len(tensor) == rows:
+        return tensor
+    full = tensor.new_zeros(rows, *tensor.shape[1:])
+    full[: len(tensor)] = tensor
+    return full
+
+
 def lanes_of(dtype: type, *tensors: torch.Tensor) -> list:
     """Dense tensors as arrays of ``dtype``, as many numbers in each element as that has."""
     size = wp.types.type_size_in_bytes(dtype) // 4

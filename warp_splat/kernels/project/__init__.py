@@ -15,6 +15,7 @@ import warp as wp
 from warp_splat.errors import InputError
 
 ARGUMENTS = {"lens": 4, "outline": 17}
+COEFFICIENTS = ("coefficients: wp.array2d[number]", "g: int")  # what learned ones take besides: variables of the kernel
 
 
 class Projection(NamedTuple):
@@ -31,11 +32,14 @@ class Projection(NamedTuple):
         -> (px, py, a10, a11, a12, a20, a21, a22, drawn): the corrected ones. None: all stays as it is.
     wide:
         It sees beside and behind the camera: depth is the distance, and z may be negative.
+    learned:
+        They may take the lens's coefficients as well, from a kernel that has them (:mod:`.adj_lens`).
     """
 
     lens: Callable[[int], wp.Function]
     outline: Callable[[int], wp.Function] | None = None
     wide: bool = False
+    learned: bool = False
 
     def functions(self, lanes: int) -> list[wp.Function | None]:
         """Lens and outline for a number of lanes.
@@ -45,9 +49,10 @@ class Projection(NamedTuple):
         """
         found = []
         for (name, count), make in zip(ARGUMENTS.items(), self[:2], strict=True):
+            counts = (count, count + len(COEFFICIENTS) * self.learned)
             makes = callable(make) and not isinstance(make, wp.Function)
             made = make(lanes) if makes else make
-            fits = makes and isinstance(made, wp.Function) and len(made.input_types) == count
+            fits = makes and isinstance(made, wp.Function) and len(made.input_types) in counts
             if not fits and (make is not None or name == "lens"):
                 raise InputError(
                     f"Projection.{name}: expected a function of the lanes that makes a wp.func of {count} arguments, "

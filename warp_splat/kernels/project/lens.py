@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_splat.kernels.formula import Notes, Number, write_function
-from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project import COEFFICIENTS, Projection
 from warp_splat.lenses.formulas import Family
 
 LIMIT = 15  # place in CameraView.lens: cosine of the angle where a wide lens ends, tangent of that of another
@@ -25,27 +25,33 @@ OUTLINE = ("z", "px", "py", "a10", "a11", "a12", "a20", "a21", "a22", "t0", "t1"
 
 
 @functools.cache
-def through(family: Family) -> Projection:
-    """EWA splatting (Zwicker et al. 2001), linearized at the mean by the lens's own derivative."""
+def through(family: Family, learned: bool = False) -> Projection:
+    """EWA splatting (Zwicker et al. 2001), linearized at the mean by the lens's own derivative.
+
+    ``learned``: its coefficients are numbers of the kernel that get a gradient, not the camera's.
+    """
 
     @functools.cache
     def make_lens(lanes: int) -> wp.Function:
         notes = Notes()
-        place, slopes, seen = image_of(notes, family, *(Number(notes, name) for name in "xyz"))
+        place, slopes, seen = image_of(notes, family, *(Number(notes, name) for name in "xyz"), learned=learned)
         place = [np.where(seen, number, NOWHERE) for number in place] if family.wide else place
         turns = [
             [Number(notes, notes.note("turn", "camera", str(axis), str(column), "z")) for axis in range(3)]
             for column in range(3)
         ]
         rows = [sum(slope * entry for slope, entry in zip(row, turn, strict=True)) for row in slopes for turn in turns]
-        return write_function(f"{family.formula.__name__}_lens", notes, "xyz", [*place, *rows], lanes)
+        more = COEFFICIENTS if learned else ()
+        return write_function(f"{family.formula.__name__}_lens", notes, "xyz", [*place, *rows], lanes, more)
 
-    return Projection(make_lens, make_narrow if family.around else None, family.wide)
+    return Projection(make_lens, make_narrow if family.around else None, family.wide, learned)
 
 
-def image_of(notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True) -> tuple:
+def image_of(
+    notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True, learned: bool = False
+) -> tuple:
     """Where a point of the camera is seen [px], the derivative of that [2][3] if asked for, and whether it is seen."""
-    places, excess, seen = bent(notes, family, x, y, z, linear)
+    places, excess, seen = bent(notes, family, x, y, z, linear, learned)
     found, slopes = [], []
     for axis, place in enumerate(places):
         focal, middle = (notes.given(f"camera.{name}[{axis}]") for name in ("focal", "principal"))
@@ -54,7 +60,9 @@ def image_of(notes: Notes, family: Family, x: Number, y: Number, z: Number, line
     return found, slopes, seen
 
 
-def bent(notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True) -> tuple:
+def bent(
+    notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: bool = True, learned: bool = False
+) -> tuple:
     """What the lens makes of a point that it follows, and its slopes if asked for; how much farther out the point is.
 
     And whether it is seen.
@@ -72,7 +80,8 @@ def bent(notes: Notes, family: Family, x: Number, y: Number, z: Number, linear: 
     variables = [
         Number(notes, number.name, _unit(axis, one.name) if linear else ()) for axis, number in enumerate((x, y, z))
     ]
-    coefficients = [notes.given(f"camera.lens[{index}]") for index in range(family.count)]
+    read, code = (notes.element, "coefficients[g, {}]") if learned else (notes.given, "camera.lens[{}]")
+    coefficients = [read(code.format(index)) for index in range(family.count)]
     return family.formula(coefficients, *variables), excess, seen
 
 

@@ -20,7 +20,6 @@ class Pieces(NamedTuple):
     all_finite: wp.Function
     rotation: wp.Function
     taken_along: wp.Function
-    covariance: wp.Function
     covers_pixel: wp.Function
     offset: wp.Function
     turned_or_not: wp.Function
@@ -113,19 +112,6 @@ def make_pieces(lanes: int) -> Pieces:
         )
 
     @wp.func
-    def covariance(a10: number, a11: number, a12: number, a20: number, a21: number, a22: number):
-        """A A', and its determinant as a sum of squares."""
-        c0 = times(a11, a22) - times(a12, a21)
-        c1 = times(a12, a20) - times(a10, a22)
-        c2 = times(a10, a21) - times(a11, a20)
-        return (
-            fma(a10, a10, fma(a11, a11, times(a12, a12))),
-            fma(a10, a20, fma(a11, a21, times(a12, a22))),
-            fma(a20, a20, fma(a21, a21, times(a22, a22))),
-            fma(c0, c0, fma(c1, c1, times(c2, c2))),
-        )
-
-    @wp.func
     def covers_pixel(mean: number, extent: number, size: float):
         """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
         first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
@@ -159,6 +145,4 @@ def make_pieces(lanes: int) -> Pieces:
         one = fill(1.0, x)
         return pick(here, x, one), pick(here, y, one), pick(here, z, one)
 
-    return Pieces(
-        largest, all_finite, rotation, taken_along, covariance, covers_pixel, offset, turned_or_not, sized_or_one
-    )
+    return Pieces(largest, all_finite, rotation, taken_along, covers_pixel, offset, turned_or_not, sized_or_one)

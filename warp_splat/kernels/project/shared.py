@@ -1,14 +1,7 @@
 """The kernel of all projections: a Gaussian's mean, conic, opacity and extent in the image. Its adjoint is Warp's.
 
-With A = J W R S (2 x 3, rows a1, a2; J the derivative of the lens at the mean, W the camera's rotation, R S the
-Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLUR. Its determinant is computed as
-
-    |a1 x a2|^2 + e (|a1|^2 + |a2|^2) + e^2,
-
-a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop.
-
-Written out in numbers, because a number may be sixteen: a third of the time of vectors and matrices of one Gaussian.
-Tried:
+Here is what decides, in :mod:`.image` the mathematics. Written out in numbers, because a number may be sixteen: a third
+of the time of vectors and matrices of one Gaussian. Tried:
 
 - columns instead of rows in memory: no processor reads ahead in sixty places at once
 - a function for the products of three: an adjoint of 12.9 ms instead of 8.2
@@ -21,12 +14,13 @@ import functools
 
 import warp as wp
 
-from warp_splat.config import BLUR, COMPENSATION_MIN, NEAR
+from warp_splat.config import NEAR
 from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
+from warp_splat.kernels.project.image import make_image, parts_of_image
 from warp_splat.kernels.project.pieces import make_pieces
 from warp_splat.kernels.simd import (
     LANES,
@@ -36,7 +30,6 @@ from warp_splat.kernels.simd import (
     fma,
     inverse,
     less,
-    over,
     pick,
     real,
     root,
@@ -60,9 +53,9 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     its rows are read (:mod:`.rolling`).
     """
     number, integer, row2, row3, row4 = TYPES[lanes]
-    lens, outline = projection.functions(lanes)
     pieces = make_pieces(lanes)
-    largest, all_finite, rotation, taken_along, covariance, covers_pixel, offset, turned_or_not, sized_or_one = pieces
+    largest, all_finite, rotation, taken_along, covers_pixel, offset, turned_or_not, sized_or_one = pieces
+    image = make_image(projection, lanes)
 
     @wp.func
     def quat_of(turns: wp.array[row4], g: int):
@@ -101,9 +94,8 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     ):
         pass
 
-    parts = {"all_finite": all_finite, "lens": lens, "offset": offset, "rotation": rotation, "covariance": covariance}
-    parts |= {"turned_or_not": turned_or_not, "sized_or_one": sized_or_one}
-    parts |= {"outline": outline} if outline else {}
+    parts = {"all_finite": all_finite, "offset": offset, "rotation": rotation, "image": image}
+    parts |= {"turned_or_not": turned_or_not, "sized_or_one": sized_or_one} | parts_of_image(projection, lanes)
     parts |= {"taken_along": taken_along} if expose else {}
     parts |= {"quat_of": quat_before_motion if expose else quat_of}
     turns = wp.array2d[row4] if expose else wp.array[row4]
@@ -162,31 +154,9 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         sx, sy, sz = sized_or_one(here, sx, sy, sz)
         x = fma(turn(camera, 0, 0, one), ox, fma(turn(camera, 0, 1, one), oy, times(turn(camera, 0, 2, one), oz)))
         y = fma(turn(camera, 1, 0, one), ox, fma(turn(camera, 1, 1, one), oy, times(turn(camera, 1, 2, one), oz)))
-        px, py, j00, j01, j02, j10, j11, j12 = lens(camera, x, y, z)
-        # a1, a2; scaled last, or needles would lose digits of the scales' gradients
-        a10 = times(sx, fma(j00, m00, fma(j01, m10, times(j02, m20))))
-        a11 = times(sy, fma(j00, m01, fma(j01, m11, times(j02, m21))))
-        a12 = times(sz, fma(j00, m02, fma(j01, m12, times(j02, m22))))
-        a20 = times(sx, fma(j10, m00, fma(j11, m10, times(j12, m20))))
-        a21 = times(sy, fma(j10, m01, fma(j11, m11, times(j12, m21))))
-        a22 = times(sz, fma(j10, m02, fma(j11, m12, times(j12, m22))))
-        if wp.static(projection.outline is not None):
-            t0 = fma(r20, m00, fma(r21, m10, times(r22, m20)))
-            t1 = fma(r20, m01, fma(r21, m11, times(r22, m21)))
-            t2 = fma(r20, m02, fma(r21, m12, times(r22, m22)))
-            px, py, a10, a11, a12, a20, a21, a22, here = outline(
-                camera, z, px, py, a10, a11, a12, a20, a21, a22, t0, t1, t2, sx, sy, sz, here
-            )
-        xx, xy, yy, sharp = covariance(a10, a11, a12, a20, a21, a22)
-        blur = fill(BLUR, one)
-        det = fma(blur, xx + yy, fma(blur, blur, sharp))
-        xx = xx + blur
-        yy = yy + blur
-        opacity = pick(here, opacity, one)
-        if camera.antialiasing != 0:  # before any test of the opacity
-            least = fill(COMPENSATION_MIN, one)
-            share = over(sharp, det)
-            opacity = times(opacity, root(pick(less(least, share), share, least)))
+        px, py, xx, xy, yy, det, opacity, here = image(
+            camera, x, y, z, m00, m01, m02, m10, m11, m12, m20, m21, m22, sx, sy, sz, opacity, here
+        )
         bounded = equal(times(det, zero), zero)  # else too large for float32 numbers, about 4e9 px
         code = valid - one - times(here, one - bounded)
         radii_out[g] = whole(code)

@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_splat.config import NEAR
 from warp_splat.kernels.formula import Notes, Number, write_function
-from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project import COEFFICIENTS, Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.project.lens import NOWHERE, OUTLINE, image_of
 from warp_splat.kernels.simd import TYPES
@@ -50,8 +50,8 @@ def make_identity(lanes: int) -> wp.Function:
 
 
 @functools.cache
-def through(family: Family) -> Projection:
-    """For the lenses of a family."""
+def through(family: Family, learned: bool = False) -> Projection:
+    """For the lenses of a family; ``learned`` as in :mod:`.lens`."""
 
     @functools.cache
     def make_outline(lanes: int) -> wp.Function:
@@ -62,14 +62,14 @@ def through(family: Family) -> Projection:
             [STEP * given[f"a1{axis}"], STEP * given[f"a2{axis}"], STEP * given[f"t{axis}"] * given["s" + "xyz"[axis]]]
             for axis in range(3)
         ]
-        (px, py), _, seen = image_of(notes, family, *center, linear=False)
+        (px, py), _, seen = image_of(notes, family, *center, linear=False, learned=learned)
 
         def offset(sign: int, axis: list[Number]) -> list[Number]:
             """From the mean's image to that of a point; none to one that is not seen."""
             x, y, z = (middle + sign * part for middle, part in zip(center, axis, strict=True))
             if not family.wide:
                 z = np.where(z < NEAR, NEAR, z)
-            (qx, qy), _, too = image_of(notes, family, x, y, z, linear=False)
+            (qx, qy), _, too = image_of(notes, family, x, y, z, linear=False, learned=learned)
             dx, dy = qx - px, qy - py
             if family.around:
                 turn = 2.0 * np.pi * notes.given("camera.focal[0]")
@@ -93,9 +93,10 @@ def through(family: Family) -> Projection:
         drawn, place = given["drawn"], [px + mean[0], py + mean[1]]
         if family.wide:
             drawn, place = drawn * seen, [np.where(seen, number, NOWHERE) for number in place]
-        return write_function(f"{family.formula.__name__}_points", notes, OUTLINE, [*place, *rows, drawn], lanes)
+        more = COEFFICIENTS if learned else ()
+        return write_function(f"{family.formula.__name__}_points", notes, OUTLINE, [*place, *rows, drawn], lanes, more)
 
-    return Projection(make_identity, make_outline, family.wide)
+    return Projection(make_identity, make_outline, family.wide, learned)
 
 
 def _squares(pairs: list[list[Number]]) -> list[Number]:
