@@ -198,10 +198,12 @@ def test_ctrl_c_stops_all_after_the_same_step(tmp_path):
 
 @pytest.mark.slow
 def test_a_whole_run_of_two_processes(tmp_path):
-    """The options of test_train.py's short run; identical models are checked after every densification."""
+    """The options of test_train.py's short run, and every part that learns; after every densification the models, and
+    what the parts learned, are checked to be identical."""
     options = (
         "--eval -r 8 --iterations 119 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 110 "
     )
+    options += "--parts sky,exposure,pose,depth,floaters --exposure affine --vignetting --pose_intrinsics focal "
     options += "--opacity_reset_interval 60 --sh_interval 30 --densify_grad_threshold 0.00005 --profile 20"
     out = torchrun(ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *options.split())
     assert out.count("Done after 120 iterations") == 1 and "all-reduce" in out

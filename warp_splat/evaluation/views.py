@@ -21,7 +21,7 @@ DECIBELS = ("PSNR", "CC_PSNR", POSE)
 TOLD = 10  # views, at most, in the table that is printed
 
 
-def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
+def write_views(picture: Callable[[View], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
     """Write ``renders/00000.png``, ``gt/00000.png`` and, of views with one, ``masks/00000.png`` ... in ``folder``.
 
     Returns the renders. Surplus images of an earlier run are removed: metrics are taken over all that lie there.
@@ -29,7 +29,7 @@ def write_views(picture: Callable[[Camera], np.ndarray], views: list[View], fold
     renders = []
     kept = set()
     for index, view in enumerate(views):
-        renders.append(picture(view.camera))
+        renders.append(picture(view))
         pictures = {"renders": renders[-1], "gt": view.picture}
         if view.mask is not None:
             pictures["masks"] = np.repeat(255 * view.mask[..., None], 3, axis=2)
@@ -72,7 +72,7 @@ def evaluate_views(
         InputError: if a file cannot be written.
     """
     folder = model_folder / split / f"ours_{iteration}"
-    renders = write_views(picture, views, folder)
+    renders = write_views(lambda view: picture(view.camera), views, folder)
     means, per_view = evaluate_folder(folder, metrics)
     if where_taken:
         values = [psnr(picture(where_taken(view)), view.picture, view.mask) for view in views]

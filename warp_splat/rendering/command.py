@@ -28,6 +28,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
+from warp_splat.rendering.own_exposure import own_exposure
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene import load_scene
@@ -67,7 +68,8 @@ def render_model(config: RenderConfig) -> int:
     with _memory_explained(device, model, None if config.orbit else scene):
         white = bool(trained.get("white_background"))
         harmonics = model_folder.read_environment(config.model_path, iteration)
-        picture = make_picture(model.to(device), white, options, linear, harmonics)
+        draw = make_renderer(model.to(device), white, options, harmonics)
+        picture = lambda camera: to_bytes(draw(camera).image, linear)  # noqa: E731
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -75,7 +77,9 @@ def render_model(config: RenderConfig) -> int:
                 say(sentence)
             if scene.train and not config.skip_train:
                 written = folder / "train" / f"ours_{iteration}"
-                write_views(picture, scene.train, written)
+                exposed = own_exposure(config.model_path, iteration, trained)
+                shown = lambda view: to_bytes(exposed(draw(view.camera).image, view.name), linear)  # noqa: E731
+                write_views(shown, scene.train, written)
                 print(f"  train  {len(scene.train)} views in {written}")
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}

@@ -6,11 +6,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import torch
 from tqdm import tqdm
 
 from warp_splat.runtime import timers
 from warp_splat.runtime.interrupts import interruptible
+from warp_splat.scene.types import View
 from warp_splat.training.record import Run
+from warp_splat.training.seams import having
 from warp_splat.training.trainer import Trainer
 from warp_splat.viewer.server import Viewer
 
@@ -118,5 +121,12 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
         InputError: if no port is free.
     """
     scene, port = trainer.scene, trainer.config.report.port
-    with Viewer(trainer.look, lambda: trainer.model.parameters["means"], scene, port, scene.linear) as viewer:
+
+    def exposed(image: torch.Tensor, view: View) -> torch.Tensor:
+        for as_taken in having(trainer.parts, "as_taken"):
+            image = as_taken(image, view)
+        return image
+
+    means = lambda: trainer.model.parameters["means"]  # noqa: E731
+    with Viewer(trainer.look, means, scene, port, scene.linear, exposed) as viewer:
         yield TrainingViewer(trainer, run, viewer)

@@ -11,6 +11,7 @@ from warp_splat.formats.model_folder import open_model, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of, with_refined_cameras
+from warp_splat.rendering.own_exposure import own_exposure
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
@@ -18,6 +19,7 @@ from warp_splat.scene.types import Scene
 from warp_splat.viewer.pace import LARGEST
 from warp_splat.viewer.server import Viewer, free_port
 
+AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
 IDLE = 0.2  # seconds between two looks at Ctrl-C
 
 
@@ -38,11 +40,19 @@ def view_model(config: ViewConfig) -> int:
     scene = _find_scene(config, trained, iteration)
     harmonics = read_environment(config.model, iteration)
     draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained), harmonics)
+    exposed = own_exposure(config.model, iteration, trained)
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
         memory_explained(device, model, [LARGEST], advice),
-        Viewer(draw, lambda: model.parameters["means"], scene, config.port, is_linear(scene, trained)) as viewer,
+        Viewer(
+            draw,
+            lambda: model.parameters["means"],
+            scene,
+            config.port,
+            is_linear(scene, trained),
+            lambda image, view: exposed(image, view.name.removesuffix(AS_GIVEN)),
+        ) as viewer,
     ):
         with interruptible() as interrupted:
             print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
@@ -62,7 +72,7 @@ def _find_scene(config: ViewConfig, trained: dict, iteration: int) -> Scene | No
         scene = with_refined_cameras(given, config.model, iteration)
         if scene is given:
             return scene
-        views = [replace(view, name=f"{view.name}, as given") for view in (*given.train, *given.test)]
+        views = [replace(view, name=f"{view.name}{AS_GIVEN}") for view in (*given.train, *given.test)]
         return replace(scene, test=[*scene.test, *views])
     except InputError as error:
         if config.source_path:

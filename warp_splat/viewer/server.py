@@ -38,6 +38,7 @@ DESERTED = 10.0  # seconds after the last browser has left; one that loads the p
 MOVING_QUALITY, SHARP_QUALITY = 75, 95  # of JPEG
 
 Draw = Callable[[Camera, bool], RenderOutput]
+Exposed = Callable[[torch.Tensor, View], torch.Tensor]  # an image [H, W, 3] as the camera of a photograph took it
 
 
 class Viewer:
@@ -49,15 +50,22 @@ class Viewer:
         scene: its photographs can be jumped to; None if there are none.
         port: where to serve; if it is busy, the next free one.
         linear: the colors are in linear light.
+        exposed: how a photograph's own colors come about, where its camera is shown.
 
     Raises:
         InputError: if no port is free.
     """
 
     def __init__(
-        self, draw: Draw, means: Callable[[], torch.Tensor], scene: Scene | None, port: int, linear: bool = False
+        self,
+        draw: Draw,
+        means: Callable[[], torch.Tensor],
+        scene: Scene | None,
+        port: int,
+        linear: bool = False,
+        exposed: Exposed = lambda image, view: image,
     ):
-        self.draw_camera, self.means, self.linear = draw, means, linear
+        self.draw_camera, self.means, self.linear, self.exposed = draw, means, linear, exposed
         self.views: dict[str, View] = {}
         if scene:
             self.views = {view.name: view for view in (*scene.train, *scene.test)}
@@ -151,7 +159,11 @@ class Viewer:
         except InputError:  # a window that was folded up; it will send another camera when it opens
             return
         kind = watcher.kind.value
-        frame, note = paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
+        out = self.draw_camera(camera, kind == "depth")
+        if view is not None:
+            inside = out.image[box.top : box.top + box.height, box.left : box.left + box.width]
+            inside[:] = self.exposed(inside.clone(), view)
+        frame, note = paint(out, kind, self.linear)
         if view is not None and watcher.opacity.value > 0:
             frame = overlay(frame, view.picture, box, watcher.opacity.value)
         if watcher.client.client_id not in self.watchers:

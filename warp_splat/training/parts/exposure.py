@@ -23,7 +23,7 @@ from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import GREEN, NEEDED, gains_of
-from warp_splat.scene.types import Scene
+from warp_splat.scene.types import Scene, View
 from warp_splat.training.optimizer import power
 from warp_splat.training.parts import ExposureOptions
 from warp_splat.training.seams import Setting, Step, Verdict
@@ -86,17 +86,25 @@ class Exposure:
 
     def image(self, image: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """As the camera of this view would have shown it."""
+        return self._mapped(image, step.view)
+
+    def _mapped(self, image: torch.Tensor, view: View) -> torch.Tensor:
         with stage("exposure"):
             if self.options.vignetting:
                 near, far = _Spread.apply(self.falloff, image.shape[:2])
                 square = _squared_radius(*image.shape[:2], image.device)
                 image = (image + self.pivot) * (1.0 + (near + far * square) * square)[..., None] - self.pivot
-            numbers = self.maps[self.places[step.view]]
+            numbers = self.maps[self.places[view]]
             if self.kind == "bilateral":
                 if numbers.requires_grad:  # no pixel that is not finite may spoil the cells
                     numbers.register_hook(lambda grad: grad.nan_to_num(0.0, 0.0, 0.0))
                 return self._through_grid(image, numbers)
             return _ColorMap.apply(image, self._whole(numbers))
+
+    @torch.no_grad()
+    def as_taken(self, image: torch.Tensor, view: View) -> torch.Tensor:
+        """The same for a picture; of a photograph that is held out nothing is known."""
+        return self._mapped(image, view) if view in self.places else image
 
     def _whole(self, numbers: torch.Tensor) -> torch.Tensor:
         """Columns of a matrix and a constant, [12], of what is learned."""
