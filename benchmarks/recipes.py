@@ -191,12 +191,17 @@ def row_of(runs: Path, name: str, scene: str, limit: int, seeds: int) -> tuple |
         *(scene, limit, name, len(found), f"{mean['psnr']:.2f}"),
         f"{min(quality):.2f} to {max(quality):.2f}" if len(found) > 1 else "",
         *("" if name == BASE else f"{np.mean(gain):+.2f}", f"{mean['ssim']:.4f}", f"{mean['flip']:.4f}"),
-        *(f"{mean['pairs'] / 1e6:.1f}", f"{mean['seconds']:.0f}", "" if name == BASE else reached),
+        *(
+            round(mean["gaussians"]),
+            f"{mean['pairs'] / 1e6:.1f}",
+            f"{mean['seconds']:.0f}",
+            "" if name == BASE else reached,
+        ),
     )
 
 
 HEADERS = (
-    *("scene", "budget", "recipe", "seeds", "PSNR dB", "from to", "gain", "SSIM", "FLIP", "Mpairs", "s"),
+    *("scene", "budget", "recipe", "seeds", "PSNR dB", "from to", "gain", "SSIM", "FLIP", "Gaussians", "Mpairs", "s"),
     "time to the PSNR of fast",
 )
 NOTE = (
