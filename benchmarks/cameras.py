@@ -166,9 +166,12 @@ def main() -> None:
     launch.prepare("cpu", 1)
     rows = [row for projection in PROJECTIONS for row in error_rows(projection)]
     runs = [recover(seed) for seed in range(SEEDS)]
-    step, added = measure_price()
     wanted = [wanted for _, wanted in SHOWN.values()]
     reached = [1 + max(n for n, found in enumerate(run) if not np.all(np.less(found, wanted))) for run in runs]
+    lost = [seed for seed, steps in enumerate(reached) if steps > STEPS]
+    if lost:
+        raise SystemExit(f"Of seeds 0 to {SEEDS - 1}, these did not come back within {STEPS} steps: {lost}.")
+    step, added = measure_price()
     last = {name: [run[-1][column] for run in runs] for column, name in enumerate(SHOWN)}
     data = {"last": last, "reached": reached, "step": step, "added": added, "machine": machine()}
     note = f"Gradients of a random loss on the cube of seed 0 at {SIZE} x {SIZE} px, relative to those in float64."

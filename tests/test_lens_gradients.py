@@ -9,10 +9,11 @@ import scenes
 import torch
 from scenes import SCENES
 
-from warp_splat import Camera, CameraParameters, InputError, Lens, RasterOptions, rasterize
+from warp_splat import Camera, CameraParameters, InputError, Lens, RasterOptions, check_gradients, rasterize
 from warp_splat.compare import exact_lenses, oracle, truth
 from warp_splat.config import ADJOINTS
 from warp_splat.lenses.formulas import MODELS
+from warp_splat.raster import project as projection
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.raster.project import project
@@ -200,6 +201,38 @@ def test_kernels_of_a_gpu():
     with using(CUDA):
         _, found = found_gradient(scene, upstream, options)
     assert (found - expected).norm() < ERROR * expected.norm()
+
+
+def spoil(monkeypatch, index, entry):
+    """Make a gradient of the projection's inputs wrong by 2 %."""
+    backward = projection.Project.backward
+
+    def spoiled(ctx, *upstream):
+        gradients = backward(ctx, *upstream)
+        gradients[index][entry] *= 1.02
+        return gradients
+
+    monkeypatch.setattr(projection.Project, "backward", staticmethod(spoiled))
+
+
+NAMES = ("focal", "principal", "coefficients")
+
+
+@pytest.mark.parametrize("name", ["opencv", pytest.param("fisheye", marks=pytest.mark.slow)])
+def test_check_gradients_agrees(name):
+    scene = SCENES[name]()
+    camera = CameraParameters(scene.camera, coefficients=coefficients_of(scene.camera.lens))
+    report = check_gradients(*scene.parameters(), camera, parameters=NAMES)
+    assert [row.verdict for row in report.rows] == ["agrees"] * 3, str(report)
+
+
+@pytest.mark.parametrize(("index", "entry", "name"), [(7, 2, "principal"), (9, 1, "coefficients")])
+def test_check_gradients_names_what_is_off(index, entry, name, monkeypatch):
+    spoil(monkeypatch, index, entry)
+    scene = SCENES["opencv"]()
+    camera = CameraParameters(scene.camera, coefficients=coefficients_of(scene.camera.lens))
+    report = check_gradients(*scene.parameters(), camera, parameters=NAMES)
+    assert report.named("off") == [name] and report.worst is None, str(report)
 
 
 def test_bad_input():

@@ -33,14 +33,13 @@ from warp_splat.config import RasterOptions
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.blend import blend
 from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.camera_parts import natural_size, parts_of, put_together
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 
 SHAPES = ("means", "quats", "scales", "opacities")
 INPUTS = (*SHAPES, "sh", "background")
-CAMERA = ("rotation", "translation", "focal", "principal")  # halves of the twist and of the intrinsics
-LAST_ROW = ("last_rotation", "last_translation")  # of the last twist, where there is a rolling shutter
 INTERMEDIATES = ("means2d", "conics", "opacities2d", "colors", "depths")
 LEAST = 2.0**-14  # the smallest step, relative to a parameter's natural size
 RUNGS = range(1, 10)  # steps h tried: LEAST times 2^rung
@@ -81,9 +80,7 @@ class Trial:
 
 def inputs_of(camera: Camera | CameraParameters) -> tuple[str, ...]:
     """The names of what is given: of the Gaussians, and of a camera that learns."""
-    if not isinstance(camera, CameraParameters):
-        return INPUTS
-    return INPUTS + CAMERA + (LAST_ROW if camera.last_twist is not None else ())
+    return *INPUTS, *parts_of(camera)
 
 
 class MovableScene:
@@ -102,10 +99,7 @@ class MovableScene:
         sh = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)
         values = {name: getattr(gaussians, name) for name in SHAPES} | {"sh": sh, "background": background}
         self.camera = camera.base if isinstance(camera, CameraParameters) else camera
-        if isinstance(camera, CameraParameters):
-            values |= dict(zip(CAMERA, (*camera.twist.split(3), *camera.intrinsics.split(2)), strict=True))
-            if camera.last_twist is not None:
-                values |= dict(zip(LAST_ROW, camera.last_twist.split(3), strict=True))
+        values |= parts_of(camera)
         self.inputs = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
         with torch.enable_grad():
             self.out = self._render(self.inputs)
@@ -114,7 +108,7 @@ class MovableScene:
             self.depth_weight = (self.out.alpha / deepest).detach()
             self.picture = self._stack(self.out.image, self.out.alpha, self.out.depth)
         with torch.no_grad():
-            self.splats = project(_gaussians(self.inputs), self._camera(self.inputs), options)
+            self.splats = project(_gaussians(self.inputs), put_together(self.camera, self.inputs), options)
         self.generator = torch.Generator().manual_seed(seed)
         random = torch.randn(self.picture.shape, generator=self.generator, dtype=torch.float32, device="cpu")
         self.weights = random.to(self.picture.device)
@@ -147,14 +141,8 @@ class MovableScene:
         return self._stack(image, alpha, depth / alpha.clamp_min(1e-10) if self.options.depth else None).double()
 
     def _render(self, inputs: dict[str, torch.Tensor]) -> RenderOutput:
-        return render(_gaussians(inputs), self._camera(inputs), inputs["background"], self.options, self.adjoint)
-
-    def _camera(self, inputs: dict[str, torch.Tensor]) -> Camera | CameraParameters:
-        if CAMERA[0] not in inputs:
-            return self.camera
-        rotation, translation, focal, principal = (inputs[name] for name in CAMERA)
-        last = torch.cat([inputs[name] for name in LAST_ROW]) if self.camera.shutter else None
-        return CameraParameters(self.camera, torch.cat([rotation, translation]), torch.cat([focal, principal]), last)
+        camera = put_together(self.camera, inputs)
+        return render(_gaussians(inputs), camera, inputs["background"], self.options, self.adjoint)
 
     def _stack(self, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None) -> torch.Tensor:
         """[H, W, 4 or 5], all of about the same size."""
@@ -201,11 +189,9 @@ def _natural(scene: MovableScene, name: str) -> torch.Tensor | float:
     if name == "sh":
         return float(value.square().mean().sqrt()) or 1.0
     pixel = scene.out.depths / scene.camera.fx  # at the Gaussian, world units
-    name = name.removeprefix("last_")
-    if name in CAMERA:  # the image moves by a pixel, by a focal length at its edge
+    if name not in (*INPUTS, *INTERMEDIATES):
         typical = float(pixel[pixel > 0].median()) if (pixel > 0).any() else 1.0
-        focal = max(scene.camera.fx, scene.camera.fy)
-        return dict(zip(CAMERA, (1.0 / focal, typical, 2.0 * focal / scene.camera.width, 1.0), strict=True))[name]
+        return natural_size(scene.camera, name, typical)
     if name == "means":  # the short axis, which is no less than half a pixel wide on the image
         return torch.hypot(scene.inputs["scales"].amin(1), 0.5 * pixel)[:, None]
     xx, xy, yy = scene.out.conics.unbind(1)

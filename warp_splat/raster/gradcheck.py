@@ -28,10 +28,9 @@ from warp_splat.raster.checks import (
     own_explained,
 )
 from warp_splat.raster.differences import (
-    CAMERA,
     INTERMEDIATES,
-    LAST_ROW,
     RUNGS,
+    SHAPES,
     MovableScene,
     Trial,
     inputs_of,
@@ -135,7 +134,8 @@ def check_gradients(
         opacities: [N].
         sh: [N, K, 3], or the pair.
         camera: pinhole camera; with :class:`CameraParameters`, "rotation", "translation" (the twist), "focal" and
-            "principal" are checked, too, with a rolling shutter also "last_rotation" and "last_translation".
+            "principal" are checked, too, with a rolling shutter also "last_rotation" and "last_translation", with
+            coefficients of a lens "coefficients".
         background: RGB.
         adjoint: the mode to check; also "generated" and "plain" (known to be wrong), which are there to be compared.
         options: what to compute; with ``depth``, it is part of the loss.
@@ -166,7 +166,8 @@ def check_gradients(
         explain_invalid(scene.out.invalid, quats)
     trials = {name: try_directions(scene, name, directions, tolerance) for name in names}
     rows = tuple(_judge(name, trials[name], tolerance) for name in names)
-    off = [row for row in rows if row.verdict == "off" and row.name not in ("background", *CAMERA, *LAST_ROW)]
+    of_gaussians = {*SHAPES, "sh", *INTERMEDIATES}
+    off = [row for row in rows if row.verdict == "off" and row.name in of_gaussians]
     worst = None
     if off:
         name = max(off, key=lambda row: row.error).name
