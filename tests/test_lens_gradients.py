@@ -163,6 +163,17 @@ def test_any_number_of_threads(monkeypatch):
     assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2]) and results[0].abs().min() > 0
 
 
+@pytest.mark.parametrize("count", [0, 16, 17])
+def test_any_number_of_gaussians(count):
+    """Whole groups of sixteen, and what is left over: more that nobody sees change nothing."""
+    scene = SCENES["opencv"]()
+    weight = {"image": torch.ones(scene.camera.height, scene.camera.width, 3)}
+    few, more = ([tensor[:rows].clone() for tensor in scene.parameters()] for rows in (count, count + 5))
+    more[3][count:] = 0.0
+    found = [found_gradient(scene, weight, PLAIN, leaves=leaves)[1] for leaves in (few, more)]
+    assert torch.equal(*found) and bool(found[0].any()) == (count > 0)
+
+
 def test_nothing_else_changes():
     """Image and gradients of the Gaussians, bit for bit; nor is anything learned that wants no gradient."""
     found = []

@@ -36,6 +36,8 @@ def coefficients_gradient(
     total, whole = np.zeros(len(numbers)), count - count % lanes
     for rows in (slice(0, whole), slice(whole, count)):
         groups = -(-(rows.stop - rows.start) // lanes)
+        if not groups:
+            continue
         tables = ([filled_up(tensor[rows], groups * lanes) for tensor in table] for table in given)
         total += _bent(cam, bend, lanes, numbers.expand(groups, lanes, -1), *tables)
     return torch.tensor((total[:, None] * _prepared(camera.lens)).sum(0)).to(coefficients)
