@@ -8,6 +8,7 @@ and follows the gradients of its pose and of fx and fy until it sees the picture
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -18,7 +19,7 @@ from common import machine, write_table
 from made_up import steps_of
 from step import synthetic
 
-from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
+from warp_splat import Camera, CameraParameters, Lens, RasterOptions, rasterize
 from warp_splat.compare import oracle, truth
 from warp_splat.config import ADJOINTS, PROJECTIONS
 from warp_splat.evaluation.report import BLUE, ORANGE, new_panels, plain_axes, save_figure
@@ -36,6 +37,9 @@ HEADERS = ("projection", "adjoint", "rotation", "translation", "fx, fy", "cx, cy
 COUNT, ROUNDS = 194_000, 30  # of the step whose price is measured
 LEVELS = (1, 2, 4, 8, 16)  # px, boxes over which pictures are averaged before they are compared
 RATE, LAST_RATE = 1e-2, 1e-4  # of Adam: radians, meters, share of the focal length
+LENS = Lens("OPENCV", (0.12, -0.05, 0.004, -0.006))
+LENS_UNITS = (0.1, 0.1, 0.01, 0.01)  # of its coefficients
+LENS_STEPS, LENS_WANTED = 30, 0.05  # px
 ANGLE, SHIFT, ZOOM = np.radians(5.0), 0.1, 1.05
 
 
@@ -73,15 +77,45 @@ def recover(seed: int, steps: int = STEPS) -> list[tuple[float, float, float]]:
         focal = torch.tensor([right.fx, right.fy]) * numbers[6:].exp()
         parameters = CameraParameters(right, numbers[:6], torch.cat([focal, middle]))
         errors.append(distance(parameters.camera, right))
-        difference = (rasterize(*gaussians, parameters).image - target).permute(2, 0, 1)
-        pooled = [torch.nn.functional.avg_pool2d(difference, level) for level in LEVELS]
-        loss = torch.stack([picture.square().mean() for picture in pooled]).sum()
+        loss = compared(rasterize(*gaussians, parameters).image, target)
         adam.zero_grad()
         loss.backward()
         adam.step()
         scheduler.step()
     focal = torch.tensor([right.fx, right.fy]) * numbers[6:].exp()
     return [*errors, distance(CameraParameters(right, numbers[:6], torch.cat([focal, middle])).camera, right)]
+
+
+def compared(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Mean squares of the differences, averaged over boxes of several sizes; summed."""
+    difference = (image - target).permute(2, 0, 1)
+    pooled = [torch.nn.functional.avg_pool2d(difference, level) for level in LEVELS]
+    return torch.stack([picture.square().mean() for picture in pooled]).sum()
+
+
+def recover_lens(seed: int, steps: int = LENS_STEPS) -> list[float]:
+    """Before every step and at last: by how many pixels the coefficients are off, at most; first there are none."""
+    gaussians, right = cube(seed), replace(looking(), lens=LENS)
+    with torch.no_grad():
+        target = rasterize(*gaussians, right).image
+    numbers = torch.zeros(len(LENS_UNITS), dtype=torch.float64, requires_grad=True)
+    newton = torch.optim.LBFGS([numbers], max_iter=1, line_search_fn="strong_wolfe")
+    still = torch.zeros(6), torch.tensor([right.fx, right.fy, right.cx, right.cy])
+    rays, errors = right.rays(np.stack(np.meshgrid(*2 * [np.linspace(0, SIZE, 9)]), -1).reshape(-1, 2)), []
+
+    def learned() -> CameraParameters:
+        return CameraParameters(right, *still, coefficients=numbers * torch.tensor(LENS_UNITS))
+
+    def loss() -> torch.Tensor:
+        newton.zero_grad()
+        found = compared(rasterize(*gaussians, learned()).image, target)
+        found.backward()
+        return found
+
+    for _ in range(steps):
+        errors.append(float(np.abs(learned().camera.pixels(rays) - right.pixels(rays)).max()))
+        newton.step(loss)
+    return [*errors, float(np.abs(learned().camera.pixels(rays) - right.pixels(rays)).max())]
 
 
 def distance(camera: Camera, right: Camera) -> tuple[float, float, float]:
@@ -171,9 +205,12 @@ def main() -> None:
     lost = [seed for seed, steps in enumerate(reached) if steps > STEPS]
     if lost:
         raise SystemExit(f"Of seeds 0 to {SEEDS - 1}, these did not come back within {STEPS} steps: {lost}.")
+    lenses = [recover_lens(seed)[-1] for seed in range(SEEDS)]
+    if max(lenses) > LENS_WANTED:
+        raise SystemExit(f"A lens came back but for {max(lenses):.2g} px, expected at most {LENS_WANTED}: {lenses}.")
     step, added = measure_price()
     last = {name: [run[-1][column] for run in runs] for column, name in enumerate(SHOWN)}
-    data = {"last": last, "reached": reached, "step": step, "added": added, "machine": machine()}
+    data = {"last": last, "reached": reached, "lenses": lenses, "step": step, "added": added, "machine": machine()}
     note = f"Gradients of a random loss on the cube of seed 0 at {SIZE} x {SIZE} px, relative to those in float64."
     if arguments.out:
         plot(runs, arguments.out / "cameras.png")

@@ -1,6 +1,8 @@
 """Gradients of a lens's coefficients: of the image against the float64 oracle, of splats against differences of it."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +20,10 @@ from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch, pool
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import cameras
 
 ERROR = 1e-4  # relative L2, of all coefficients
 SMALL = (0.06, -0.03, 0.004, -0.006, 0.02, -0.01, 0.015, 0.005, 0.003, -0.002, 0.004, 0.001)
@@ -244,6 +250,12 @@ def test_check_gradients_names_what_is_off(index, entry, name, monkeypatch):
     camera = CameraParameters(scene.camera, coefficients=coefficients_of(scene.camera.lens))
     report = check_gradients(*scene.parameters(), camera, parameters=NAMES)
     assert report.named("off") == [name] and report.worst is None, str(report)
+
+
+def test_a_lens_finds_its_way_back():
+    """From no distortion, in a picture that the renderer drew."""
+    errors = cameras.recover_lens(seed=1)
+    assert errors[0] > 2.0 and errors[-1] < cameras.LENS_WANTED, errors
 
 
 def test_bad_input():
