@@ -14,7 +14,7 @@ from warp_splat.flags import flags_of
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.runtime.distributed import ALONE
-from warp_splat.training.deadline import Deadline, plan_training
+from warp_splat.training.deadline import REACHED, Deadline, plan_training
 from warp_splat.training.options import LearnOptions, TrainConfig, schedule_of
 from warp_splat.training.plan import (
     Cost,
@@ -93,6 +93,19 @@ def test_what_can_be_compared():
     assert other.startswith("Nothing comparable was measured for 0.50 megapixels and 1600 steps.")
     assert "desk, 0.48 megapixels, 1000 steps: 25.2 dB; room, 5.00 megapixels" in other
     assert comparable([], plan, TASK) == "No training was measured to compare this one with."
+
+
+def test_the_package_compares_with_what_was_measured():
+    """The package's table is that of the documents."""
+    measured = json.loads((SCENE.parents[1] / "docs" / "benchmarks" / "minutes.json").read_text())
+    rows = [
+        dict(zip(measured["headers"], row, strict=True)) for row in measured["rows"] if row[0] in ("embedded", "half")
+    ]
+    table = [Reached(**entry) for entry in json.loads(REACHED.read_text())]
+    assert len(table) == len(rows) > 2
+    for entry, row in zip(table, rows, strict=True):
+        assert entry[2:5] == (float(row["asked s"]) / 60, row["iterations"], row["Gaussians"])
+        assert entry.psnr == float(row["PSNR dB"])
 
 
 def taken(learn: LearnOptions, pace, spent: float = 0.0) -> tuple[float, int, int]:
