@@ -19,6 +19,7 @@ from pathlib import Path
 from common import machine, write_table
 
 from warp_splat.config import CORES
+from warp_splat.formats.png import load_png
 from warp_splat.training.deadline import REACHED
 from warp_splat.training.plan import Reached
 
@@ -44,9 +45,9 @@ def train(model: Path, flags: list, disturb_after: float = 0.0) -> dict:
         if process.wait():
             sys.exit(process.returncode)
     results = next(iter(json.loads((model / "results.json").read_text()).values()))
-    camera = json.loads((model / "cameras.json").read_text())[0]
+    height, width, _ = load_png(next(model.glob("test/*/renders/*.png"))).shape
     options = tomllib.loads((model / "config.toml").read_text())
-    return results | {"options": options, "pixels": camera["width"] * camera["height"]}
+    return results | {"options": options, "pixels": width * height}
 
 
 def row_of(name: str, minutes: float, found: dict) -> tuple:
