@@ -3,7 +3,8 @@
     python benchmarks/cubins.py [--out docs/cuda]
 
 Stack must be 0: a kernel that spills registers to memory is slow without a word. Occupancy is the share of the
-threads that fit on a multiprocessor at once, in blocks of 256.
+threads that fit on a multiprocessor at once. The loop is the longest one without another in it, in instructions of the
+machine code; of a blend, that is what a warp does for a tile instance at most.
 """
 
 import argparse
@@ -35,12 +36,17 @@ from warp_splat.kernels.splat import BlendVariant
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.lenses.formulas import MODELS
 
-BLOCK = 256
 REGISTERS = 65536  # of a multiprocessor, all architectures below
-#: Architecture: threads, blocks and KiB of shared memory of a multiprocessor (CUDA C++ Programming Guide, table 15).
-LIMITS = {75: (1024, 16, 64), 80: (2048, 32, 164), 86: (1536, 16, 100), 89: (1536, 24, 100), 90: (2048, 32, 228)}
+#: Architecture: threads, blocks and KiB of shared memory of a multiprocessor (CUDA C++ Programming Guide, table of
+#: technical specifications per compute capability).
+LIMITS = {
+    **{75: (1024, 16, 64), 80: (2048, 32, 164), 86: (1536, 16, 100), 89: (1536, 24, 100)},
+    **{90: (2048, 32, 228), 100: (2048, 32, 228), 120: (1536, 24, 100)},
+}
 
 PROPERTIES = re.compile(r"Function (\S+):\s+REG:(\d+) STACK:(\d+) SHARED:(\d+)")
+INSTRUCTION = re.compile(r"/\*([0-9a-f]{4,6})\*/\s+(.*?);")
+BRANCH = re.compile(r"\bBRA\b.*?\b0x([0-9a-f]+)")
 
 
 def modules() -> dict[str, wp.Module]:
@@ -95,7 +101,8 @@ def resources(name: str, module: wp.Module, arch: int, tool: str) -> list[dict]:
         wp.compile_aot_module(module, arch=arch, module_dir=folder, use_ptx=False)
         cubin = next(Path(folder).glob("*.cubin"))
         dynamic = json.loads(next(Path(folder).glob("*.meta")).read_text())
-        said = subprocess.run([tool, "-res-usage", str(cubin)], capture_output=True, text=True, check=True).stdout
+        ask = lambda what: subprocess.run([tool, what, str(cubin)], capture_output=True, text=True, check=True).stdout  # noqa: E731
+        said, loops = ask("-res-usage"), dict(map(longest_loop, ask("-sass").split("Function : ")[1:]))
     records = []
     for function, registers, stack, shared in PROPERTIES.findall(said):
         kernel = re.sub(r"^.*__locals__|_[0-9a-f]{8}(?=_cuda)|_cuda_kernel|_forward$", "", function)
@@ -103,22 +110,33 @@ def resources(name: str, module: wp.Module, arch: int, tool: str) -> list[dict]:
             "module": name,
             "kernel": kernel.replace("_backward", ", adjoint"),
             "arch": arch,
+            "threads": module.options["block_dim"],
             "registers": int(registers),
             "stack": int(stack),
             "static_shared": int(shared),
             "dynamic_shared": dynamic.get(f"{function}_smem_bytes", 0),
+            "loop": loops[function],
         }
         records.append(record | {"occupancy": occupancy(record)})
     return records
 
 
+def longest_loop(code: str) -> tuple[str, int]:
+    """A function's name, and the instructions of its longest loop that has no other in it."""
+    found = [(int(place, 16), text) for place, text in INSTRUCTION.findall(code)]
+    jumps = [(int(match[1], 16), place) for place, text in found if (match := BRANCH.search(text))]
+    loops = [(first, last) for first, last in jumps if first < last]
+    inner = [a for a in loops if not any(b != a and a[0] <= b[0] and b[1] <= a[1] for b in loops)]
+    return code.split(maxsplit=1)[0], max((sum(a <= place <= b for place, _ in found) for a, b in inner), default=0)
+
+
 def occupancy(record: dict) -> float:
-    """Share of a multiprocessor's threads in blocks of 256 that registers and shared memory leave room for."""
+    """Share of a multiprocessor's threads that registers and shared memory leave room for."""
     threads, blocks, shared = LIMITS[record["arch"]]
-    by_registers = REGISTERS // (-(-record["registers"] // 8) * 8 * BLOCK)
+    by_registers = REGISTERS // (-(-record["registers"] // 8) * 8 * record["threads"])
     used = record["static_shared"] + record["dynamic_shared"]
     by_shared = shared * 1024 // used if used else blocks
-    return min(blocks, threads // BLOCK, by_registers, by_shared) * BLOCK / threads
+    return min(blocks, threads // record["threads"], by_registers, by_shared) * record["threads"] / threads
 
 
 def main() -> None:
@@ -141,9 +159,10 @@ def main() -> None:
         most = lambda key: max(record[key] for record in here)  # noqa: B023, E731
         shares = (f"{100 * record['occupancy']:.0f}" for record in here)
         shared = (most("static_shared"), most("dynamic_shared"))
-        rows.append((module, kernel, most("registers"), most("stack"), *shared, *shares))
-    headers = ("module", "kernel", "registers", "stack", "static B", "dynamic B", *(f"sm_{arch} %" for arch in LIMITS))
-    note = "The most of any architecture; occupancy in percent, blocks of 256 threads."
+        rows.append((module, kernel, most("threads"), most("registers"), most("stack"), *shared, most("loop"), *shares))
+    headers = ("module", "kernel", "threads", "registers", "stack", "static B", "dynamic B", "loop")
+    headers = (*headers, *(f"sm_{arch} %" for arch in LIMITS))
+    note = "The most of any architecture; occupancy in percent. Loop: instructions of the longest that holds no other."
     write_table("cubins", arguments.out, headers, rows, note, {"records": records})
 
 

@@ -60,7 +60,7 @@ def make_adding_block(variant: BlendVariant) -> wp.Kernel:
     """The package's adjoint with another last line: what it wrote to a slot is added to the Gaussian's row."""
     source = inspect.getsource(adjoint.make_reverse_block)
     changed = source.replace(
-        "slots_out[k, grad] = row[grad]", "wp.atomic_add(slots_out, bins.instances[k], grad, row[grad])"
+        "slots_out[k, column] = total", "wp.atomic_add(slots_out, bins.instances[k], column, total)"
     )
     assert changed != source
     path, names = "<adjoint that adds>", dict(vars(adjoint))

@@ -345,5 +345,6 @@ inline bool __any_sync(unsigned mask, bool predicate) { return host::ballot(mask
 inline int atomicAdd(int* where, int value) { return __atomic_fetch_add(where, value, __ATOMIC_RELAXED); }
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(unsigned bits) { return __builtin_ffs(bits); }
+inline float __fdividef(float a, float b) { return a / b; }
 inline void __trap() { abort(); }
 struct alignas(16) float4 { float x, y, z, w; };

@@ -39,6 +39,8 @@ CONSTANT = {
     "noise": "random numbers",
     "widened": "moments, which have no gradient",
     "rounded": "the same",
+    "odds_of": "only states are recovered by it",
+    "lane_sum": "sums of gradients",
     "fall_value": "exp2_known has the derivative",
 }
 #: Derivatives that are right only together, in the loop that Warp replays, and adjoints of whole steps: against

@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import cubins  # noqa: E402
 
-KEYS = ("registers", "static_shared", "dynamic_shared")
+KEYS = ("registers", "static_shared", "dynamic_shared", "loop")
 
 
 def recorded():
@@ -25,7 +25,7 @@ def recorded():
     "arch",
     [
         pytest.param(90, marks=pytest.mark.slow),
-        *(pytest.param(arch, marks=pytest.mark.long) for arch in (75, 80, 86, 89)),
+        *(pytest.param(arch, marks=pytest.mark.long) for arch in (75, 80, 86, 89, 100, 120)),
     ],
 )
 def test_resources(arch):
@@ -42,6 +42,18 @@ def test_resources(arch):
 
 def test_occupancy():
     """Worked by hand: 72 registers take 18432 of a block's 256 threads, 3 blocks of 65536, 768 of 2048 threads."""
-    record = {"arch": 90, "registers": 72, "static_shared": 2384, "dynamic_shared": 11312}
+    record = {"arch": 90, "threads": 256, "registers": 72, "static_shared": 2384, "dynamic_shared": 11312}
     assert cubins.occupancy(record) == pytest.approx(768 / 2048)
+    assert cubins.occupancy(record | {"threads": 32, "dynamic_shared": 0}) == pytest.approx(
+        28 * 32 / 2048
+    )  # blocks, by registers
     assert cubins.occupancy(record | {"registers": 24, "dynamic_shared": 100_000}) == pytest.approx(512 / 2048)
+
+
+def test_longest_loop():
+    """0x10 to 0x40 holds another loop; of the two that hold none, 0x50 to 0x80 is the longer."""
+    lines = ["name", *(f"/*{16 * i:04x}*/  NOP ;" for i in range(9))]
+    lines[4] = "/*0030*/  @P0 BRA 0x20 ;"
+    lines[5] = "/*0040*/  @!P1 BRA 0x10 ;"
+    lines[9] = "/*0080*/  BRA.U UP0, `(.L_x_1) 0x50 ;"
+    assert cubins.longest_loop("\n".join(lines)) == ("name", 4)

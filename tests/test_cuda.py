@@ -5,12 +5,15 @@ The driver alone is another one; all else is the renderer as users call it.
 
 import pytest
 import torch
+import warp as wp
 from test_rasterize import check_gradients, check_image, relative_error, run, truth
 
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
+from warp_splat.kernels.cuda import warps
 from warp_splat.raster import api
 from warp_splat.raster.drivers import CUDA, using
+from warp_splat.runtime.launch import launch_blocks, view
 
 SCENES = ("degree1", "dense_tile", "saturated", "needles", "ties", "size_1x1", "size_17x33", "single", "empty")
 PLAIN = RasterOptions()
@@ -44,6 +47,25 @@ def test_against_the_lanes(adjoint):
     assert (first.depth - second.depth).abs().max() < 1e-4 * second.depth.max()
     for key, gradient in gradients.items():
         assert relative_error(gradient, expected[key]) < 1e-5, key
+
+
+@pytest.mark.parametrize("columns", [10, 16])
+@pytest.mark.parametrize("threads", [32, 256])
+def test_lanes_know_the_sums_of_their_columns(columns, threads, blocks):
+    vector = wp.types.vector(length=columns, dtype=float)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False, "block_dim": threads})
+    def add(rows: wp.array[vector], sums_out: wp.array2d[float]):
+        _block, thread = wp.tid()
+        total = warps.lane_sum(rows[thread], thread)
+        column = warps.column_of(thread, wp.static(columns))
+        if column >= 0:
+            sums_out[thread // 32, column] = total
+
+    rows = torch.randn(threads, columns, generator=torch.Generator().manual_seed(0))
+    sums = torch.full((threads // 32, columns), float("nan"))
+    launch_blocks(add, 1, [view(rows, vector)], [view(sums, wp.float32)], "cpu")
+    assert torch.allclose(sums, rows.view(-1, 32, columns).sum(1), atol=1e-5)
 
 
 def test_two_runs_give_the_same_bits(blocks):

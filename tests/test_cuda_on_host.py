@@ -75,14 +75,14 @@ def check_clean(program, launch):
 def check_controls(program, launch, barriers):
     """A barrier that is taken out is reported: all but one, which stands beside another."""
     silent = [barrier for barrier in barriers if run(program, launch, without=barrier).code == 0]
-    assert len(silent) <= 1, silent
-    assert len(barriers) >= 3
+    assert len(silent) <= 1 and len(silent) < len(barriers), silent
 
 
 def test_adjoint_has_no_races(monkeypatch, tmp_path):
-    launch = launches_of("manual", monkeypatch, small(4))[-1]
+    launch = launches_of("manual", monkeypatch, small(100))[-1]  # more than a warp stages at once
     program = build(launch, "thread", tmp_path)
-    check_controls(program, launch, check_clean(program, launch))
+    barriers = check_clean(program, launch)
+    assert barriers and all(run(program, launch, without=barrier).code for barrier in barriers)
 
 
 @pytest.mark.long

@@ -71,7 +71,7 @@ def test_helpers_keep_nothing_alive():
 def test_blocks_of_threads(device, monkeypatch):
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False, "block_dim": launch.BLOCK})
+    @wp.kernel(module="unique", module_options={"enable_backward": False, "block_dim": 256})
     def total(values: wp.array[float], sums_out: wp.array[float]):
         block, thread = wp.tid()
         value = values[block * 256 + thread] + 0.0

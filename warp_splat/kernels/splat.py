@@ -28,7 +28,7 @@ import warp as wp
 from warp_splat.config import ALPHA_MAX
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
-from warp_splat.kernels.simd import fill, fma, over, times, where_less
+from warp_splat.kernels.simd import fill, fma, over, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL
 
 wp.set_module_options(FORWARD_ONLY)
@@ -101,10 +101,22 @@ def adj_alpha_blend(t: Any, odds: Any, behind: Any, here: Any):
     return fma(t, here, -fma(behind, odds, behind))
 
 
-@wp.func
-def odds_of(alpha: Any):
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)  // a reciprocal and a step of Newton's: a division has twice the instructions, and a branch
+    const float left = 1.0f - alpha, inverse = __fdividef(1.0f, left), odds = alpha * inverse;
+    return fmaf(fmaf(-left, odds, alpha), inverse, odds);
+#else
+    return alpha / (1.0f - alpha);
+#endif
+""")
+def odds_of(alpha: float) -> float:
     """w_k / T_{k+1}: the transmittance in front of a Gaussian is that behind it times 1 + odds.
 
     For faint Gaussians 1 / (1 - alpha) would round to one side: over 100,000 layers an error of 3e-3 instead of 5e-6.
     """
+    return alpha / (1.0 - alpha)  # what Python sees
+
+
+@wp.func
+def odds_of(alpha: vec16):
     return over(alpha, fill(1.0, alpha) - alpha)

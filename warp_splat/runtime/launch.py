@@ -24,8 +24,6 @@ from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_threads
 
-BLOCK = 256  # threads of a block: one per pixel of a tile
-
 
 def prepare(device: str, threads: int) -> torch.device:
     """Set up the process for a run: Warp's messages, torch's threads, number of threads (0: all cores), memory.
@@ -159,7 +157,7 @@ def load(kernel: wp.Kernel, device: torch.device) -> None:
 def launch_blocks(
     kernel: wp.Kernel, blocks: int, inputs: Sequence, outputs: Sequence, device: torch.device | str, **adjoint
 ) -> None:
-    """Launch ``kernel``, which uses tiles of Warp, on ``blocks`` blocks of BLOCK threads; nothing happens for 0.
+    """Launch ``kernel`` on ``blocks`` blocks of as many threads as it was made for; nothing happens for 0.
 
     With ``adj_inputs`` and ``adj_outputs``, the generated adjoint instead.
     On the CPU that is a check of the kernels, not a way to work: only ``wp.config.enable_cpu_blocks`` makes a block of
@@ -170,7 +168,7 @@ def launch_blocks(
     where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
     if adjoint:
         where["adjoint"] = True
-    where |= {"block_dim": BLOCK, "record_tape": False}
+    where |= {"block_dim": kernel.module.options["block_dim"], "record_tape": False}
     wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **where, **adjoint)
 
 

@@ -9,13 +9,13 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.cuda.warps import vec10
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
 
 THREADS = wp.constant(TILE * TILE)  # per block
-vec10 = wp.types.vector(length=10, dtype=float)
 
 #: Of modules whose kernels run in blocks. No regrouping of sums: it would change what CPU fibers check.
 BLOCK_OPTIONS = {"enable_backward": False, "block_dim": TILE * TILE}

@@ -9,16 +9,14 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.cuda.adjoint import clear_rest, row_from_moments, row_from_root
-from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of, vec10
+from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of
+from warp_splat.kernels.cuda.warps import AT_ONCE, COLUMNS, WARP, block_sum, column_of, vec10, vec_channels
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import fma
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, exponent
 from warp_splat.kernels.step import geometry_from_moments, make_manual, make_stepwise, opaque
 from warp_splat.kernels.structs import BinsView
-
-AT_ONCE = 16  # channels: registers
-vec_channels = wp.types.vector(length=AT_ONCE, dtype=float)
 
 
 @functools.cache
@@ -118,6 +116,8 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         t = final[tile, thread]
         walked = float(count[tile, thread])
         adj_t = float(0.0)
+        written = column_of(thread, COLUMNS)
+        channel_written = column_of(thread, AT_ONCE)
         for back in range(steps[tile]):
             k = start + steps[tile] - 1 - back
             splat = bins.instances[k]
@@ -160,21 +160,18 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 grads = vec10(p.dx, p.dy, p.xx, p.xy, p.yy, p.opacity, 0.0, 0.0, 0.0, 0.0)
                 adj_t = adj_front
             t = front
-            sums = wp.tile_sum(wp.tile(grads, preserve_type=True))[0]
-            row = sums
+            row = grads
             if wp.static(mode == "manual"):
-                row = row_from_moments(sums, g)
+                row = row_from_moments(grads, g)
             if wp.static(mode == "stepwise"):
-                row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
-            if thread == 0:
-                for grad in range(CHANNEL):
-                    slots_out[k, grad] = row[grad]
+                row = row_from_root(grads, wp.vec3(g[XX], g[XY], g[YY]))
+            total = block_sum(row, thread)
+            if thread < WARP and written >= 0 and written < CHANNEL:
+                slots_out[k, written] = total
             if wp.static(not geometric):
-                more = wp.tile_sum(wp.tile(w * up, preserve_type=True))[0]
-                if thread == 0:
-                    for channel in range(WIDTH):
-                        if CHANNEL + channel < slots_out.shape[1]:
-                            slots_out[k, CHANNEL + channel] = more[channel]
+                more = block_sum(w * up, thread)
+                if thread < WARP and channel_written >= 0 and CHANNEL + channel_written < slots_out.shape[1]:
+                    slots_out[k, CHANNEL + channel_written] = more
         clear_rest(bins, tile, thread, steps[tile], slots_out)
 
     return adj_channels

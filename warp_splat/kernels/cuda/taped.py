@@ -11,7 +11,8 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.cuda.adjoint import row_from_root
-from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of, vec10
+from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of
+from warp_splat.kernels.cuda.warps import COLUMNS, WARP, block_sum, column_of, vec10
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent, odds_of
@@ -96,11 +97,10 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
 
     @wp.func_grad(read)
     def adj_read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int, adj_ret: vec10):
-        sums = wp.tile_sum(wp.tile(adj_ret, preserve_type=True))[0]
-        if thread == 0:
-            row = row_from_root(sums, splat.root)
-            for grad in range(GRADS):
-                slots[slot, grad] = row[grad]
+        total = block_sum(row_from_root(adj_ret, splat.root), thread)
+        column = column_of(thread, COLUMNS)
+        if thread < WARP and column >= 0 and column < GRADS:
+            slots[slot, column] = total
 
     @wp.func
     def fall_value(z: float):
