@@ -11,10 +11,11 @@ import linecache
 import torch
 import warp as wp
 from common import milliseconds
-from made_up import cameras, make_gaussians
+from made_up import cameras
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
+from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.cuda import adjoint
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.cuda import THREADS, spread_upstream
@@ -130,11 +131,11 @@ def card_rates(device: str, count: int) -> tuple[float, float]:
 
 
 def measure_blends(
-    count: int, width: int, height: int, device: str, repeats: int
+    model: GaussianModel, width: int, height: int, device: str, repeats: int
 ) -> tuple[list[list], list[list], float]:
     """Rows of shares and of slots against atomics, and by how much these two differ, relative."""
     with torch.no_grad():
-        blends = Blends(make_gaussians(count, device).activated(), cameras(width, height, 1)[0])
+        blends = Blends(model.activated(), cameras(width, height, 1)[0])
     bandwidth, arithmetic = card_rates(device, 2**24 if device == "cuda" else 2**16)
     runs = {
         "forward": blends.forward,

@@ -97,6 +97,20 @@ def test_a_device_that_errs_is_found(wrong):
     assert sum(found.startswith("WRONG") for _, found in results.tables["Checks"]) == len(results.wrong)
 
 
+def test_an_attempt_in_a_process_of_its_own_ends_no_other():
+    program = 'import sys; print(\'rows: ["Checks", [["this", "WRONG: 1"]]]\'); sys.exit(\'illegal address\')'
+    results = gpu.Results(None, "cpu", seconds=60, apart=[sys.executable, "-c", program])
+    results.attempt("that", lambda: pytest.fail("was run here"), needs=1)
+    assert results.tables["Checks"] == [["this", "WRONG: 1"], ("that", "WRONG: illegal address")]
+    assert results.wrong == ["this", "that"]
+
+
+def test_what_is_stored_is_what_the_cpu_says():
+    stored, found = gpu.expectation(gpu.EXPECTED, gpu.STORED), gpu.expectation(None, gpu.STORED)
+    for name, tensor in stored.items():
+        assert (tensor - found[name]).norm() < 1e-5 * tensor.norm(), name
+
+
 @pytest.mark.slow
 def test_dry_run(tmp_path):
     command = [sys.executable, ROOT / "benchmarks/gpu.py", "--device", "cpu", "--out", tmp_path]
