@@ -1,0 +1,132 @@
+"""How a camera shows an image: a map of its colors and how its lens darkens it, differentiable in torch.
+
+Of photographs as a screen shows them, light times g is (value + PIVOT) times g^(1/2.4), but for the darkest 4 %
+(IEC 61966-2-1). So maps act on value + PIVOT, and need no powers.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
+from warp_splat.kernels.simd import Types
+from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
+from warp_splat.runtime.sums import in_pairs
+from warp_splat.runtime.timers import stage
+
+PIVOT = 0.055
+#: Numbers of a map, differences to the identity: a gain; 12 of an affine map (columns of a matrix, and what is added);
+#: as many for each cell of brightness, height and width (Chen et al. 2007).
+SHAPES = {"gain": (1,), "affine": (12,), "bilateral": (12, 4, 8, 8)}
+
+
+def expose(
+    image: torch.Tensor, kind: str, numbers: torch.Tensor, falloff: torch.Tensor | None, pivot: float
+) -> torch.Tensor:
+    """The image through a map, differentiable in all three tensors.
+
+    Args:
+        image: [H, W, 3].
+        kind: of SHAPES.
+        numbers: of its shape there.
+        falloff: a and b of 1 + a r^2 + b r^4, with the distance r to the image's middle as a share of that to its
+            corner, [2]; None: 0.
+        pivot: PIVOT, or 0 of colors in linear light.
+    """
+    if falloff is not None:
+        near, far = _Spread.apply(falloff, image.shape[:2])
+        square = _squared_radius(*image.shape[:2], image.device)
+        image = (image + pivot) * (1.0 + (near + far * square) * square)[..., None] - pivot
+    if kind == "bilateral":
+        if numbers.requires_grad:  # no pixel that is not finite may spoil the cells
+            numbers.register_hook(lambda grad: grad.nan_to_num(0.0, 0.0, 0.0))
+        return _through_grid(image, numbers, pivot)
+    return _ColorMap.apply(image, whole(kind, numbers, pivot))
+
+
+def whole(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor:
+    """Columns of a matrix and a constant, [12], of a gain or an affine map."""
+    none = torch.zeros_like(numbers[:1])
+    n = [numbers if i % 4 == 0 else none for i in range(12)] if kind == "gain" else list(numbers.split(1))
+    diagonal = [1.0 + n[i] if i % 4 == 0 else n[i] for i in range(9)]
+    constant = [n[9 + k] + pivot * ((n[k] + n[3 + k]) + n[6 + k]) for k in range(3)]
+    return torch.cat(diagonal + constant)
+
+
+def load_kernels(device: torch.device) -> None:
+    """Compile and load them, for many pixels at once and for those left over."""
+    for lanes in {driver_of(device).lanes, 1}:
+        load(make_map_colors(lanes), device)
+        load(make_adj_map_colors(lanes), device)
+
+
+def _through_grid(image: torch.Tensor, numbers: torch.Tensor, pivot: float) -> torch.Tensor:
+    """By the affine map that is sliced for each pixel, from its place and its brightness."""
+    height, width, _ = image.shape
+    r, g, b = (image + pivot).unbind(-1)
+    brightness = (r + g + b) * (2.0 / 3.0) - (1.0 + 2.0 * pivot)
+    # not by linspace, which rounds differently by processor
+    rows, columns = ((torch.arange(n, device=image.device) + 0.5) * (2.0 / n) - 1.0 for n in (height, width))
+    places = [columns.expand(height, width), rows[:, None].expand(height, width), brightness]
+    found = functional.grid_sample(
+        numbers[None], torch.stack(places, -1)[None, None], padding_mode="border", align_corners=True
+    )
+    n = found[0, :, 0]
+    changes = [(n[k] * r + n[3 + k] * g) + (n[6 + k] * b + n[9 + k]) for k in range(3)]
+    return image + torch.stack(changes, -1)
+
+
+class _ColorMap(torch.autograd.Function):
+    """An image [H, W, 3] by an affine map [12]."""
+
+    @staticmethod
+    def forward(ctx, image, numbers):
+        image = image.detach().contiguous()
+        ctx.save_for_backward(image, numbers)
+        weights, mapped = lanes_of(vec12, numbers.detach())[0], torch.empty_like(image)
+
+        def arguments(types: Types, rows: slice) -> tuple[list, list]:
+            colors, made = lanes_of(types.row3, image.view(-1, 3)[rows], mapped.view(-1, 3)[rows])
+            return [weights, colors], [made]
+
+        launch_in_lanes(make_map_colors, driver_of(image.device).lanes, image.numel() // 3, arguments, image.device)
+        return mapped
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj):
+        with stage("adjoint of exposure"):
+            image, numbers = ctx.saved_tensors
+            adj, lanes, count = adj.contiguous(), driver_of(image.device).lanes, image.numel() // 3
+            weights, adj_image = lanes_of(vec12, numbers)[0], torch.empty_like(image)
+            sums = image.new_empty(count // lanes + count % lanes, 12)
+
+            def arguments(types: Types, rows: slice) -> tuple[list, list]:
+                tables = (table.view(-1, 3)[rows] for table in (image, adj, adj_image))
+                colors, given, made = lanes_of(types.row3, *tables)
+                return [weights, colors, given], [made, *lanes_of(vec12, sums[rows.start // lanes :])]
+
+            launch_in_lanes(make_adj_map_colors, lanes, count, arguments, image.device)
+            return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
+
+
+class _Spread(torch.autograd.Function):
+    """Numbers [K] at every pixel, [K, H, W]. Their gradient is summed in one order, unlike torch's by expand."""
+
+    @staticmethod
+    def forward(ctx, numbers, size):
+        return numbers.detach()[:, None, None].expand(-1, *size)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj):
+        return in_pairs(adj.flatten(1).T).to(adj.dtype).nan_to_num(0.0, 0.0, 0.0), None
+
+
+def _squared_radius(height: int, width: int, device: torch.device) -> torch.Tensor:
+    """Of each pixel from the middle, 1 at the corners of the image, [H, W]."""
+    y, x = (torch.arange(size, device=device) + 0.5 - 0.5 * size for size in (height, width))
+    return ((y * y)[:, None] + x * x) / (0.25 * (height * height + width * width))
