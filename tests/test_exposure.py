@@ -13,14 +13,17 @@ import torch
 from test_checkpoints import begin, state_of, steps
 from test_train import SCENE
 
+from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.formats.png import load_png
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime import pool
 from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
+from warp_splat.scene.neighbors import guessed
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import choose
 from warp_splat.training.record import keep, restore, save_model
@@ -139,6 +142,42 @@ def test_the_folder_has_the_maps_in_the_layout_of_the_reference(kind, scene, tmp
     expected = image @ image_map[:3, :3] + image_map[:3, 3]
     assert not torch.allclose(expected, image, atol=1e-4)
     torch.testing.assert_close(trainer.parts[0].image(image, None, SimpleNamespace(view=view)), expected)
+
+
+def test_a_held_out_one_is_guessed_where_neighbors_are_alike():
+    """Along a walk; and not where each is as it likes."""
+    places = np.linspace(0.0, 6.0, 41)
+    walk = [Camera(9, 9, 9.0, 9.0, 4.5, 4.5, np.eye(3), (-x, 0.0, 0.0)) for x in places]
+    known, others = ([camera for i, camera in enumerate(walk) if (i % 8 == 4) == held] for held in (False, True))
+    values = np.stack([np.sin(places), np.cos(places)], 1)
+    train, test = (values[[i for i in range(41) if (i % 8 == 4) == held]] for held in (False, True))
+    assert np.abs(guessed(train, known, others, 6.0) - test).max() < 0.03
+    assert np.abs(guessed(1e-3 * train, known, others, 6.0) - 1e-3 * test).max() < 3e-5
+    assert not guessed(np.resize([0.1, -0.1], len(known)), known, others, 6.0).any()
+    assert not guessed(np.zeros((1, 12)), known[:1], others, 6.0).any()
+    assert guessed(values, walk, [], 6.0).shape == (0, 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, capsys):
+    """In the evaluation as by render.py, of train and test views."""
+    model = tmp_path / "model"
+    options = ["--exposure", kind, "--vignetting", "--exposure_lr_init", "0.05", "--quiet", "-r", "8"]
+    assert main(["train", "-s", str(SCENE), "--eval", "-m", str(model), "--iterations", "60", *options]) == 0
+    before = json.loads((model / "per_view.json").read_text())["ours_60"]
+    assert main(["render", "-m", str(model), "--quiet"]) == 0
+    assert json.loads((model / "per_view.json").read_text())["ours_60"]["PSNR"] == before["PSNR"]
+    path = model / "point_cloud/iteration_60/exposures.json"
+    text = path.read_text()
+    pictures = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
+    path.unlink()
+    assert main(["render", "-m", str(model), "--quiet"]) == 0
+    plain = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
+    assert all((exposed != mean).any() for exposed, mean in zip(pictures, plain, strict=True))
+    path.write_text(text.replace('"kind"', '"sort"'))
+    assert main(["render", "-m", str(model), "--quiet"]) == 1
+    assert "exposures.json: expected exposures as training writes them, found other JSON" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -137,7 +137,7 @@ def test_evaluation_keeps_and_uses_masks(tmp_path):
     write_image(root / "masks" / "b.png", some_mask())
     views = load(root)[0].train
 
-    def picture(camera):
+    def picture(camera, name):
         image = texture() // 2
         image[some_mask()[..., 0] == 0] = 255
         return image

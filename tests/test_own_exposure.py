@@ -1,7 +1,7 @@
 """A photograph's own exposure where its camera is shown: by render.py and in the viewer; neutral ones elsewhere."""
 
 import json
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,55 +12,58 @@ from test_train import fails, train
 
 from warp_splat.cli import main
 from warp_splat.config import RasterOptions
-from warp_splat.formats.model_folder import open_model
+from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import make_renderer
-from warp_splat.rendering.own_exposure import own_exposure
+from warp_splat.rendering.exposure import as_photographed
 from warp_splat.viewer import server
-
-MAP = [[0.5, 0.1, 0.0, 0.02], [0.0, 0.8, 0.0, -0.01], [0.2, 0.0, 1.5, 0.0]]
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A model whose first photograph, which is held out, and second one have MAP."""
+    """A model, and its file of exposures, where the second photograph that trains has a gain of 1.5."""
     folder = tmp_path_factory.mktemp("model")
     assert train(folder, "--iterations", "6", "-r", "8", "--parts", "exposure") == 0
-    maps = json.loads((folder / "exposure.json").read_text())
-    assert "view_000.png" not in maps and len(maps) == 43
-    (folder / "exposure.json").write_text(json.dumps(maps | {"view_001.png": MAP}))
-    return folder
+    file = folder / "point_cloud" / "iteration_6" / "exposures.json"
+    facts = json.loads(file.read_text())
+    assert len(facts["maps"]) == 50
+    facts["maps"] = {name: [0.5] if name == "view_002.png" else [0.0] for name in facts["maps"]}
+    file.write_text(json.dumps(facts))
+    return folder, file
 
 
-def test_render_shows_training_photographs_as_they_were_taken(trained, capsys):
-    """By ``color @ map[:, :3] + map[:, 3]`` in float64; held-out ones, and other photographs, hardly change."""
-    assert main(["render", "-m", str(trained)]) == 0
-    renders = [load_png(trained / "train" / "ours_6" / "renders" / f"{place:05d}.png") for place in (0, 1)]
-    (trained / "exposure.json").rename(trained / "away.json")
-    assert main(["render", "-m", str(trained)]) == 0
-    neutral = [load_png(trained / "train" / "ours_6" / "renders" / f"{place:05d}.png") for place in (0, 1)]
-    (trained / "away.json").rename(trained / "exposure.json")
-    expected = neutral[0] / 255 @ np.array(MAP)[:, :3] + np.array(MAP)[:, 3]
-    assert np.abs(renders[0] / 255 - expected.clip(0, 1)).max() < 1.5 / 255
-    assert np.abs(renders[1].astype(int) - neutral[1]).max() <= 6 and not np.array_equal(renders[0], neutral[0])
+def test_render_shows_photographs_as_they_were_taken(trained):
+    """By a gain on value + 0.055 in float64; and as the mean photograph where there is no file."""
+    (folder, file), written = trained, []
+    for name in ("exposures.json", "away.json"):
+        file.rename(file.with_name(name))
+        assert main(["render", "-m", str(folder)]) == 0
+        written.append([load_png(folder / f"train/ours_6/renders/{place:05d}.png") for place in (0, 1)])
+        file.with_name(name).rename(file)
+    renders, neutral = written
+    expected = 1.5 * (neutral[1] / 255 + 0.055) - 0.055
+    assert np.abs(renders[1] / 255 - expected.clip(0, 1)).max() < 1.5 / 255
+    assert np.array_equal(renders[0], neutral[0])
 
 
-def test_maps_are_those_of_the_last_iteration_of_a_folder(trained):
-    iteration, _, options = open_model(trained)
-    image, shown = torch.rand(3, 4, 3), lambda *where: own_exposure(*where)(image, "view_001.png")
-    assert not torch.equal(shown(str(trained), iteration, options), image)
-    assert own_exposure(str(trained), iteration, options)(image, "view_000.png") is image
-    for others in ((str(trained), iteration - 1, options), (str(trained), iteration, {**options, "parts": ""})):
-        assert shown(*others) is image
+def test_exposures_are_those_beside_the_gaussians(trained):
+    folder, file = trained
+    assert read_exposures(folder, 6) and not read_exposures(folder, 5)
+    assert read_exposures(file.parent / "point_cloud.ply", 0)
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"a.png": [[1, 2]]}', '{"a.png": "x"}', '{"a.png": [1, [2]]}'])
-def test_damaged_maps_are_one_sentence(text, trained, capsys):
-    whole = (trained / "exposure.json").read_text()
-    (trained / "exposure.json").write_text(text)
-    assert "exposure.json: " in fails(capsys, "render", "-m", str(trained))
-    (trained / "exposure.json").write_text(whole)
+@pytest.mark.parametrize(
+    "changes",
+    ["{", "[]", {"kind": "else"}, {"maps": {"a": [1, 2]}}, {"maps": [1]}, {"falloff": [1e999, 0]}, {"pivot": "x"}],
+    ids=str,
+)
+def test_damaged_exposures_are_one_sentence(changes, trained, capsys):
+    folder, file = trained
+    whole = file.read_text()
+    file.write_text(changes if isinstance(changes, str) else json.dumps(json.loads(whole) | changes))
+    assert "exposures.json: expected exposures as training writes them" in fails(capsys, "render", "-m", str(folder))
+    file.write_text(whole)
 
 
 def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
@@ -88,7 +91,7 @@ def test_training_shows_what_it_compares(options, scene, tmp_path):
     trainer, run = begin(scene, tmp_path, **options)
     steps(trainer, run, 12)
     view, (part,) = scene.train[3], trainer.parts
-    image = trainer.look(view.camera).image
-    step = type("", (), {"view": view})
-    assert torch.equal(part.as_taken(image, view), part.image(image, None, step).detach())
-    assert part.as_taken(image, replace(view, name="another")) is image
+    image, exposures = trainer.look(view.camera).image, trainer.exposures
+    expected = part.image(image, None, SimpleNamespace(view=view)).detach()
+    assert torch.equal(as_photographed(image, exposures, view.name), expected)
+    assert as_photographed(image, exposures, "another") is image

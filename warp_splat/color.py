@@ -1,4 +1,4 @@
-"""Between linear light and what a screen shows. For NumPy's and torch's arrays alike."""
+"""Between linear light and what a screen shows, and how maps of colors are held. For NumPy and torch alike."""
 
 from __future__ import annotations
 
@@ -10,6 +10,12 @@ if TYPE_CHECKING:
     import torch
 
 TOE = 0.0031308  # below, sRGB is linear (IEC 61966-2-1)
+#: On a screen, light times g is (value + PIVOT) times g^(1/2.4), but for the darkest 4 %. So maps of colors act on
+#: value + PIVOT, and need no powers.
+PIVOT = 0.055
+#: Numbers of a map of colors, differences to the identity: a gain; 12 of an affine map (columns of a matrix, and what
+#: is added); as many for each cell of brightness, height and width (Chen et al. 2007).
+COLOR_MAPS = {"gain": (1,), "affine": (12,), "bilateral": (12, 4, 8, 8)}
 
 
 def to_srgb(linear: Any, where: Callable) -> Any:

@@ -18,10 +18,12 @@ from warp_splat.text import format_table
 
 POSE = "PSNR_POSE"  # PSNR from where the model says that a photograph was taken
 DECIBELS = ("PSNR", "CC_PSNR", POSE)
+#: From a camera, exposed as the photograph of a name: [H, W, 3] uint8.
+Picture = Callable[[Camera, str], np.ndarray]
 TOLD = 10  # views, at most, in the table that is printed
 
 
-def write_views(picture: Callable[[View], np.ndarray], views: list[View], folder: Path) -> list[np.ndarray]:
+def write_views(picture: Picture, views: list[View], folder: Path) -> list[np.ndarray]:
     """Write ``renders/00000.png``, ``gt/00000.png`` and, of views with one, ``masks/00000.png`` ... in ``folder``.
 
     Returns the renders. Surplus images of an earlier run are removed: metrics are taken over all that lie there.
@@ -29,7 +31,7 @@ def write_views(picture: Callable[[View], np.ndarray], views: list[View], folder
     renders = []
     kept = set()
     for index, view in enumerate(views):
-        renders.append(picture(view))
+        renders.append(picture(view.camera, view.name))
         pictures = {"renders": renders[-1], "gt": view.picture}
         if view.mask is not None:
             pictures["masks"] = np.repeat(255 * view.mask[..., None], 3, axis=2)
@@ -52,7 +54,7 @@ class Comparison(NamedTuple):
 
 
 def evaluate_views(
-    picture: Callable[[Camera], np.ndarray],
+    picture: Picture,
     views: list[View],
     model_folder: Path,
     split: str,
@@ -72,10 +74,10 @@ def evaluate_views(
         InputError: if a file cannot be written.
     """
     folder = model_folder / split / f"ours_{iteration}"
-    renders = write_views(lambda view: picture(view.camera), views, folder)
+    renders = write_views(picture, views, folder)
     means, per_view = evaluate_folder(folder, metrics)
     if where_taken:
-        values = [psnr(picture(where_taken(view)), view.picture, view.mask) for view in views]
+        values = [psnr(picture(where_taken(view), view.name), view.picture, view.mask) for view in views]
         per_view[POSE] = dict(zip(per_view["PSNR"], values, strict=True))
         means[POSE] = sum(values) / len(values)
     write_results(model_folder, iteration, means, per_view, extra)

@@ -84,7 +84,7 @@ def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None
     """A sheet of the views that changed most, before and after."""
     views = [*opened.scene.test, *opened.scene.train]
     pictures = [opened.picture(splats) for splats in (before, after)]
-    pairs = [[picture(view.camera) for picture in pictures] for view in views]
+    pairs = [[picture(view.camera, view.name) for picture in pictures] for view in views]
     changes = [np.abs(one.astype(int) - other).mean() for one, other in pairs]
     chosen = np.argsort(changes, kind="stable")[::-1][:SHOWN]
     sections = {}

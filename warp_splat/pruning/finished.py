@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
+from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, read_environment
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
@@ -31,17 +31,19 @@ class Opened(NamedTuple):
     scene: Scene
     setting: ViewSetting  # of the training views
     harmonics: np.ndarray | None  # behind the Gaussians, [16, 3]
+    exposures: Exposures | None  # of its photographs
 
-    def picture(self, splats: SplatArrays) -> Callable[[Camera], np.ndarray]:
-        """A function from a camera to what ``splats`` look like, [H, W, 3] uint8."""
+    def picture(self, splats: SplatArrays) -> Callable[..., np.ndarray]:
+        """A function from a camera, and whose photograph's exposure it has, to what ``splats`` look like: uint8."""
         model = GaussianModel.from_splats(splats).to(self.setting.background.device)
+        options, linear = self.setting.options, self.scene.linear
         white = bool(self.trained.get("white_background"))
-        return make_picture(model, white, self.setting.options, self.scene.linear, self.harmonics)
+        return make_picture(model, white, options, linear, self.harmonics, self.exposures)
 
     def psnr(self, splats: SplatArrays, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders."""
         picture = self.picture(splats)
-        return float(np.mean([psnr(picture(view.camera), view.picture, view.mask) for view in views]))
+        return float(np.mean([psnr(picture(view.camera, view.name), view.picture, view.mask) for view in views]))
 
     def quality(self, splats: SplatArrays) -> dict[str, float]:
         """PSNR [dB] of the training views and, if there are any, of those held out."""
@@ -71,7 +73,8 @@ def open_finished(model: str, source_path: str, iteration: int, device: str, thr
     if harmonics is not None:
         print(f"What {model} has learned behind its Gaussians stays as it is; a file of Gaussians does not have it.")
     background = backdrop(bool(trained.get("white_background")), harmonics, used)
-    return Opened(file, trained, scene, ViewSetting(scene.train, options_of(trained), background), harmonics)
+    setting = ViewSetting(scene.train, options_of(trained), background)
+    return Opened(file, trained, scene, setting, harmonics, read_exposures(model, iteration))
 
 
 def output_of(model: str, output: str, name: str) -> Path:

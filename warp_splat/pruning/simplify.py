@@ -131,7 +131,7 @@ def squared_error(opened: Opened, splats: SplatArrays) -> float:
     """Of the training views, summed over pixels and channels, colors 0..1."""
     picture, error = opened.picture(splats), 0.0
     for view in opened.scene.train:
-        squared = (picture(view.camera) / 255.0 - view.picture / 255.0) ** 2
+        squared = (picture(view.camera, view.name) / 255.0 - view.picture / 255.0) ** 2
         error += float(squared.sum() if view.mask is None else squared[view.mask > 0].sum())
     return error
 
@@ -142,7 +142,7 @@ def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
     for share in LEVELS:
         splats = thinning.to(max(1, round(share * len(opened.file.splats.means))))
         picture, start = opened.picture(splats), time.perf_counter()
-        renders = [picture(view.camera) for view in views]
+        renders = [picture(view.camera, view.name) for view in views]
         seconds = time.perf_counter() - start
         pairs = zip(renders, views, strict=True)
         rows.append(

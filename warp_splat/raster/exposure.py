@@ -1,8 +1,4 @@
-"""How a camera shows an image: a map of its colors and how its lens darkens it, differentiable in torch.
-
-Of photographs as a screen shows them, light times g is (value + PIVOT) times g^(1/2.4), but for the darkest 4 %
-(IEC 61966-2-1). So maps act on value + PIVOT, and need no powers.
-"""
+"""How a camera shows an image: a map of its colors and how its lens darkens it, differentiable in torch."""
 
 from __future__ import annotations
 
@@ -17,11 +13,6 @@ from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
-PIVOT = 0.055
-#: Numbers of a map, differences to the identity: a gain; 12 of an affine map (columns of a matrix, and what is added);
-#: as many for each cell of brightness, height and width (Chen et al. 2007).
-SHAPES = {"gain": (1,), "affine": (12,), "bilateral": (12, 4, 8, 8)}
-
 
 def expose(
     image: torch.Tensor, kind: str, numbers: torch.Tensor, falloff: torch.Tensor | None, pivot: float
@@ -30,11 +21,11 @@ def expose(
 
     Args:
         image: [H, W, 3].
-        kind: of SHAPES.
+        kind: of COLOR_MAPS.
         numbers: of its shape there.
         falloff: a and b of 1 + a r^2 + b r^4, with the distance r to the image's middle as a share of that to its
             corner, [2]; None: 0.
-        pivot: PIVOT, or 0 of colors in linear light.
+        pivot: the map acts on value + pivot: PIVOT, or 0 in linear light.
     """
     if falloff is not None:
         near, far = _Spread.apply(falloff, image.shape[:2])

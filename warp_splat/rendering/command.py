@@ -21,6 +21,7 @@ from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
+from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
@@ -28,7 +29,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
-from warp_splat.rendering.own_exposure import own_exposure
+from warp_splat.rendering.exposure import as_photographed
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene import load_scene
@@ -68,8 +69,8 @@ def render_model(config: RenderConfig) -> int:
     with _memory_explained(device, model, None if config.orbit else scene):
         white = bool(trained.get("white_background"))
         harmonics = model_folder.read_environment(config.model_path, iteration)
-        draw = make_renderer(model.to(device), white, options, harmonics)
-        picture = lambda camera: to_bytes(draw(camera).image, linear)  # noqa: E731
+        exposures = read_exposures(config.model_path, iteration)
+        picture = make_picture(model.to(device), white, options, linear, harmonics, exposures)
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -77,9 +78,7 @@ def render_model(config: RenderConfig) -> int:
                 say(sentence)
             if scene.train and not config.skip_train:
                 written = folder / "train" / f"ours_{iteration}"
-                exposed = own_exposure(config.model_path, iteration, trained)
-                shown = lambda view: to_bytes(exposed(draw(view.camera).image, view.name), linear)  # noqa: E731
-                write_views(shown, scene.train, written)
+                write_views(picture, scene.train, written)
                 print(f"  train  {len(scene.train)} views in {written}")
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}
@@ -211,10 +210,14 @@ def make_picture(
     options: RasterOptions,
     linear: bool = False,
     harmonics: np.ndarray | None = None,
-) -> Callable[[Camera], np.ndarray]:
-    """A function from a camera to the model's image, [H, W, 3] uint8; ``linear``: its colors are in linear light."""
+    exposures: Exposures | None = None,
+) -> Callable[..., np.ndarray]:
+    """A function from a camera, and whose photograph's exposure it has, to the model's image, [H, W, 3] uint8.
+
+    ``linear``: its colors are in linear light.
+    """
     draw = make_renderer(model, white_background, options, harmonics)
-    return lambda camera: to_bytes(draw(camera).image, linear)
+    return lambda camera, name="": to_bytes(as_photographed(draw(camera).image, exposures, name), linear)
 
 
 def make_renderer(

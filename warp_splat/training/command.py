@@ -260,6 +260,7 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         run.preview = time.perf_counter()
         view = trainer.refined(views)[len(views) // 2]
         try:
-            save_png(run.folder / "preview.png", np.concatenate([view.picture, trainer.picture(view.camera)], 1))
+            picture = trainer.picture(view.camera, view.name)
+            save_png(run.folder / "preview.png", np.concatenate([view.picture, picture], 1))
         except InputError as error:
             warn(error)

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 import torch
 from tqdm import tqdm
 
+from warp_splat.rendering.exposure import as_photographed
 from warp_splat.runtime import timers
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.scene.types import View
 from warp_splat.training.record import Run
-from warp_splat.training.seams import having
 from warp_splat.training.trainer import Trainer
 from warp_splat.viewer.server import Viewer
 
@@ -123,9 +123,7 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
     scene, port = trainer.scene, trainer.config.report.port
 
     def exposed(image: torch.Tensor, view: View) -> torch.Tensor:
-        for as_taken in having(trainer.parts, "as_taken"):
-            image = as_taken(image, view)
-        return image
+        return as_photographed(image, trainer.exposures, view.name)
 
     means = lambda: trainer.model.parameters["means"]  # noqa: E731
     with Viewer(trainer.look, means, scene, port, scene.linear, exposed) as viewer:

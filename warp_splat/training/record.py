@@ -22,6 +22,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
 from warp_splat.formats.colmap_text import write_colmap
+from warp_splat.formats.exposures import write_exposures
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.text import format_table
@@ -75,6 +76,7 @@ def save_model(trainer: Trainer, run: Run) -> Path:
         _save_cameras(trainer, run.folder, path.parent)
         behind = trainer.behind.cpu().numpy()
         model_folder.write_environment(path, behind if behind.ndim > 1 else None)
+        write_exposures(path, trainer.exposures)
         for files in having(trainer.parts, "files"):
             for name, value in files().items():
                 write_json(run.folder / name, value)

@@ -30,7 +30,7 @@ For what is shown and saved, a part may have:
 
     behind(color) -> color                  as ``background``, of pictures, without gradients
     refined(camera, view) -> camera         of a photograph, held out or not, as it is learned by now
-    as_taken(image, view) -> image          a picture with the photograph's own colors, without gradients
+    exposures() -> Exposures                of photographs, held out or not, as they are learned by now
     files() -> {name: value}                JSON files of the model's folder
 
 Both may have, the growth after the parts:

@@ -18,10 +18,12 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.formats.exposures import Exposures
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.rendering.exposure import as_photographed
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load
@@ -267,9 +269,14 @@ class Trainer:
         with torch.no_grad():
             return self._render(camera, self.behind, replace(self.options, depth=depth))
 
-    def picture(self, camera: Camera) -> np.ndarray:
-        """The present model seen by ``camera``, [H, W, 3] uint8."""
-        return to_bytes(self.look(camera).image, self.scene.linear)
+    @property
+    def exposures(self) -> Exposures | None:
+        """How photographs were exposed, if a part learns it."""
+        return next((found() for found in having(self.parts, "exposures")), None)
+
+    def picture(self, camera: Camera, name: str = "") -> np.ndarray:
+        """The present model seen by ``camera``, [H, W, 3] uint8, exposed as the photograph of this name."""
+        return to_bytes(as_photographed(self.look(camera).image, self.exposures, name), self.scene.linear)
 
     def refined(self, views: list[View]) -> list[View]:
         """The views, with the cameras that parts have learned."""
@@ -287,7 +294,7 @@ class Trainer:
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
         views = self.refined(views)
-        return float(np.mean([psnr(self.picture(view.camera), view.picture, view.mask) for view in views]))
+        return float(np.mean([psnr(self.picture(view.camera, view.name), view.picture, view.mask) for view in views]))
 
 
 #: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.

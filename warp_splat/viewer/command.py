@@ -7,11 +7,12 @@ from dataclasses import replace
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
+from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.model_folder import open_model, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of, with_refined_cameras
-from warp_splat.rendering.own_exposure import own_exposure
+from warp_splat.rendering.exposure import as_photographed
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
@@ -40,7 +41,7 @@ def view_model(config: ViewConfig) -> int:
     scene = _find_scene(config, trained, iteration)
     harmonics = read_environment(config.model, iteration)
     draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained), harmonics)
-    exposed = own_exposure(config.model, iteration, trained)
+    exposures = read_exposures(config.model, iteration)
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
@@ -51,7 +52,7 @@ def view_model(config: ViewConfig) -> int:
             scene,
             config.port,
             is_linear(scene, trained),
-            lambda image, view: exposed(image, view.name.removesuffix(AS_GIVEN)),
+            lambda image, view: as_photographed(image, exposures, view.name.removesuffix(AS_GIVEN)),
         ) as viewer,
     ):
         with interruptible() as interrupted:

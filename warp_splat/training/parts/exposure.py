@@ -9,15 +9,19 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 
+from warp_splat.color import COLOR_MAPS, PIVOT
 from warp_splat.errors import InputError
+from warp_splat.formats.exposures import Exposures
 from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.exposure import PIVOT, SHAPES, expose, load_kernels, whole
+from warp_splat.raster.exposure import expose, load_kernels, whole
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import GREEN, NEEDED, gains_of
-from warp_splat.scene.types import Scene, View
+from warp_splat.scene.neighbors import guessed
+from warp_splat.scene.types import Scene
 from warp_splat.training.optimizer import power
 from warp_splat.training.parts import ExposureOptions
 from warp_splat.training.seams import Setting, Step, Verdict
@@ -38,10 +42,10 @@ class Exposure:
         self.options, self.kind, self.end = options, options.exposure or DEFAULT, setting.iterations
         if options.exposure_lr_init and not options.exposure_lr_final:
             raise InputError("--exposure_lr_final: expected a positive number, since rates fall log-linearly, got 0.")
-        self.pivot = 0.0 if setting.scene.linear else PIVOT
+        self.pivot, self.scene = 0.0 if setting.scene.linear else PIVOT, setting.scene
         self.places = {view: place for place, view in enumerate(setting.scene.train)}
         device = setting.model.device
-        self.maps = torch.zeros(len(self.places), *SHAPES[self.kind], device=device, requires_grad=True)
+        self.maps = torch.zeros(len(self.places), *COLOR_MAPS[self.kind], device=device, requires_grad=True)
         self.falloff = torch.zeros(2, device=device, requires_grad=True)
 
     @classmethod
@@ -75,17 +79,9 @@ class Exposure:
 
     def image(self, image: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """As the camera of this view would have shown it."""
-        return self._mapped(image, step.view)
-
-    def _mapped(self, image: torch.Tensor, view: View) -> torch.Tensor:
         with stage("exposure"):
             falloff = self.falloff if self.options.vignetting else None
-            return expose(image, self.kind, self.maps[self.places[view]], falloff, self.pivot)
-
-    @torch.no_grad()
-    def as_taken(self, image: torch.Tensor, view: View) -> torch.Tensor:
-        """The same for a picture; of a photograph that is held out nothing is known."""
-        return self._mapped(image, view) if view in self.places else image
+            return expose(image, self.kind, self.maps[self.places[step.view]], falloff, self.pivot)
 
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """Add the squared difference of this view's map to the identity, and between neighboring cells."""
@@ -105,6 +101,15 @@ class Exposure:
         maps = {view.name: whole(self.kind, self.maps[place], self.pivot) for view, place in self.places.items()}
         pairs = ((name, numbers.cpu().view(4, 3)) for name, numbers in maps.items())
         return {"exposure.json": {name: torch.cat([n[:3], n[3:].T], 1).tolist() for name, n in pairs}}
+
+    def exposures(self) -> Exposures:
+        """Of all photographs; those of held-out ones are guessed from the nearest that train."""
+        maps, scene = self.maps.detach().cpu().numpy(), self.scene
+        train, test = ([view.camera for view in views] for views in (scene.train, scene.test))
+        found = [*maps, *guessed(maps, train, test, scene.extent).astype(np.float32)]
+        names = [view.name for view in (*scene.train, *scene.test)]
+        falloff = self.falloff.detach().cpu().numpy()
+        return Exposures(self.kind, self.pivot, falloff, dict(zip(names, found, strict=True)))
 
     @torch.no_grad()
     def after_step(self, iteration: int) -> None:
