@@ -16,7 +16,7 @@ from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import make_renderer
-from warp_splat.rendering.exposure import as_photographed
+from warp_splat.rendering.photographed import as_photographed
 from warp_splat.viewer import server
 
 

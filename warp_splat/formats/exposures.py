@@ -17,7 +17,7 @@ EXPOSURES = "exposures.json"
 
 
 class Exposures(NamedTuple):
-    """What :func:`warp_splat.raster.exposure.expose` takes."""
+    """What :func:`warp_splat.raster.expose.expose` takes."""
 
     kind: str
     pivot: float

@@ -12,7 +12,7 @@ from warp_splat.formats.model_folder import open_model, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of, with_refined_cameras
-from warp_splat.rendering.exposure import as_photographed
+from warp_splat.rendering.photographed import as_photographed
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible

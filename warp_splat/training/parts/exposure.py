@@ -16,7 +16,7 @@ from warp_splat.color import COLOR_MAPS, PIVOT
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures
 from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.exposure import expose, load_kernels, whole
+from warp_splat.raster.expose import color_matrix, expose, load_color_maps
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import GREEN, NEEDED, gains_of
@@ -75,7 +75,7 @@ class Exposure:
     def load(self) -> None:
         """Compile and load the kernels."""
         if self.kind != "bilateral":
-            load_kernels(self.maps.device)
+            load_color_maps(self.maps.device)
 
     def image(self, image: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """As the camera of this view would have shown it."""
@@ -98,7 +98,7 @@ class Exposure:
         """The maps [3, 4] of gains and affine maps as the reference writes them: color @ map[:, :3] + map[:, 3]."""
         if self.kind == "bilateral":
             return {}
-        maps = {view.name: whole(self.kind, self.maps[place], self.pivot) for view, place in self.places.items()}
+        maps = {view.name: color_matrix(self.kind, self.maps[place], self.pivot) for view, place in self.places.items()}
         pairs = ((name, numbers.cpu().view(4, 3)) for name, numbers in maps.items())
         return {"exposure.json": {name: torch.cat([n[:3], n[3:].T], 1).tolist() for name, n in pairs}}
 

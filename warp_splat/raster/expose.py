@@ -35,10 +35,10 @@ def expose(
         if numbers.requires_grad:  # no pixel that is not finite may spoil the cells
             numbers.register_hook(lambda grad: grad.nan_to_num(0.0, 0.0, 0.0))
         return _through_grid(image, numbers, pivot)
-    return _ColorMap.apply(image, whole(kind, numbers, pivot))
+    return _ColorMap.apply(image, color_matrix(kind, numbers, pivot))
 
 
-def whole(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor:
+def color_matrix(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor:
     """Columns of a matrix and a constant, [12], of a gain or an affine map."""
     none = torch.zeros_like(numbers[:1])
     n = [numbers if i % 4 == 0 else none for i in range(12)] if kind == "gain" else list(numbers.split(1))
@@ -47,7 +47,7 @@ def whole(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor:
     return torch.cat(diagonal + constant)
 
 
-def load_kernels(device: torch.device) -> None:
+def load_color_maps(device: torch.device) -> None:
     """Compile and load them, for many pixels at once and for those left over."""
     for lanes in {driver_of(device).lanes, 1}:
         load(make_map_colors(lanes), device)

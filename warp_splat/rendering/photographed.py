@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from warp_splat.formats.exposures import Exposures
-from warp_splat.raster.exposure import expose
+from warp_splat.raster.expose import expose
 
 
 def as_photographed(image: torch.Tensor, exposures: Exposures | None, name: str) -> torch.Tensor:
