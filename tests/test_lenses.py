@@ -109,6 +109,14 @@ def test_a_panorama_that_turns_is_a_picture_that_rolls(device):
     assert (rolled.image.roll(-columns, 1) - still.image).abs().mean() < 1e-5
 
 
+def test_a_panorama_that_is_not_twice_as_wide_as_high_is_refused():
+    focals = 90 / (2 * np.pi), 30 / np.pi
+    with pytest.raises(InputError, match="EQUIRECTANGULAR: expected a picture of 2:1, got 90 x 30 pixels"):
+        Camera(90, 30, *focals, 45, 15, np.eye(3), np.zeros(3), lens=Lens("EQUIRECTANGULAR"))
+    whole = scenes.SCENES["panorama"]().camera
+    assert whole.resized(13, 7).width == 13  # rounded to whole pixels
+
+
 def picture(model="OPENCV", coefficients=(0.1, 0.0, 0.0, 0.0), size=(40, 30), focal=20.0):
     width, height = size
     place = (width, height, focal, focal, width / 2, height / 2, np.eye(3), np.zeros(3))
@@ -179,6 +187,34 @@ def test_lenses_at_their_ends(model, coefficients, device):
     if model == "FOV":
         pinhole, drawn = (rasterize(*scene.parameters(), view) for view in (scene.camera, camera))
         torch.testing.assert_close(drawn.image, pinhole.image, rtol=0, atol=1e-5)
+
+
+def one_gaussian(device, mean, scale):
+    one = torch.ones(1, 1, device=device)
+    quats = one * torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
+    shapes = [one * torch.tensor([mean], device=device), quats, scale * one.expand(1, 3), 0.9 * one[0]]
+    return [tensor.clone().requires_grad_() for tensor in (*shapes, one.expand(1, 1, 3))]
+
+
+@pytest.mark.parametrize("down", [3.0, -3.0])
+def test_a_pole_is_seen_at_all_longitudes(down, device):
+    """As a band all around, which is fainter at most by 30 %, half a turn away; on that side alone; with gradients."""
+    camera = replace(scenes.SCENES["panorama"]().camera, rotation=np.eye(3), translation=np.zeros(3))
+    leaves = one_gaussian(device, [1e-4, down, 1e-4], 0.3)
+    out = rasterize(*leaves, camera)
+    at_pole, away = (out.alpha[-1], out.alpha[0]) if down > 0 else (out.alpha[0], out.alpha[-1])
+    assert at_pole.min() > 0.7 * at_pole.max() > 0.4 and away.max() == 0
+    out.image.square().sum().backward()
+    assert all(leaf.grad.isfinite().all() for leaf in leaves) and leaves[3].grad.abs().min() > 0
+
+
+def test_what_a_panorama_shows_at_its_seam_and_near_its_poles_is_found_again():
+    camera = replace(scenes.SCENES["panorama"]().camera, rotation=np.eye(3), translation=np.zeros(3))
+    columns, rows = np.array([1e-6, 0.5, 30.0, 59.5, 60 - 1e-6]), np.array([0.25, 0.5, 15.0, 29.5, 29.75])
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    np.testing.assert_allclose(camera.pixels(camera.rays(pixels)), pixels, atol=1e-9)
+    ends = camera.rays(np.stack([[0.0, camera.width], [15.0, 15.0]], 1))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-12)
 
 
 def test_channels_cross_the_seam(device):

@@ -13,6 +13,8 @@ from warp_splat.lenses.shutter import Shutter, rotation_vector
 
 MOST_SHARE = 0.5  # of its height by which a picture may move up or down while it is read
 
+ODD = 2  # px by which a panorama's width may miss twice its height, once it has been resized
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -79,6 +81,11 @@ class Camera:
             if not isinstance(self.lens, Lens):
                 raise InputError(f"Camera lens: expected a warp_splat.Lens or None, got {self.lens!r:.80}.")
             check_picture(self.lens, *self._picture)
+            if self.lens.family.around and abs(self.width - 2 * self.height) > ODD:
+                raise InputError(
+                    f"Camera lens {self.lens.model}: expected a picture of 2:1, got {self.width} x {self.height} "
+                    "pixels; use one that shows all around."
+                )
         if self.shutter is not None:
             if not isinstance(self.shutter, Shutter):
                 raise InputError(f"Camera shutter: expected a warp_splat.Shutter or None, got {self.shutter!r:.80}.")
