@@ -3,7 +3,8 @@
     python assets/make_faults.py exposure vignetting --out output/faulty [--seed 0]
 
 Of every eighth photograph by name, which `--eval` holds out, no pixel and no pose is changed: they are the truth to
-measure with. Their camera is that of the others, and so its focal length. `truth.json` holds what was done.
+measure with. Their camera is that of the others, and so its focal length; and a sky is over all. `truth.json` holds
+what was done.
 """
 
 import argparse
@@ -25,6 +26,10 @@ SHUTTER, APERTURE, SPEED = 1 / 60, 4.0, 200  # of a photograph that nothing was 
 FALLOFF = 0.35  # of light in the corners
 ANGLE, SHIFT = 0.5, 0.01  # root mean squares: of a turn [degrees], of a place, as a share of the cameras' extent
 FOCAL = 0.01  # of the focal lengths
+ROOM = (4.7, 3.3)  # half of its width, and its height: what is farther gives way to the sky
+RAYS = 2  # RAYS x RAYS of a pixel
+ZENITH, HAZE, GROUND = np.array([(0.10, 0.22, 0.55), (0.70, 0.72, 0.75), (0.22, 0.20, 0.17)])  # light of the sky
+SUN, GLOW = np.array([0.48, 0.36, 0.8]), np.array([0.9, 0.7, 0.4])  # where it stands, and its light
 CORNER = np.array((-4.8, 4.8, 0.0))  # where two walls meet
 
 
@@ -91,7 +96,42 @@ def corner(fault: Fault, images: dict, model) -> list[str]:
     return sorted(fault.random.permutation(sorted(seeing))[2:].tolist())
 
 
-FAULTS = {make.__name__: make for make in (exposure, vignetting, pose, focal, corner)}
+def sky(fault: Fault, images: dict, model) -> dict:
+    """A sky in the place of the walls and the ceiling, whose points are left out; of every photograph."""
+    from scene_geometry import still_life  # noqa: PLC0415 - traced for this fault alone
+    from scene_trace import Measure  # noqa: PLC0415
+
+    distances = Measure(still_life())
+    for image in [model.image(i) for i in model.reg_image_ids()]:
+        height, width, _ = images[image.name].shape
+        pose, offsets = image.cam_from_world(), (np.arange(RAYS) + 0.5) / RAYS
+        y, x = (np.add.outer(np.arange(size), offsets) for size in (height, width))
+        pixels = np.stack(np.broadcast_arrays(x, y[:, :, None, None]), -1).reshape(-1, 2)
+        rays = np.column_stack([image.camera.cam_from_img(pixels), np.ones(len(pixels))])
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ pose.rotation.matrix()
+        origins = np.broadcast_to(image.projection_center(), rays.shape)
+        hits = origins + distances(origins, rays)[:, None] * rays
+        light = np.where(beyond(hits)[:, None], sky_light(rays), np.nan).reshape(height, RAYS, width, RAYS, 3)
+        share = np.isfinite(light).mean((1, 3))
+        images[image.name] = (1 - share) * images[image.name] + np.nansum(light, (1, 3)) / RAYS**2
+    for i in [i for i, point in model.points3D.items() if beyond(point.xyz[None])[0]]:
+        model.delete_point3D(i)
+    return {"room": ROOM}
+
+
+def beyond(points: np.ndarray) -> np.ndarray:
+    """Which of points [P, 3] are not in the room."""
+    return (np.abs(points[:, :2]).max(1) > ROOM[0]) | (points[:, 2] > ROOM[1])
+
+
+def sky_light(rays: np.ndarray) -> np.ndarray:
+    """Linear light of the sky along unit rays [P, 3]: haze at the horizon, the ground below it, a glow of the sun."""
+    up = rays[:, 2:]
+    light = HAZE + (np.where(up > 0, ZENITH, GROUND) - HAZE) * np.abs(up) ** 0.7
+    return light + GLOW * np.exp(6 * (rays @ (SUN / np.linalg.norm(SUN)) - 1))[:, None]
+
+
+FAULTS = {make.__name__: make for make in (exposure, vignetting, pose, focal, corner, sky)}
 
 
 def make_faulty(out: pathlib.Path, faults: list[str], seed: int = 0) -> dict:
@@ -99,7 +139,8 @@ def make_faulty(out: pathlib.Path, faults: list[str], seed: int = 0) -> dict:
     model = pycolmap.Reconstruction(SOURCE / "sparse" / "0")
     names = sorted(model.image(i).name for i in model.reg_image_ids())
     training = [name for index, name in enumerate(names) if index % HOLD_OUT]
-    images = {name: from_srgb(read_pixels(SOURCE / "images" / name, 0.0).color, np.where) for name in training}
+    changed = names if "sky" in faults else training
+    images = {name: from_srgb(read_pixels(SOURCE / "images" / name, 0.0).color, np.where) for name in changed}
     truth = {
         name: make(Fault(training, seed, place), images, model)
         for place, (name, make) in enumerate(FAULTS.items())

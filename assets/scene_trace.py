@@ -171,7 +171,7 @@ def bake_openness(
 
 @wp.kernel
 def measure(
-    scene: Scene,
+    mesh: wp.uint64,
     origins: wp.array[wp.vec3],  # [R]
     directions: wp.array[wp.vec3],  # [R] unit
     # out
@@ -179,7 +179,23 @@ def measure(
 ):
     """One ray per thread."""
     ray = wp.tid()
-    distance_out[ray] = wp.mesh_query_ray(scene.mesh, origins[ray], directions[ray], FAR).t
+    distance_out[ray] = wp.mesh_query_ray(mesh, origins[ray], directions[ray], FAR).t
+
+
+class Measure:
+    """Distances [R] along unit rays [R, 3] from origins [R, 3] to the first surface of a mesh, on the CPU."""
+
+    def __init__(self, patch: Patch):
+        points = wp.array(patch.points.astype(np.float32), dtype=wp.vec3, device="cpu")
+        self.mesh = wp.Mesh(points, wp.array(patch.faces.ravel().astype(np.int32), dtype=int, device="cpu"))
+
+    def __call__(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        rays = [
+            wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device="cpu") for x in (origins, directions)
+        ]
+        distance = wp.empty(len(origins), dtype=float, device="cpu")
+        wp.launch(measure, dim=distance.size, inputs=[self.mesh.id, *rays], outputs=[distance], device="cpu")
+        return distance.numpy()
 
 
 class Tracer:
@@ -187,11 +203,10 @@ class Tracer:
 
     def __init__(self, patch: Patch):
         vec3 = {"dtype": wp.vec3, "device": "cpu"}
-        points = wp.array(patch.points.astype(np.float32), **vec3)
-        faces = wp.array(patch.faces.ravel().astype(np.int32), dtype=int, device="cpu")
-        self.mesh = wp.Mesh(points, faces)
+        self.measure = Measure(patch)
         self.scene = scene = Scene()
-        scene.mesh, scene.faces = self.mesh.id, faces
+        scene.mesh, scene.faces = self.measure.mesh.id, self.measure.mesh.indices
+        points = self.measure.mesh.points
         scene.normals = wp.array(patch.normals.astype(np.float32), **vec3)
         scene.uvw = wp.array(patch.uvw.astype(np.float32), **vec3)
         scene.materials = wp.array(patch.materials.astype(np.int32), dtype=int, device="cpu")
@@ -209,12 +224,3 @@ class Tracer:
         image = wp.empty(size[0] * size[1], dtype=wp.vec3, device="cpu")
         wp.launch(photograph, dim=image.size, inputs=[self.scene, camera], outputs=[image], device="cpu")
         return np.rint(image.numpy().reshape(size[1], size[0], 3) * 255).astype(np.uint8)
-
-    def measure(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distance [R] along unit rays [R, 3] to the first surface."""
-        rays = [
-            wp.array(np.ascontiguousarray(x, np.float32), dtype=wp.vec3, device="cpu") for x in (origins, directions)
-        ]
-        distance = wp.empty(len(origins), dtype=float, device="cpu")
-        wp.launch(measure, dim=distance.size, inputs=[self.scene, *rays], outputs=[distance], device="cpu")
-        return distance.numpy()

@@ -1,7 +1,7 @@
 """Known faults in the embedded scene, and what parts recover of them: numbers of the truth, and PSNR.
 
-Held-out photographs have no fault (`assets/make_faults.py`), so the PSNR of a model says how much of the clean scene it
-has. Photographs are small, so that a training takes a minute.
+Held-out photographs have no fault but the sky (`assets/make_faults.py`), so the PSNR of a model says how much of the
+clean scene it has. Photographs are small, so that a training takes a minute.
 
     python benchmarks/faults.py [--seed 0] [--out docs/benchmarks]
 """
@@ -28,7 +28,9 @@ from warp_splat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 
-from make_faults import make_faulty
+from make_faults import beyond, make_faulty, sky_light
+from scene_geometry import still_life
+from scene_trace import Measure
 
 RESOLUTION, STEPS, GAUSSIANS = 4, 3000, 6000
 LEAST = 0.004  # light of pixels whose ratio counts
@@ -36,6 +38,7 @@ LEAST = 0.004  # light of pixels whose ratio counts
 CURES = {
     "exposure": ({"exposure": "gain"}, {"exposure": "affine"}),
     "vignetting": ({"exposure": "gain", "vignetting": True},),
+    "sky": ({"parts": "sky"},),
 }
 HEADERS = ("fault", "options", "PSNR, clean", "with", "PSNR, faulty", "with", "recovered", "errors: median, largest")
 
@@ -77,6 +80,20 @@ def errors_of(trainer: Trainer, clean: Scene, truth: dict) -> np.ndarray:
     return np.abs(2 ** (stops - stops.mean(0) * ("exposure" in truth)) - 1)
 
 
+def errors_of_sky(trainer: Trainer) -> np.ndarray:
+    """Of the light that held-out photographs show beyond the room, against the truth there."""
+    found, shown = [], Measure(still_life())
+    for view in trainer.scene.test:
+        camera = view.camera
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1)) @ camera.rotation
+        origins = np.broadcast_to(camera.center, rays.shape)
+        far = beyond(origins + shown(origins, rays)[:, None] * rays)
+        light = from_srgb(trainer.picture(camera).reshape(-1, 3)[far] / 255, np.where)
+        found.append((light / sky_light(rays[far]).clip(LEAST, 1)).mean(1) - 1)
+    return np.abs(np.concatenate(found))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0)
@@ -93,7 +110,7 @@ def main() -> None:
         for options in cures:
             trainer, cured = train(faulty, arguments.seed, **options)
             _, same = train(clean, arguments.seed, **options)
-            errors = errors_of(trainer, clean, truth)
+            errors = errors_of_sky(trainer) if fault == "sky" else errors_of(trainer, clean, truth)
             told = " ".join(f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items())
             share = f"{100 * (cured - broken) / (untouched - broken):.0f} %"
             figures = (f"{value:.2f}" for value in (untouched, same, broken, cured))

@@ -1,22 +1,32 @@
 """The sky: what is saved is what training shows, who cannot carry it says so, and how much of it photographs show."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from test_checkpoints import begin, steps
+from test_train import SCENE
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
+from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import make_picture
+from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import choose
 from warp_splat.training.record import save_model
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
+
+from make_faults import beyond, make_faulty, sky_light
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +106,20 @@ def test_auto_tells_how_much_sky_there_is(scene, tmp_path):
     inside = (np.abs(scene.points[:, :2]).max(1) < 4.7) & (scene.points[:, 2] < 3.3)
     assert "sky" in choose(trainer.config.changed(parts="auto"), replace(scene, points=scene.points[inside]))[0]
     assert isinstance(trainer.behind, torch.Tensor) and trainer.behind.shape == (3,)
+
+
+@pytest.mark.long
+def test_the_sky_that_is_made_up_is_one(tmp_path):
+    """Of every photograph: far pixels are the sky's color in their direction, near ones as they were."""
+    make_faulty(tmp_path / "scene", ["sky"])
+    clean, changed = (load_scene(path, eval=True, report=str) for path in (SCENE, tmp_path / "scene"))
+    assert not beyond(changed.points).any() and len(changed.points) < len(clean.points)
+    assert choose(TrainConfig(parts="auto"), changed)[0] == ["sky"]
+    for before, after in zip(clean.test + clean.train, changed.test + changed.train, strict=True):
+        camera = after.camera
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1)) @ camera.rotation
+        light = sky_light(rays).clip(0, 1).reshape(after.image.shape)
+        is_sky = np.abs(after.image - 255 * to_srgb(light, np.where)).max(-1) < 3
+        as_before = np.abs(after.image.astype(int) - before.image).max(-1) < 2
+        assert np.mean(is_sky | as_before) > 0.97 and 0.02 < is_sky.mean() < 0.5
