@@ -31,10 +31,11 @@ from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.project import adj_camera, affine, ellipsoid
 from warp_splat.kernels.project.adj_lens import make_bend
 from warp_splat.kernels.project.quarantine import quarantine
+from warp_splat.kernels.project.rolling import make_expose
 from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.kernels.statistics import make_observe
-from warp_splat.lenses.formulas import MODELS
+from warp_splat.lenses.formulas import MODELS, PINHOLE
 
 REGISTERS = 65536  # of a multiprocessor, all architectures below
 #: Architecture: threads, blocks and KiB of shared memory of a multiprocessor (CUDA C++ Programming Guide, table of
@@ -54,6 +55,7 @@ def modules() -> dict[str, wp.Module]:
     found = {
         "project": make_project(affine.PROJECTION, reach_of, 1, None).module,
         "project, ellipsoid": make_project(ellipsoid.PROJECTION, reach_of, 1, None).module,
+        "project, rolling shutter": make_project(affine.PROJECTION, reach_of, 1, make_expose(PINHOLE, 1)).module,
         "adjoint of pose": adj_camera.make_adj_pose(1).module,
         "adjoint of intrinsics": adj_camera.make_adj_intrinsics(1).module,
         "shade": sh_colors.make_shade(1).module,

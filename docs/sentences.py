@@ -259,6 +259,7 @@ def sentences() -> dict[str, list[tuple]]:
                 "find the means to within {} px, one step to within {} px.",
                 *(f.small(max(f.shutter(way, "off"))) for way in ("two steps", "one step")),
             ),
+            ("the adjoint has {} registers, without spills", f.registers("project, rolling shutter")[0]),
             ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
             ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
             (

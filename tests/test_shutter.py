@@ -62,7 +62,7 @@ def test_means_are_where_their_row_sees_them(device):
     assert len(seen) > 50
     for index in seen:
         mean, row = scene.means[index].double().cpu().numpy(), 0.5 * height(scene)
-        for _ in range(60):
+        for _ in range(20):
             camera = scene.camera.at(np.clip(row, -0.15 * height(scene), 1.15 * height(scene)) - 0.5)
             place = camera.pixels((camera.rotation @ mean + camera.translation)[None])[0]
             row = place[1]
@@ -182,11 +182,15 @@ def draw(camera, **options):
 
 @pytest.mark.slow
 def test_one_at_a_time_as_on_a_gpu_is_the_same():
-    """The kernels of a GPU, against sixteen Gaussians at once."""
+    """The kernels of a GPU, against sixteen Gaussians at once; gradients of the poses, too."""
     scene, found = moving("degree2"), []
     for driver in (CPU, replace(CPU, lanes=1)):
-        given = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
-        splats = project(Gaussians(*given[:4], given[4][:, :1], given[4][:, 1:]), scene.camera, RasterOptions(), driver)
+        given, camera = (
+            [tensor.clone().requires_grad_() for tensor in scene.parameters()],
+            CameraParameters(scene.camera),
+        )
+        splats = project(Gaussians(*given[:4], given[4][:, :1], given[4][:, 1:]), camera, RasterOptions(), driver)
+        given += [camera.twist, camera.last_twist, camera.intrinsics]
         upstream = [torch.ones_like(part) for part in splats[:5]]
         found.append([*splats[:6], *torch.autograd.grad(splats[:5], given, upstream)])
     for sixteen, one in zip(*found, strict=True):
@@ -272,14 +276,6 @@ def test_a_camera_that_learns_stays_where_it_is():
         np.testing.assert_allclose(camera.translation, exact.translation.detach(), atol=1e-13)
         np.testing.assert_allclose(camera.shutter.turn, exact.shutter.turn.detach(), atol=1e-13)
         np.testing.assert_allclose(camera.shutter.shift, exact.shutter.shift.detach(), atol=1e-13)
-
-
-@pytest.mark.slow
-def test_check_gradients_agrees():
-    scene = moving("degree2")
-    names = ["rotation", "last_rotation", "last_translation", "focal"]
-    report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), parameters=names)
-    assert [row.verdict for row in report.rows] == ["agrees"] * 4, str(report)
 
 
 def test_check_gradients_names_the_last_row_if_it_is_off(monkeypatch):
