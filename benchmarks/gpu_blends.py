@@ -19,7 +19,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.cuda import adjoint
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.cuda import THREADS, spread_upstream
-from warp_splat.raster.data import Gaussians, Pixels, variant_of
+from warp_splat.raster.data import Gaussians, Pixels, alphas_of, variant_of
 from warp_splat.raster.drivers import CUDA
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, launch_blocks, view
@@ -98,7 +98,7 @@ class Blends:
     def reverse(self, kernel: wp.Kernel, rows: torch.Tensor) -> None:
         states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
         upstream = [view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
-        inputs = [self.bins.view(), self.options.alpha_min, *states, *upstream]
+        inputs = [self.bins.view(), alphas_of(self.options), *states, *upstream]
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
 
     def into_slots(self) -> None:

@@ -28,7 +28,7 @@ from warp_splat.kernels.falloff import make_exp
 from warp_splat.kernels.simd import LANES, total, vec16, where_less
 from warp_splat.kernels.splat import alpha_of, exponent
 from warp_splat.kernels.structs import BinsView
-from warp_splat.raster.data import Gaussians
+from warp_splat.raster.data import Gaussians, alphas_of
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import camera_view, project
 from warp_splat.runtime.launch import launch, view
@@ -44,7 +44,7 @@ exp2_minus = make_exp(RasterOptions().exp_degree)
 def count_pairs(
     first: int,
     bins: BinsView,
-    alpha_min: float,
+    alphas: wp.vec2,
     count: wp.array2d[vec16],  # [T, BLOCKS] instances walked before the pixel stopped
     width: float,
     height: float,
@@ -69,7 +69,7 @@ def count_pairs(
                 dx = offset_x(splat.mean, x0, bx)
                 dy = offset_y(splat.mean, y0, by)
                 fall = exp2_minus(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-                alpha = alpha_of(fall * splat.opacity, alpha_min)
+                alpha = alpha_of(fall * splat.opacity, alphas)
                 hit = where_less(vec16(0.0), alpha, vec16(1.0), vec16(0.0))
                 hit = where_less(vec16(float(k - start)), count[tile, 4 * by + bx], hit, vec16(0.0))
                 hit = where_less(vec16(splat.mean[0]) - dx, vec16(width), hit, vec16(0.0))
@@ -99,7 +99,7 @@ def count(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> Count
         bins = CPU.bin(project(gaussians, camera, options), camera, options)
         _, (_, stopped, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
         pairs = torch.empty(len(bins.ranges), 2, dtype=torch.int64)
-        inputs = [bins.view(), options.alpha_min, view(stopped, vec16), camera.width, camera.height]
+        inputs = [bins.view(), alphas_of(options), view(stopped, vec16), camera.width, camera.height]
         launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
     blended, looked_at = pairs.sum(0).tolist()
     pixels = camera.width * camera.height

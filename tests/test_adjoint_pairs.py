@@ -116,7 +116,7 @@ def make_piece(name, number):
 
     @wp.func
     def clamped(x: number, y: number, z: number):
-        return opaque(x, ALPHA_MIN, y, z)
+        return opaque(x, wp.vec2(ALPHA_MIN, ALPHA_MAX), y, z)
 
     @wp.func
     def angle(x: number, y: number, z: number):
@@ -182,9 +182,10 @@ def test_against_differences(name, lanes):
 
 
 def test_opacity_against_central_differences():
+    alphas = wp.vec2(ALPHA_MIN, ALPHA_MAX)
     for value in (0.001, 0.1, 0.5, 0.97, 1.5):  # below the cut, between, above the clamp
-        slope = (splat.alpha_of(value + 1e-3, ALPHA_MIN) - splat.alpha_of(value - 1e-3, ALPHA_MIN)) / 2e-3
-        assert splat.adj_alpha_of(value, ALPHA_MIN, 2.5) == pytest.approx(2.5 * slope, abs=1e-3)
+        slope = (splat.alpha_of(value + 1e-3, alphas) - splat.alpha_of(value - 1e-3, alphas)) / 2e-3
+        assert splat.adj_alpha_of(value, alphas, 2.5) == pytest.approx(2.5 * slope, abs=1e-3)
 
 
 def test_a_blended_pixel_against_float64():

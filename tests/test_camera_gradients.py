@@ -102,6 +102,7 @@ def test_modes(adjoint):
 
 
 VARIANTS = [
+    ("degree2", RasterOptions(antialiasing=True, blur=1.0)),
     ("degree2", RasterOptions(antialiasing=True, depth=True)),
     ("subpixel", RasterOptions(antialiasing=True)),
     ("off_center", RasterOptions(antialiasing=True, depth=True)),

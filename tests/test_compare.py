@@ -18,7 +18,7 @@ from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant
-from warp_splat.raster.data import Gaussians
+from warp_splat.raster.data import Gaussians, alphas_of
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, view
@@ -47,7 +47,7 @@ def test_what_is_differentiated_is_the_blend(mode):
     color, behind = torch.zeros(len(final), 3 * BLOCKS, LANES), torch.zeros_like(final)
     slots = torch.zeros(len(bins.instances), 9)
     states = [view(state, vec16) for state in (final, count, kept)]
-    inputs = [lists, PLAIN.alpha_min, *states, view(steps, wp.int32), view(slots, wp.float32)]
+    inputs = [lists, alphas_of(PLAIN), *states, view(steps, wp.int32), view(slots, wp.float32)]
     launch(make_walk(mode, BlendVariant()), len(final), inputs, [view(color, vec16), view(behind, vec16)])
     assert torch.allclose(behind, final, rtol=1e-6, atol=0)
     height, width, _ = image.shape

@@ -18,6 +18,7 @@ from gsplat.cuda import _torch_impl as theirs  # noqa: E402
 
 GRADIENT = 1e-5
 SKEWLESS = torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]])  # its torch code knows a skew, its kernels do not
+CONSTANTS = {"near": 0.01, "alpha_max": 0.999}  # of gsplat, where they are not ours
 MODELS = ("pinhole", "ortho", "fisheye")
 
 
@@ -95,13 +96,12 @@ def test_harmonics(degree):
 
 
 @pytest.mark.parametrize("driver", ["lanes", "blocks"])
-@pytest.mark.parametrize("name", ["degree2", "near_and_behind"])
-def test_pixels_against_the_oracle(name, driver, monkeypatch):
-    monkeypatch.setattr(oracle, "NEAR", 0.01)
+@pytest.mark.parametrize("name", ["degree2", "near_and_behind", "opaque"])
+def test_pixels_against_the_oracle(name, driver):
     call, scene = call_of(name, cameras=1), SCENES[name]()
     leaves = {key: call[key] for key in ("means", "quats", "scales", "opacities", "colors")}
     exact = {key: leaf.detach().double().requires_grad_() for key, leaf in leaves.items()}
-    truth = oracle.exact_render(*exact.values(), scene.camera, background=(0.1, 0.2, 0.3))
+    truth = oracle.exact_render(*exact.values(), scene.camera, background=(0.1, 0.2, 0.3), **CONSTANTS)
     if driver == "blocks":
         with using(CUDA):
             image, alpha, _ = rasterization(**call, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]))
@@ -148,6 +148,14 @@ def test_modes_channels_and_batches(mode, channels):
     assert (packed["isect_ids"].diff() >= 0).all() and packed["tiles_per_gauss"].sum() == len(order)
 
 
+def test_no_gaussians():
+    nothing = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (9, 3)}
+    call = call_of(**{name: torch.zeros(0, *shape) for name, shape in nothing.items()}, backgrounds=torch.ones(2, 3))
+    for packed in (True, False):
+        image, alpha, meta = rasterization(**call, packed=packed)
+        assert (image == 1).all() and not alpha.any() and len(meta["flatten_ids"]) == 0
+
+
 def test_gradients_of_what_meta_shows_and_sparse_ones():
     found = []
     for packed in (False, True):
@@ -186,7 +194,7 @@ def test_sums_of_magnitudes(mode, channels, driver):
         dx, dy = (means2d - pixels[:, None]).unbind(2)
         xx, xy, yy = meta["conics"][mine][order].detach().double().unbind(1)
         raw = call["opacities"][ids].detach() * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
-        solid = torch.where(raw >= 1 / 255, raw.clamp_max(0.99), 0.0)
+        solid = torch.where(raw >= 1 / 255, raw.clamp_max(0.999), 0.0)
         after = torch.cumprod(1 - solid, 1)
         share = solid * torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
         light, total = share @ call["colors"][ids].double() + after[:, -1:] * behind[view], share.sum(1, keepdim=True)
@@ -229,11 +237,19 @@ def test_its_strategy_grows_a_model(packed, steps):
     ("changes", "found"),
     [
         ({"absgrad": True, "sh_degree": None, "colors": torch.zeros(120, 31)}, "absgrad: expected at most 30 channels"),
+        ({"colors": torch.zeros(120, 0), "sh_degree": None}, "colors: expected 1 to 512 channels, got 0"),
+        ({"viewmats": torch.zeros(0, 4, 4)}, "viewmats: expected a tensor"),
+        ({"viewmats": torch.zeros(2, 4, 4)}, "viewmats: expected matrices from world to camera"),
+        ({"opacities": torch.full((120,), 2.0)}, "opacities: expected values in 0..1"),
+        ({"scales": torch.full((120, 3), -1.0)}, "scales: expected positive values"),
+        ({"means": torch.zeros(120, 3).to_sparse()}, "means: expected a dense tensor"),
+        ({"width": 10**6, "height": 10**6}, "width, height: expected at most 4294967296 pixels"),
+        ({"sh_degree": torch.zeros(2)}, "sh_degree: expected 0 to 4 or None"),
         ({"distributed": True}, "distributed: warp_splat.gsplat does not carry it; render in each process"),
-        ({"with_ut": True}, "with_ut: .* does not carry"),
         ({"with_eval3d": True}, "with_eval3d: .* does not carry"),
         ({"covars": torch.zeros(120, 3, 3)}, "covars: .* give quats and scales"),
-        ({"radial_coeffs": torch.zeros(2, 6)}, "radial_coeffs: .* undistort"),
+        ({"ftheta_coeffs": object()}, "ftheta_coeffs: .* undistort"),
+        ({"viewmats_rs": torch.zeros(2, 4, 4)}, "viewmats_rs: .* warp_splat.Camera.rolling"),
         ({"rolling_shutter": "ROLLING"}, "rolling_shutter: .*the shutter is global"),
         ({"camera_model": "ftheta"}, "camera_model: expected one of pinhole, ortho, fisheye, got 'ftheta'"),
         ({"render_mode": "depth"}, "render_mode: expected one of RGB, D"),

@@ -15,6 +15,7 @@ from scenes import PARAMETERS, SCENES
 import warp_splat
 from warp_splat import InputError, RasterOptions
 from warp_splat.compare import oracle
+from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ADJOINTS
 from warp_splat.raster import bin
 
@@ -53,8 +54,9 @@ def truth(name, options):
     """Computed once per scene and options, in float64."""
     scene = SCENES[name]()
     leaves = leaves_of(scene.to("cpu", torch.float64))
-    chosen = {key: getattr(options, key) for key in ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")}
-    out = oracle.exact_render(*[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **chosen)
+    out = oracle.exact_render(
+        *[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **for_oracle(options)
+    )
     generator = torch.Generator().manual_seed(1)
     upstream = {}
     for key in ("image", "alpha", "depth")[: 3 if options.depth else 2]:
@@ -161,6 +163,9 @@ VARIANTS = [
     pytest.param("opencv", RasterOptions(projection="unscented"), marks=pytest.mark.long),
     pytest.param("panorama", RasterOptions(projection="unscented"), marks=pytest.mark.long),
     pytest.param("inside", RasterOptions(projection="unscented"), marks=pytest.mark.long),
+    ("saturated", RasterOptions(alpha_max=0.999)),
+    ("near_and_behind", RasterOptions(near=0.01, blur=0.1, antialiasing=True)),
+    ("near_and_behind", RasterOptions(near=1.5, blur=1.0, projection="unscented")),
     ("degree1", RasterOptions(alpha_min=0.0)),
     ("saturated", RasterOptions(t_min=0.0)),
     ("saturated", RasterOptions(alpha_min=1e-4, t_min=1e-2)),
@@ -176,7 +181,9 @@ def test_options(name, options, device):
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS[1:])
-@pytest.mark.parametrize(("name", "options"), [VARIANTS[0], VARIANTS[-3]], ids=str)
+@pytest.mark.parametrize(
+    ("name", "options"), [VARIANTS[0], VARIANTS[-3], ("opaque", RasterOptions(alpha_max=0.999))], ids=str
+)
 def test_options_in_other_modes(name, options, adjoint, device):
     check_options(name, options, device, adjoint)
 

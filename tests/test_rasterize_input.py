@@ -1,5 +1,6 @@
 """Bad input to the renderer: an InputError that names the argument and says what was found, before any work."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -172,6 +173,15 @@ def test_sh_degree(degree, device):
         InputError, match=r"options.sh_degree: expected 0, 1, 2, 3 or None, got " + re.escape(repr(degree))
     ):
         call(device, options=RasterOptions(sh_degree=degree))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [("alpha_max", 1.0, "0 to 0.9999"), ("near", 0.0, "1e-06 to 1e+06"), ("blur", math.nan, "1e-06 to 1e+06")],
+)
+def test_constants(name, value, wanted, device):
+    with pytest.raises(InputError, match=re.escape(f"options.{name}: expected a number from {wanted}, got {value}.")):
+        call(device, options=RasterOptions(**{name: value}))
 
 
 def test_bad_input_leaves_the_renderer_working(device):

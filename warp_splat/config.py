@@ -60,6 +60,7 @@ class RasterOptions:
             outline of an ellipsoid instead of the Gaussian; Qi, Cai and Han 2024; not of a camera with a lens) or
             "unscented" (seven points through the lens; Wu et al. 2025), or your own; see docs/extending.md.
         alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips nothing.
+        alpha_max: an opacity at a pixel is clamped to this, 0 to 0.9999.
         t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 means 1e-30.
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.
         extent: which tiles list a Gaussian: "ellipse" (exactly those where its opacity reaches ``alpha_min``) or
@@ -69,6 +70,9 @@ class RasterOptions:
         median_depth: also return the depth per pixel at which half of the light is gone.
         normals: also blend the Gaussians' normals: their shortest axes, towards the camera.
         strongest: also return which Gaussians weigh most in each pixel, so many of them, 0 to 8, and their weights.
+        near: Gaussians whose center is nearer along the optical axis (of a wide lens: nearer) are left out, at least
+            1e-6 [world units].
+        blur: added to both variances of the projected Gaussian (low-pass), at least 1e-6 [px^2].
     """
 
     depth: bool = False
@@ -76,6 +80,7 @@ class RasterOptions:
     antialiasing: bool = False
     projection: str | Projection = "affine"
     alpha_min: float = ALPHA_MIN
+    alpha_max: float = ALPHA_MAX
     t_min: float = T_MIN
     max_steps: int | None = None
     extent: str = "ellipse"
@@ -84,6 +89,8 @@ class RasterOptions:
     median_depth: bool = False
     normals: bool = False
     strongest: int = 0
+    near: float = NEAR
+    blur: float = BLUR
 
 
 @dataclass

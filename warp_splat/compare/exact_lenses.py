@@ -91,13 +91,14 @@ def narrowed(covariances, camera):
     return factors[:, :, None] * covariances * factors[:, None, :]
 
 
-def unscented(points, axes, camera):
+def unscented(points, axes, camera, near=NEAR):
     """Means [N, 2] px and covariances [N, 2, 2] px^2 of Gaussians around ``points``, by Wu et al. 2025, section 4.1.
 
     Args:
         points: [N, 3] in the camera.
         axes: [N, 3, 3], columns: the Gaussian's axes in the camera, a standard deviation long.
         camera: that looks at them.
+        near: points are seen as if no nearer.
     """
     alpha, beta, kappa, n = 1.0, 2.0, 0.0, 3
     scale = alpha**2 * (n + kappa) - n
@@ -107,7 +108,7 @@ def unscented(points, axes, camera):
         _, visible = depths_of(sigma_points, camera.lens)
         sigma_points = torch.where(visible[..., None], sigma_points, points[:, None])
     else:
-        nearest = torch.cat([sigma_points[..., :2], sigma_points[..., 2:].clamp_min(NEAR)], -1)
+        nearest = torch.cat([sigma_points[..., :2], sigma_points[..., 2:].clamp_min(near)], -1)
         sigma_points = nearest
     places = on_image(sigma_points, camera)
     if camera.lens is not None and camera.lens.model == AROUND:

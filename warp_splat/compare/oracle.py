@@ -142,15 +142,18 @@ def _double(value):
     return value.double() if isinstance(value, torch.Tensor) else torch.tensor(value, dtype=torch.float64)
 
 
-def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine"):
+def exact_splats(
+    means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine",
+    near=NEAR, blur=BLUR,
+):  # fmt: skip
     """Gaussians as the camera sees them. Its numbers may be tensors that want gradients."""
     world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
     points, seen = means @ world_to_camera.T + translation, world_to_camera
     if getattr(camera, "shutter", None):
-        points, along = exact_shutter.exposed(points, camera)
+        points, along = exact_shutter.exposed(points, camera, near)
         seen = along @ world_to_camera
     depth, live = exact_lenses.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
-    live = live & (depth > NEAR) & (quats.norm(dim=1) > 0)
+    live = live & (depth > near) & (quats.norm(dim=1) > 0)
     points = torch.where(live[:, None], points, points.new_tensor([0.3, 0, 1]))  # no division by zero, no gradient
     x, y, z = points.unbind(1)
 
@@ -160,7 +163,7 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
         means2d, sharp = outlines(points, sigma, live, camera)
     elif projection == "unscented":
         axes = seen @ rotation_matrices(quats) * scales[:, None]
-        means2d, sharp = exact_lenses.unscented(points, axes, camera)
+        means2d, sharp = exact_lenses.unscented(points, axes, camera, near)
     elif camera.lens:
         means2d, to_pixels = exact_lenses.seen(points, camera)
         sharp = exact_lenses.narrowed(to_pixels @ sigma @ to_pixels.transpose(1, 2), camera)
@@ -168,7 +171,7 @@ def exact_splats(means, quats, scales, opacities, sh, camera, sh_degree=None, an
         means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
         to_pixels = jacobians(points, camera)
         sharp = to_pixels @ sigma @ to_pixels.transpose(1, 2)
-    cov2d = sharp + BLUR * torch.eye(2, dtype=torch.float64)
+    cov2d = sharp + blur * torch.eye(2, dtype=torch.float64)
     opacity = opacities
     if antialiasing:
         ratio = torch.linalg.det(sharp) / torch.linalg.det(cov2d)
@@ -198,27 +201,27 @@ def _alphas(splats, order, camera, pixels):
     return alpha, error
 
 
-def _decide(alpha, error, alpha_min, t_min):
+def _decide(alpha, error, alpha_min, alpha_max, t_min):
     """Which pairs are blended [P, M], and which pixels hang on rounding [P]. No gradient flows through a decision."""
-    solid = torch.where(alpha >= alpha_min, alpha.clamp_max(ALPHA_MAX), torch.zeros_like(alpha))
+    solid = torch.where(alpha >= alpha_min, alpha.clamp_max(alpha_max), torch.zeros_like(alpha))
     after = torch.cumprod(1 - solid, 1)  # transmittance if nothing stopped it: it can only fall
     before = after / (1 - solid)
     blended = (solid > 0) & (after >= t_min)
 
     drift = torch.cumsum(error * solid / (1 - solid), 1) + 1e-5  # relative error of the transmittance
     reached = before >= t_min * (1 - drift)
-    at_threshold = (alpha / alpha_min).log().abs().minimum((alpha / ALPHA_MAX).log().abs()) < error
+    at_threshold = (alpha / alpha_min).log().abs().minimum((alpha / alpha_max).log().abs()) < error
     at_stop = (solid > 0) & ((after / t_min).log().abs() < drift)
-    seen = before * alpha.clamp_max(ALPHA_MAX) > UNSEEN
+    seen = before * alpha.clamp_max(alpha_max) > UNSEEN
     return blended, ((at_threshold | at_stop) & reached & seen).any(1)
 
 
-def _swappable(alpha, blended, depth):
+def _swappable(alpha, blended, depth, alpha_max):
     """Pixels that blend two neighbors whose depths differ by less than float32 knows: a renderer may swap them, [P]."""
     gap = (depth[1:] - depth[:-1]).abs()
     close = (gap > 0) & (gap < 8 * ROUNDING * depth[1:].abs())  # equal ones are ordered by index, everywhere
     both = blended[:, 1:] & blended[:, :-1] & close
-    before = torch.cumprod(1 - torch.where(blended, alpha.clamp_max(ALPHA_MAX), 0), 1)[:, 1:]
+    before = torch.cumprod(1 - torch.where(blended, alpha.clamp_max(alpha_max), 0), 1)[:, 1:]
     return (both & (before * alpha[:, :-1] * alpha[:, 1:] > UNSEEN)).any(1)
 
 
@@ -237,8 +240,9 @@ def _culling(splats, alpha, order, camera, alpha_min):
 
 
 def exact_render(
-    means, quats, scales, opacities, sh, camera, background=BLACK, alpha_min=ALPHA_MIN, t_min=STOP, pixels=None, **view
-):
+    means, quats, scales, opacities, sh, camera, background=BLACK, alpha_min=ALPHA_MIN, alpha_max=ALPHA_MAX, t_min=STOP,
+    pixels=None, **view,
+):  # fmt: skip
     """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background.
 
     Keywords are those of :class:`warp_splat.RasterOptions`; thresholds of 0 blend everything. With ``pixels`` [P, 2]
@@ -257,13 +261,13 @@ def exact_render(
     order = order[splats.live[order]]
     with torch.no_grad():
         raw, error = _alphas(splats, order, camera, pixels)
-        blended, fragile = _decide(raw, error, alpha_min, t_min)
-        fragile |= _swappable(raw, blended, splats.z.detach()[order])
+        blended, fragile = _decide(raw, error, alpha_min, alpha_max, t_min)
+        fragile |= _swappable(raw, blended, splats.z.detach()[order], alpha_max)
         touches, near_image, reach = _culling(splats, raw, order, camera, alpha_min)
         seen = blended.any(0)  # the others have no gradient, and need no memory for it
     order, blended = order[seen], blended[:, seen]
     raw, _ = _alphas(splats, order, camera, pixels)
-    alpha = torch.where(blended, raw.clamp_max(ALPHA_MAX), torch.zeros_like(raw))
+    alpha = torch.where(blended, raw.clamp_max(alpha_max), torch.zeros_like(raw))
     through = torch.cat([torch.ones_like(raw[:, :1].sum(1, keepdim=True)), torch.cumprod(1 - alpha, 1)], 1)
     weight = alpha * through[:, :-1]
     background = torch.as_tensor(background, dtype=torch.float64)

@@ -39,7 +39,8 @@ class Error:
 
 def for_oracle(options: RasterOptions) -> dict[str, Any]:
     """Those that change what is true, as keywords of the oracle."""
-    return {key: getattr(options, key) for key in ("sh_degree", "antialiasing", "projection", "alpha_min", "t_min")}
+    names = ("sh_degree", "antialiasing", "projection", "alpha_min", "alpha_max", "t_min", "near", "blur")
+    return {name: getattr(options, name) for name in names}
 
 
 def compute_truth(workload: Workload) -> Truth:

@@ -10,6 +10,7 @@ import torch
 
 from warp_splat.config import CHANNELS_MOST, TILE
 from warp_splat.errors import InputError
+from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_range, is_one_of
 from warp_splat.raster.drivers import DRIVERS, driver_of
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -18,13 +19,15 @@ CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 NOT_CARRIED = {
     "distributed": "render in each process by itself",
     "covars": "give quats and scales",
-    "with_ut": "leave it False: Gaussians are projected by their linearization",
     "with_eval3d": "leave it False: Gaussians are evaluated on the image",
-    "radial_coeffs": "undistort the photographs",
-    "tangential_coeffs": "undistort the photographs",
-    "thin_prism_coeffs": "undistort the photographs",
     "ftheta_coeffs": "undistort the photographs",
-    "viewmats_rs": "leave it None: the shutter is global",
+    "viewmats_rs": "leave it None: the shutter is global; warp_splat.Camera.rolling has a rolling one",
+}
+#: Coefficients of lenses: how many there are, by the camera's model.
+COEFFICIENTS = {
+    "radial_coeffs": {"pinhole": 6, "fisheye": 4},
+    "tangential_coeffs": {"pinhole": 2},
+    "thin_prism_coeffs": {"pinhole": 4},
 }
 
 
@@ -52,6 +55,10 @@ class Request(NamedTuple):
     absgrad: bool
     rasterize_mode: str
     camera_model: str
+    with_ut: bool
+    radial_coeffs: torch.Tensor | None  # [S, C, 6 or 4]
+    tangential_coeffs: torch.Tensor | None  # [S, C, 2]
+    thin_prism_coeffs: torch.Tensor | None  # [S, C, 4]
     batch: tuple[int, ...] = ()  # the scenes' dimensions
 
 
@@ -61,7 +68,7 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
     means, viewmats = request.means, request.viewmats
     if not isinstance(means, torch.Tensor) or means.dim() < 2:
         raise InputError(f"means: expected a tensor [..., N, 3], got {_found(means)}.")
-    if not isinstance(viewmats, torch.Tensor) or viewmats.dim() < 3:
+    if not isinstance(viewmats, torch.Tensor) or viewmats.dim() < 3 or viewmats.shape[-3] < 1:
         raise InputError(f"viewmats: expected a tensor [..., C, 4, 4], got {_found(viewmats)}.")
     batch, count, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
     scenes = math.prod(batch)
@@ -71,6 +78,12 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
     for name, shape in shapes.items():
         _check_tensor(name, given[name], (*batch, *shape), means.device)
         flat[name] = given[name].reshape(scenes, *shape)
+    scales, opacities = flat["scales"].detach(), flat["opacities"].detach()
+    check_range("scales", scales, bool((scales < 0).any()), "positive values (activated, not their logarithm)")
+    outside = bool(((opacities < 0) | (opacities > 1)).any())
+    check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
+    if not bool(torch.linalg.det(viewmats.detach()).all()):
+        raise InputError("viewmats: expected matrices from world to camera, got one that has no inverse.")
     colors = request.colors
     _check_tensor("colors", colors, None, means.device)
     tail = 1 if request.sh_degree is None else 2
@@ -94,6 +107,11 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
         shape = (cameras, colors.shape[-1])
         _check_tensor("backgrounds", request.backgrounds, (*batch, *shape), means.device)
         flat["backgrounds"] = request.backgrounds.reshape(scenes, *shape)
+    for name, counts in COEFFICIENTS.items():
+        if given[name] is not None:
+            shape = (cameras, counts[request.camera_model])
+            _check_tensor(name, given[name], (*batch, *shape), means.device)
+            flat[name] = given[name].reshape(scenes, *shape)
     return request._replace(**flat, batch=batch)
 
 
@@ -110,16 +128,25 @@ def _check_choices(request: Request, given: dict[str, Any]) -> None:
     for name, values in choices.items():
         if given[name] not in values:
             raise InputError(f"{name}: expected one of {', '.join(values)}, got {given[name]!r:.60}.")
+    if given["with_ut"] and request.camera_model == "ortho":
+        raise InputError("camera_model: expected pinhole or fisheye where with_ut is True, got 'ortho'.")
+    for name, counts in COEFFICIENTS.items():
+        if given[name] is not None and not (given["with_ut"] and request.camera_model in counts):
+            models = " or ".join(counts)
+            raise InputError(f"{name}: expected None without with_ut=True and camera_model {models}, got coefficients.")
     for name in ("width", "height", "channel_chunk"):
         if isinstance(given[name], bool) or not isinstance(given[name], numbers.Integral) or given[name] < 1:
             raise InputError(f"{name}: expected a whole number, at least 1, got {given[name]!r:.60}.")
+    if given["width"] * given["height"] > CAMERA_PIXELS_MOST:
+        size = f"{given['width']} x {given['height']}"
+        raise InputError(f"width, height: expected at most {CAMERA_PIXELS_MOST} pixels, got {size}; render smaller.")
     if given["tile_size"] != TILE:
         raise InputError(f"tile_size: expected {TILE}, got {given['tile_size']!r:.60}.")
     for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
         if not isinstance(given[name], numbers.Real) or not float(given[name]) >= 0.0:
             raise InputError(f"{name}: expected a number, at least 0, got {given[name]!r:.60}.")
     degree = request.sh_degree
-    if degree is not None and (isinstance(degree, bool) or degree not in range(5)):
+    if isinstance(degree, bool) or not is_one_of(degree, (None, *range(5))):
         raise InputError(f"sh_degree: expected 0 to 4 or None, got {degree!r:.60}.")
 
 
@@ -127,6 +154,8 @@ def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device:
     if not isinstance(tensor, torch.Tensor) or (shape is not None and tuple(tensor.shape) != shape):
         wanted = "a tensor" if shape is None else f"a tensor {list(shape)}"
         raise InputError(f"{name}: expected {wanted}, got {_found(tensor)}.")
+    if tensor.layout != torch.strided:
+        raise InputError(f"{name}: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
     if tensor.dtype != torch.float32:
         raise InputError(f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}.")
     if tensor.device != device or device.type not in DRIVERS:

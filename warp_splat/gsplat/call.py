@@ -52,7 +52,7 @@ def rasterization(
     """Images of N Gaussians through C cameras, for each of any number of scenes (the dimensions "...").
 
     Differentiable in every tensor, ``viewmats`` and ``Ks`` included. The projection is computed by torch, which gives
-    each of their entries its gradient; lists and pixels by this package's kernels. Alpha is clamped to 0.99.
+    each of their entries its gradient; lists and pixels by this package's kernels. Alpha is clamped to 0.999.
 
     Args:
         means: [..., N, 3] float32, world units, like all tensors on one device.
@@ -79,17 +79,18 @@ def rasterization(
         rasterize_mode: "classic" or "antialiased".
         channel_chunk: of no effect: how many channels go at once is the kernels' choice.
         distributed: must be False.
-        camera_model: "pinhole", "ortho" or "fisheye" (equidistant).
+        camera_model: "pinhole", "ortho" or "fisheye" (equidistant, if it has no coefficients).
         segmented: of no effect: it chooses how gsplat sorts.
         covars: must be None.
-        with_ut: must be False.
+        with_ut: project by an unscented transform (Wu et al. 2025), which sees through lenses; not with "ortho".
         with_eval3d: must be False.
-        radial_coeffs: must be None, like those that follow.
-        tangential_coeffs: of a lens.
-        thin_prism_coeffs: of a lens.
-        ftheta_coeffs: of a lens.
+        radial_coeffs: OpenCV's k1 to k6, [..., C, 6], of a fisheye k1 to k4, [..., C, 4]; only with ``with_ut``, like
+            those that follow.
+        tangential_coeffs: OpenCV's p1 and p2, [..., C, 2]; of a pinhole camera.
+        thin_prism_coeffs: OpenCV's s1 to s4, [..., C, 4]; of a pinhole camera.
+        ftheta_coeffs: must be None.
         rolling_shutter: None, or gsplat's ``RollingShutterType.GLOBAL``.
-        viewmats_rs: of a rolling shutter.
+        viewmats_rs: must be None.
 
     Returns:
         Images [..., C, H, W, D, and 1 more with a depth], alphas [..., C, H, W, 1], and a dictionary as gsplat's.

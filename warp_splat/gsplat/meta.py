@@ -66,7 +66,7 @@ def tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:
     for view, bins in enumerate(lists):
         gaussians = wp.to_torch(bins.gaussians).long()[bins.instances.long()]
         listed.append(numbers[gaussians + view * count])
-        depths.append(seen.depths.detach().view(-1, count)[view, gaussians])
+        depths.append(seen.depths.detach().flatten(0, 1)[view, gaussians])
         sizes.append(bins.ranges[:, 1] - bins.ranges[:, 0])
         per_gaussian[view] = torch.bincount(gaussians, minlength=count).int()
         offsets[view] = bins.ranges[:, 0] + begins

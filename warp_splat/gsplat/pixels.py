@@ -16,6 +16,7 @@ from warp_splat.raster.data import Bins, Dropped, Splats2D, Walk
 from warp_splat.raster.drivers import driver_of
 
 LEAST = 1e-10  # alpha that a mean depth is divided by
+ALPHA_MAX = 0.999  # to which gsplat clamps an opacity at a pixel
 
 
 class _Magnitudes(torch.autograd.Function):
@@ -48,11 +49,9 @@ def draw(
 
     The adjoint fills ``magnitudes``, of the shape of meta's means2d, if asked for.
     """
-    sizes = (
-        seen.drawn.sum(2).flatten().tolist() if request.packed else [seen.drawn.shape[2]] * seen.drawn[..., 0].numel()
-    )
+    scenes, cameras, count = seen.drawn.shape
+    sizes = seen.drawn.sum(2).flatten().tolist() if request.packed else [count] * (scenes * cameras)
     into = [None] * len(sizes) if magnitudes is None else magnitudes.view(-1, 2).split(sizes)
-    scenes, cameras = seen.drawn.shape[:2]
     images, alphas, lists = [], [], []
     for scene in range(scenes):
         for camera in range(cameras):
@@ -82,7 +81,7 @@ def _draw_view(
     splats = Splats2D(seen.means2d, seen.conics, seen.opacities, first, seen.depths, seen.extents.contiguous(), radii)
     splats = splats._replace(**{name: getattr(splats, name).contiguous() for name in splats._fields})
     frame = Camera(request.width, request.height, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))  # its size counts
-    driver, options = driver_of(device), RasterOptions(depth=wanted[-1] in ("D", "ED"))
+    driver, options = driver_of(device), RasterOptions(depth=wanted[-1] in ("D", "ED"), alpha_max=ALPHA_MAX)
     bins, walk, dropped = driver.bin(splats, frame, options), Walk(), Dropped()
     image, alpha, depth = blend(splats, bins, background, frame, options, "manual", driver, dropped, walk)
     blended = Blended(bins, walk, frame, options, "manual", driver, dropped)

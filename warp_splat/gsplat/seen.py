@@ -11,8 +11,8 @@ import torch
 
 from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
 from warp_splat.gsplat.arguments import Request
-
-TINY = 1e-14  # squared distance from the axis, below which a fisheye's formula takes it for this
+from warp_splat.gsplat.sigma_points import TINY, see_points
+from warp_splat.gsplat.turns import rotations, rows_turned
 
 
 class Seen(NamedTuple):
@@ -28,17 +28,21 @@ class Seen(NamedTuple):
 
 
 def see(request: Request) -> Seen:
-    """Project (Zwicker et al. 2001): linearized at the mean, W' = J V R S, covariance W' W''."""
+    """Project: linearized at the mean (Zwicker et al. 2001), W' = J V R S, covariance W' W''; or :func:`see_points`."""
     turn, shift = request.viewmats[..., :3, :3], request.viewmats[..., :3, 3]
-    points = _product(request.means[:, None], turn.mT[:, :, None]) + shift[:, :, None]
+    points = rows_turned(request.means[:, None], turn.mT[:, :, None]) + shift[:, :, None]
     z = points[..., 2]
     ahead = (z > request.near_plane) & (z < request.far_plane) & (request.quats != 0).any(-1)[:, None]
-    points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
-    places, to_x, to_y = _LENSES[request.camera_model](request, points)
-    axes = _rotations(request.quats) * request.scales[:, :, None]
-    a, b = (_product(_product(row, turn[:, :, None]), axes[:, None]) for row in (to_x, to_y))
-    xx, xy, yy = (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1)
-    sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
+    axes = rotations(request.quats) * request.scales[:, :, None]
+    if request.with_ut:
+        places, xx, xy, yy, sharp, seen = see_points(request, axes)
+        ahead = ahead & seen
+    else:
+        points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
+        places, to_x, to_y = _LENSES[request.camera_model](request, points)
+        a, b = (rows_turned(rows_turned(row, turn[:, :, None]), axes[:, None]) for row in (to_x, to_y))
+        xx, xy, yy = (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1)
+        sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
     wide = sharp + request.eps2d * (xx + yy) + request.eps2d**2
     xx, yy = xx + request.eps2d, yy + request.eps2d
     opacities = request.opacities[:, None].expand_as(z)
@@ -66,25 +70,6 @@ def see(request: Request) -> Seen:
         radii,
         drawn,
     )
-
-
-def _product(rows: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
-    """Rows [..., 3] times matrices [..., 3, 3]. In torch's own product bits depend on how many there are."""
-    first, second, third = (rows[..., axis, None] * matrices[..., axis, :] for axis in range(3))
-    return first + second + third
-
-
-def _rotations(quats: torch.Tensor) -> torch.Tensor:
-    """Matrices [S, N, 3, 3] of quaternions w first, any norm."""
-    nothing = (quats == 0).all(-1, keepdim=True)
-    quats = torch.where(nothing, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    vector = torch.stack([x, y, z], -1)
-    none = torch.zeros_like(w)
-    across = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
-    outer = vector[..., :, None] * vector[..., None, :]
-    scalar = (w * w - (vector * vector).sum(-1))[..., None, None] * torch.eye(3, device=w.device)
-    return scalar + 2 * outer + 2 * w[..., None, None] * across  # Rodrigues' formula
 
 
 def _numbers(request: Request) -> tuple[torch.Tensor, ...]:

@@ -4,7 +4,7 @@ A pixel blends Gaussians k = 0..n-1 front to back (Kerbl et al. 2023, eq. 2 and 
 
     q_k     = d' conic_k d / 2,  d = mean_k - pixel center
     raw_k   = opacity_k exp(-q_k) = opacity_k 2^-|root_k d|^2,  root_k upper triangular (:mod:`.falloff`)
-    alpha_k = 0 if raw_k < alpha_min, else min(raw_k, ALPHA_MAX)
+    alpha_k = 0 if raw_k < alpha_min, else min(raw_k, alpha_max)
     w_k     = alpha_k T_k,  T_{k+1} = T_k - w_k = T_k (1 - alpha_k)
     image   = sum_k w_k color_k + T_n background
 
@@ -18,14 +18,13 @@ behind_k = sum_{j > k} w_j (color_j . u) + T_n dL/dT_n:
 The square root of the conic keeps needles right. The terms of d' conic d are as large as (d / short axis)^2, and cancel
 along the long axis. Those of root d are only as large as d / short axis.
 
-The gradient is zero where alpha is cut to 0 or clamped to ALPHA_MAX (the reference passes it through the clamp).
+The gradient is zero where alpha is cut to 0 or clamped to alpha_max (the reference passes it through the clamp).
 """
 
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_splat.config import ALPHA_MAX
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.simd import fill, fma, over, times, vec16, where_less
@@ -68,15 +67,15 @@ def exponent(dx: Any, dy: Any, xx: Any, xy: Any, yy: Any):
 
 
 @wp.func
-def alpha_of(raw: Any, alpha_min: float):
-    """Opacity of the Gaussian at the pixel, cut and clamped; 0 where ``raw`` is negative."""
-    return where_less(raw, fill(alpha_min, raw), fill(0.0, raw), wp.min(raw, fill(ALPHA_MAX, raw)))
+def alpha_of(raw: Any, alphas: wp.vec2):
+    """Opacity of the Gaussian at the pixel, cut and clamped by ``alphas``; 0 where ``raw`` is negative."""
+    return where_less(raw, fill(alphas[0], raw), fill(0.0, raw), wp.min(raw, fill(alphas[1], raw)))
 
 
 @wp.func
-def adj_alpha_of(raw: Any, alpha_min: float, adj_ret: Any):
+def adj_alpha_of(raw: Any, alphas: wp.vec2, adj_ret: Any):
     zero = fill(0.0, raw)
-    return where_less(raw, fill(alpha_min, raw), zero, where_less(raw, fill(ALPHA_MAX, raw), adj_ret, zero))
+    return where_less(raw, fill(alphas[0], raw), zero, where_less(raw, fill(alphas[1], raw), adj_ret, zero))
 
 
 @wp.func

@@ -19,24 +19,24 @@ wp.set_module_options(FORWARD_ONLY)
 
 
 @wp.func
-def opaque(raw: float, alpha_min: float, here: float, walked: float):
+def opaque(raw: float, alphas: wp.vec2, here: float, walked: float):
     """Opacity, 0 for pixels that had stopped."""
-    return alpha_of(where_less(here, walked, raw, -1.0), alpha_min)
+    return alpha_of(where_less(here, walked, raw, -1.0), alphas)
 
 
 @wp.func
-def opaque(raw: vec16, alpha_min: float, here: vec16, walked: vec16):
-    return alpha_of(where_less(here, walked, raw, vec16(-1.0)), alpha_min)
+def opaque(raw: vec16, alphas: wp.vec2, here: vec16, walked: vec16):
+    return alpha_of(where_less(here, walked, raw, vec16(-1.0)), alphas)
 
 
 @wp.func_grad(opaque)
-def adj_opaque(raw: float, alpha_min: float, here: float, walked: float, adj_ret: float):
-    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, -1.0), alpha_min, adj_ret)
+def adj_opaque(raw: float, alphas: wp.vec2, here: float, walked: float, adj_ret: float):
+    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, -1.0), alphas, adj_ret)
 
 
 @wp.func_grad(opaque)
-def adj_opaque(raw: vec16, alpha_min: float, here: vec16, walked: vec16, adj_ret: vec16):
-    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, vec16(-1.0)), alpha_min, adj_ret)
+def adj_opaque(raw: vec16, alphas: wp.vec2, here: vec16, walked: vec16, adj_ret: vec16):
+    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, vec16(-1.0)), alphas, adj_ret)
 
 
 @wp.func
@@ -70,7 +70,7 @@ def make_manual(falloff: int | None, number: type) -> wp.Function:
         opacity: float,
         t: number,  # behind
         behind: number,  # T dL/dT, behind
-        alpha_min: float,
+        alphas: wp.vec2,
         here: number,
         walked: number,
         lit: number,  # color . u
@@ -78,10 +78,10 @@ def make_manual(falloff: int | None, number: type) -> wp.Function:
         """T in front, T dL/dT in front, the weight, and dL/dopacity of every pixel (times opacity: -dL/dq)."""
         fall = fall_at(z)
         raw = where_less(here, walked, fall * opacity, fill(-1.0, z))
-        odds = odds_of(alpha_of(raw, alpha_min))
+        odds = odds_of(alpha_of(raw, alphas))
         w = times(t, odds)
         front = fma(t, odds, t)
-        adj_raw = adj_alpha_of(raw, alpha_min, adj_alpha_blend(front, odds, behind, lit))
+        adj_raw = adj_alpha_of(raw, alphas, adj_alpha_blend(front, odds, behind, lit))
         return front, fma(w, lit, behind), w, times(adj_raw, fall)
 
     return adj_step
@@ -119,10 +119,10 @@ def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
         depth: number
 
     @wp.func
-    def undo(parcel: Parcel, t: number, alpha_min: float, here: number, walked: number):
+    def undo(parcel: Parcel, t: number, alphas: wp.vec2, here: number, walked: number):
         """The falloff and the transmittance in front, from that behind."""
         fall = fall_at(exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy))
-        odds = odds_of(opaque(times(fall, parcel.opacity), alpha_min, here, walked))
+        odds = odds_of(opaque(times(fall, parcel.opacity), alphas, here, walked))
         return fall, fma(t, odds, t)
 
     @wp.func
@@ -131,7 +131,7 @@ def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
         fall: number,
         t: number,  # in front
         adj_behind: number,  # dL/dT behind
-        alpha_min: float,
+        alphas: wp.vec2,
         here: number,
         walked: number,
         red: number,  # upstream gradients
@@ -141,7 +141,7 @@ def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
     ):
         """What the step adds to the loss, T behind it seen as a quantity of weight dL/dT."""
         z = exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy)
-        alpha = opaque(times(fall_known(z, fall), parcel.opacity), alpha_min, here, walked)
+        alpha = opaque(times(fall_known(z, fall), parcel.opacity), alphas, here, walked)
         w = times(alpha, t)
         lit = fma(parcel.red, red, fma(parcel.green, green, times(parcel.blue, blue)))
         if wp.static(CHANNELS > 3):

@@ -45,11 +45,16 @@ def pinhole(_k, x, y, z):
 
 def perspective(k, x, y, z):
     """Radial (a ratio of polynomials) and tangential distortion: Brown (1966), as OpenCV has it."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = k
     u, v = x / z, y / z
     r2 = u * u + v * v
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return _tangential(u * radial, v * radial, u, v, r2, p1, p2)
+    radial = radial_of(k, r2)
+    return _tangential(u * radial, v * radial, u, v, r2, k[2], k[3])
+
+
+def radial_of(k, r2):
+    """How many times as far from the axis :func:`perspective` shows what a pinhole shows at the square root of r2."""
+    k1, k2, _p1, _p2, k3, k4, k5, k6 = k
+    return (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
 
 
 def fisheye(k, x, y, z):

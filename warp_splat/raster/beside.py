@@ -17,7 +17,7 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.slots import CHANNEL
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.data import Bins, Dropped, Gaussians, Splats2D, Walk, variant_of
+from warp_splat.raster.data import Bins, Dropped, Gaussians, Splats2D, Walk, alphas_of, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
 from warp_splat.runtime.launch import available_memory, view
@@ -97,7 +97,7 @@ def find_strongest(splats: Splats2D, blended: Blended) -> Strongest:
     median = torch.empty(shape, dtype=torch.int32, device=device)
     kernel = blended.driver.channels.strongest(variant_of(options), most)
     _, count = blended.driver.view_walk(blended.walk)
-    inputs = [bins.view(), options.alpha_min, count, view(blended.walk.steps, wp.int32)]
+    inputs = [bins.view(), alphas_of(options), count, view(blended.walk.steps, wp.int32)]
     outputs = [view(ranks, wp.int32), view(weights, wp.float32), view(median, wp.int32)]
     blended.driver.launch_tiles(kernel, bins, inputs, outputs)
     gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
@@ -151,7 +151,7 @@ class Channels(torch.autograd.Function):
         kernel, steps = driver.channels.blend(variant_of(options)), walk.steps
         _, count = driver.view_walk(walk)
         for begin, rows in _groups(bins, features, driver):
-            inputs = [bins.view(), options.alpha_min, count, view(steps, wp.int32), view(rows, wp.float32)]
+            inputs = [bins.view(), alphas_of(options), count, view(steps, wp.int32), view(rows, wp.float32)]
             group = min(features.shape[1] - begin, driver.channels.at_once)
             driver.launch_tiles(kernel, bins, [*inputs, begin, group], [view(image, wp.float32)])
         ctx.save_for_backward(features)
@@ -235,7 +235,7 @@ def _differentiate(
     slots = _new_slots(bins, CHANNEL + width)
     kernel = driver.channels.adjoint(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
-    inputs = [bins.view(), options.alpha_min, *driver.view_walk(walk), view(walk.steps, wp.int32)]
+    inputs = [bins.view(), alphas_of(options), *driver.view_walk(walk), view(walk.steps, wp.int32)]
     inputs += [view(rows, wp.float32), view(ranks, wp.float32), begin, group, view(adj_pixels, wp.float32)]
     driver.launch_tiles(kernel, bins, inputs, [view(slots, wp.float32)])
     tables = [slots.new_empty(bins.gaussian_count, columns) for columns in (2, 3, 1, width) if columns]

@@ -85,6 +85,10 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         value = getattr(options, name)
         if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < 1.0):
             raise InputError(f"options.{name}: expected a number from 0 to below 1, got {value!r}.")
+    for name, low, high in (("alpha_max", 0.0, 0.9999), ("near", 1e-6, 1e6), ("blur", 1e-6, 1e6)):
+        value = getattr(options, name)
+        if isinstance(value, bool) or not (isinstance(value, numbers.Real) and low <= float(value) <= high):
+            raise InputError(f"options.{name}: expected a number from {low:g} to {high:g}, got {value!r:.60}.")
     steps = options.max_steps
     if steps is not None and not (isinstance(steps, numbers.Integral) and int(steps) >= 0):
         raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {steps!r}.")
@@ -96,8 +100,7 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         strongest=int(most),
         sh_degree=None if options.sh_degree is None else int(options.sh_degree),
         exp_degree=None if options.exp_degree is None else int(options.exp_degree),
-        alpha_min=float(options.alpha_min),
-        t_min=float(options.t_min),
+        **{name: float(getattr(options, name)) for name in ("alpha_min", "alpha_max", "t_min", "near", "blur")},
         max_steps=None if steps is None else int(steps),
     )
 

@@ -20,7 +20,7 @@ from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
-from warp_splat.raster.data import Bins, Pixels, Walk, limits_of, variant_of
+from warp_splat.raster.data import Bins, Pixels, Walk, alphas_of, limits_of, variant_of
 from warp_splat.runtime.launch import empty, launch, view
 
 
@@ -43,7 +43,7 @@ def blend(
     launch(
         make_blend(variant_of(options, keep)),
         tile_count,
-        [bins.view(), options.alpha_min, *limits_of(options), view(background, wp.float32)],
+        [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32)],
         [pixels.view(), *_in_lanes(final, count, kept)],
         bounds=bins.slices,
     )
@@ -96,13 +96,13 @@ def _spread_upstream(bins: Bins, options: RasterOptions, background, final, coun
 
 def differentiate(mode: str, bins: Bins, options: RasterOptions, saved, upstream, steps, slots) -> None:
     """Fill ``slots`` [M, 9 or 10]; ``saved`` and ``upstream`` as the kernels take them, ``steps`` [T]."""
-    tile_count, alpha_min = len(bins.ranges), options.alpha_min
+    tile_count, alphas = len(bins.ranges), alphas_of(options)
     (final, count, kept), steps, rows = saved, view(steps, wp.int32), view(slots, wp.float32)
     if mode in ("manual", "stepwise"):
-        inputs = [bins.view(), alpha_min, final, count, steps, *upstream]
+        inputs = [bins.view(), alphas, final, count, steps, *upstream]
         launch(make_reverse(mode, variant_of(options)), tile_count, inputs, [rows], bounds=bins.slices)
         return
-    lists, inputs = bins.view(), [alpha_min, final, count, kept, steps, rows]
+    lists, inputs = bins.view(), [alphas, final, count, kept, steps, rows]
     if mode == "generated":
         copies, copies.grad = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
         copies.assign(bins.splats.numpy()[bins.instances.numpy()])

@@ -13,7 +13,7 @@ from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
-from warp_splat.raster.data import Bins, Pixels, Walk, limits_of, variant_of
+from warp_splat.raster.data import Bins, Pixels, Walk, alphas_of, limits_of, variant_of
 from warp_splat.runtime.launch import launch_blocks, view
 
 THREADS = TILE * TILE
@@ -30,7 +30,7 @@ def blend(
     launch_blocks(
         make_blend_block(variant_of(options, keep)),
         tile_count,
-        [bins.view(), options.alpha_min, *limits_of(options), _float(background)],
+        [bins.view(), alphas_of(options), *limits_of(options), _float(background)],
         [pixels.view(), _float(final), view(count, wp.int32), _float(kept)],
         background.device,
     )
@@ -46,7 +46,7 @@ def adjoint(
     (up, adj_final), adj_background, dropped, steps = spread_upstream(
         bins, options, background, final, count, adj_pixels, slots
     )
-    inputs = [bins.view(), options.alpha_min, _float(final), view(count, wp.int32)]
+    inputs = [bins.view(), alphas_of(options), _float(final), view(count, wp.int32)]
     upstream, steps, rows = [view(up, wp.vec4), _float(adj_final)], view(steps, wp.int32), _float(slots)
     if mode in ("manual", "stepwise"):
         kernel = make_reverse_block(mode, variant_of(options))

@@ -145,6 +145,11 @@ def variant_of(options: RasterOptions, keep: bool = False) -> BlendVariant:
     return BlendVariant(3 + options.depth, options.exp_degree if options.falloff is None else options.falloff, keep)
 
 
+def alphas_of(options: RasterOptions) -> wp.vec2:
+    """Below which opacity a Gaussian is skipped at a pixel, and to which it is clamped, as kernels take it."""
+    return wp.vec2(options.alpha_min, options.alpha_max)
+
+
 def limits_of(options: RasterOptions) -> list:
     """Where a pixel stops, as kernels take it: its least transmittance, and the entries of the list that it sees."""
     steps = MAX_INSTANCES if options.max_steps is None else min(options.max_steps, MAX_INSTANCES)

@@ -54,7 +54,7 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     cam.slope_max = wp.vec2(*((size - principal) / focal + margin))
     cam.sh_degree = degree if options.sh_degree is None else min(degree, options.sh_degree)
     cam.antialiasing = int(options.antialiasing)
-    cam.alpha_min = options.alpha_min
+    cam.alpha_min, cam.near, cam.blur = options.alpha_min, options.near, options.blur
     if camera.lens or camera.shutter or options.projection == "unscented":
         numbers = camera.lens.numbers if camera.lens else ()
         cam.lens = vec16(*numbers, *[0.0] * (LIMIT - len(numbers)), lens_limit(limits))

@@ -46,7 +46,7 @@ def _make_manual_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
         dy: vec16,
         t: vec16,  # transmittance behind
         adj_t: vec16,  # T dL/dT behind
-        alpha_min: float,
+        alphas: wp.vec2,
         here: vec16,
         walked: vec16,
         red: vec16,  # upstream gradients
@@ -59,7 +59,7 @@ def _make_manual_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
         if wp.static(CHANNELS > 3):
             lit = fma(far, splat.depth, lit)
         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
-        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
+        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alphas, here, walked, lit)
         part = mat_grads()
         adj_x = times(adj_opacity, dx)
         adj_y = times(adj_opacity, dy)
@@ -98,7 +98,7 @@ def _make_stepwise_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function
         dy: vec16,
         t: vec16,  # transmittance behind
         adj_t: vec16,  # dL/dT behind
-        alpha_min: float,
+        alphas: wp.vec2,
         here: vec16,
         walked: vec16,
         red: vec16,  # upstream gradients
@@ -118,9 +118,9 @@ def _make_stepwise_body(variant: BlendVariant) -> tuple[wp.Function, wp.Function
         parcel.green = vec16(splat.color[1])
         parcel.blue = vec16(splat.color[2])
         parcel.depth = vec16(splat.depth)
-        fall, front = undo(parcel, t, alpha_min, here, walked)
+        fall, front = undo(parcel, t, alphas, here, walked)
         adj, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
-            parcel, fall, front, adj_t, alpha_min, here, walked, red, green, blue, far
+            parcel, fall, front, adj_t, alphas, here, walked, red, green, blue, far
         )
         part = mat_grads()
         part[MEAN_X] = adj.dx
@@ -160,7 +160,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     def adj_blend(
         first: int,
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         final: wp.array2d[vec16],  # [T, BLOCKS]
         count: wp.array2d[vec16],  # [T, BLOCKS]
         steps: wp.array[int],  # [T]
@@ -213,7 +213,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
                     if wp.static(CHANNELS > 3):
                         far = s[UP + 3 * BLOCKS + block]
                     front, adj_front, part = body(
-                        splat, dx, dy, s[T + block], s[ADJ_T + block], alpha_min, here, s[WALKED + block],
+                        splat, dx, dy, s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block],
                         s[UP + block], s[UP + BLOCKS + block], s[UP + 2 * BLOCKS + block], far,
                     )  # fmt: skip
                     s[T + block] = front

@@ -97,7 +97,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     def blend(
         first: int,  # tile of this slice
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         t_min: float,
         max_steps: int,
         background: wp.array[float],  # [3]
@@ -143,7 +143,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
                     block = (4 * by + bx) & (BLOCKS - 1)
                     dx = offset_x(splat.mean, x0, bx)
                     fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-                    alpha = alpha_of(fall * splat.opacity, alpha_min)
+                    alpha = alpha_of(fall * splat.opacity, alphas)
                     behind = advance(s[T + block], alpha, t_min)
                     w = weight(s[T + block], alpha, behind)
                     if wp.static(variant.keep):

@@ -25,12 +25,12 @@ def make_reverse_step(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp
 
     @wp.func
     def manual(
-        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alpha_min: float, here: vec16, walked: vec16,
+        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alphas: wp.vec2, here: vec16, walked: vec16,
         lit: vec16,
     ):  # fmt: skip
         """T in front, T dL/dT in front, the weight, and what to sum for the geometry."""
         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
-        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
+        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alphas, here, walked, lit)
         part = mat_geometry()
         adj_x = times(adj_opacity, dx)
         adj_y = times(adj_opacity, dy)
@@ -44,7 +44,7 @@ def make_reverse_step(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp
 
     @wp.func
     def stepwise(
-        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alpha_min: float, here: vec16, walked: vec16,
+        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alphas: wp.vec2, here: vec16, walked: vec16,
         lit: vec16,
     ):  # fmt: skip
         """T in front, dL/dT in front, the weight, and what to sum for the geometry."""
@@ -57,9 +57,9 @@ def make_reverse_step(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp
         parcel.opacity = vec16(splat.opacity)
         parcel.red = lit
         zero = vec16(0.0)
-        fall, front = undo(parcel, t, alpha_min, here, walked)
+        fall, front = undo(parcel, t, alphas, here, walked)
         adj, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
-            parcel, fall, front, adj_t, alpha_min, here, walked, vec16(1.0), zero, zero, zero
+            parcel, fall, front, adj_t, alphas, here, walked, vec16(1.0), zero, zero, zero
         )
         part = mat_geometry()
         part[MEAN_X] = adj.dx
@@ -72,12 +72,12 @@ def make_reverse_step(mode: str, variant: BlendVariant) -> tuple[wp.Function, wp
 
     @wp.func
     def absolute(
-        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alpha_min: float, here: vec16, walked: vec16,
+        splat: Splat2D, dx: vec16, dy: vec16, t: vec16, adj_t: vec16, alphas: wp.vec2, here: vec16, walked: vec16,
         lit: vec16,
     ):  # fmt: skip
         """As ``manual``; what is summed are the magnitudes of what each pixel says of the mean."""
         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
-        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alpha_min, here, walked, lit)
+        front, adj_front, w, adj_opacity = adj_step(z, splat.opacity, t, adj_t, alphas, here, walked, lit)
         adj_u = times(fma(dx, splat.root[0], times(dy, splat.root[1])), adj_opacity)
         adj_v = times(times(dy, splat.root[2]), adj_opacity)
         adj_x = times(adj_u, splat.root[0])

@@ -75,7 +75,7 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
     def blend_channels(
         first: int,
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         count: wp.array2d[vec16],  # [T, BLOCKS]
         steps: wp.array[int],  # [T]
         rows: wp.array2d[float],  # [V, AT_ONCE] of the splats
@@ -117,7 +117,7 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
                     block = (4 * by + bx) & (BLOCKS - 1)
                     dx = offset_x(splat.mean, x0, bx)
                     fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-                    alpha = opaque(fall * splat.opacity, alpha_min, here, s[WALKED + block])
+                    alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
                     w = times(alpha, s[T + block])
                     if some(w):
                         s[T + block] = fma(-alpha, s[T + block], s[T + block])
@@ -161,7 +161,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     def adj_channels(
         first: int,
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         final: wp.array2d[vec16],  # [T, BLOCKS]
         count: wp.array2d[vec16],  # [T, BLOCKS]
         steps: wp.array[int],  # [T]
@@ -227,7 +227,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                             lit = fma(s[up + channel], mine[channel], lit)
                         channel += 1
                     front, adj_front, w, part = body(
-                        splat, dx, dy, s[T + block], s[ADJ_T + block], alpha_min, here, s[WALKED + block], lit
+                        splat, dx, dy, s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit
                     )
                     s[T + block] = front
                     s[ADJ_T + block] = adj_front

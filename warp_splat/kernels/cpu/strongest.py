@@ -27,7 +27,7 @@ def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
     def strongest(
         first: int,
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         count: wp.array2d[vec16],  # [T, BLOCKS]
         steps: wp.array[int],  # [T]
         # out
@@ -71,7 +71,7 @@ def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
                     dx = offset_x(splat.mean, x0, bx)
                     fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
                     t = s[T + block]
-                    alpha = opaque(fall * splat.opacity, alpha_min, here, s[WALKED + block])
+                    alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
                     behind = fma(-alpha, t, t)
                     s[T + block] = behind
                     known = s[MEDIAN + block]

@@ -155,7 +155,7 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     def walk(
         first: int,
         bins: BinsView,  # splats: a copy per instance for ``generated``, [M]
-        alpha_min: float,
+        alphas: wp.vec2,
         final: wp.array2d[vec16],  # [T, BLOCKS]
         count: wp.array2d[vec16],  # [T, BLOCKS]
         kept: wp.array2d[vec16],  # [M, BLOCKS], or nothing
@@ -197,7 +197,7 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
                         dy = vec16(y) - LANE_Y - row
                         z = exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2])
                         raw = fall_at(z) * splat.opacity
-                        alpha = alpha_of(where_less(here, count[tile, block], raw, vec16(-1.0)), alpha_min)
+                        alpha = alpha_of(where_less(here, count[tile, block], raw, vec16(-1.0)), alphas)
                     else:
                         dx = spread(m, MEAN_X, x) - LANE_X - column
                         dy = spread(m, MEAN_Y, y) - LANE_Y - row
@@ -205,7 +205,7 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
                         xy = spread(m, XY, splat.root[1])
                         z = exponent(dx, dy, xx, xy, spread(m, YY, splat.root[2]))
                         raw = times(fall_known(z, fall_value(z)), spread(m, OPACITY, splat.opacity))
-                        alpha = opaque(raw, alpha_min, here, count[tile, block])
+                        alpha = opaque(raw, alphas, here, count[tile, block])
                     if wp.static(mode == "stored"):
                         front = front_of_kept(t, block, kept, k)
                     elif wp.static(mode == "plain"):

@@ -150,7 +150,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(WARP_OPTIONS))
     def adj_blend(
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         final: wp.array2d[float],  # [T, THREADS]
         count: wp.array2d[int],  # [T, THREADS]
         steps: wp.array[int],  # [T]
@@ -191,7 +191,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
             if last - lane >= 0:
                 splat = bins.splats[bins.instances[start + last - lane]]
                 mine = staged_of(splat)
-                z_most = 0.5 * LOG2_E * reach_of(splat.opacity, alpha_min)
+                z_most = 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0])
                 touched = blocks_of(splat, z_most, left, top)
             staged = wp.tile(mine, preserve_type=True)
             blocks = wp.tile(touched)
@@ -210,7 +210,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
                                 lit += fars[p] * g[CHANNEL + 3]
                             z = exponent(dx, dy, g[XX], g[XY], g[YY])
                             front, beyond, w, s = adj_step(
-                                z, g[OPACITY], ts[p], adj_ts[p], alpha_min, here, walked[p], lit
+                                z, g[OPACITY], ts[p], adj_ts[p], alphas, here, walked[p], lit
                             )
                             sx = s * dx
                             sy = s * dy
@@ -231,9 +231,9 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
                             parcel.green = g[CHANNEL + 1]
                             parcel.blue = g[CHANNEL + 2]
                             parcel.depth = g[CHANNEL + 3]
-                            fall, front = undo(parcel, ts[p], alpha_min, here, walked[p])
+                            fall, front = undo(parcel, ts[p], alphas, here, walked[p])
                             q, _fall, adj_front, _behind, _min, _here, _walked, _r, _g, _b, _z = wp.grad(step)(
-                                parcel, fall, front, adj_ts[p], alpha_min, here, walked[p],
+                                parcel, fall, front, adj_ts[p], alphas, here, walked[p],
                                 reds[p], greens[p], blues[p], fars[p],
                             )  # fmt: skip
                             sums += vec10(q.dx, q.dy, q.xx, q.xy, q.yy, q.opacity, q.red, q.green, q.blue, q.depth)

@@ -38,7 +38,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def blend(
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         t_min: float,
         max_steps: int,
         background: wp.array[float],  # [3]
@@ -71,7 +71,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             for j in range(wp.min(THREADS, length - first)):
                 g = staged[j]
                 fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
-                alpha = alpha_of(fall * g[OPACITY], alpha_min)
+                alpha = alpha_of(fall * g[OPACITY], alphas)
                 behind = advance(t, alpha, t_min)
                 w = weight(t, alpha, behind)
                 if wp.static(variant.keep):

@@ -27,7 +27,7 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def blend_channels(
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         count: wp.array2d[int],  # [T, THREADS]
         steps: wp.array[int],  # [T]
         rows: wp.array2d[float],  # [V, AT_ONCE] of the splats
@@ -58,7 +58,7 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
                 g = staged[j]
                 splat = splats[j]
                 fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
-                alpha = opaque(fall * g[OPACITY], alpha_min, float(first + j), walked)
+                alpha = opaque(fall * g[OPACITY], alphas, float(first + j), walked)
                 w = alpha * t
                 t = fma(-alpha, t, t)
                 for channel in range(WIDTH):
@@ -87,7 +87,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def adj_channels(
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         final: wp.array2d[float],  # [T, THREADS]
         count: wp.array2d[int],  # [T, THREADS]
         steps: wp.array[int],  # [T]
@@ -133,7 +133,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                     lit += up[channel] * rows[splat, channel]
             if wp.static(mode != "stepwise"):
                 z = exponent(dx, dy, g[XX], g[XY], g[YY])
-                front, beyond, w, adj_opacity = adj_step(z, g[OPACITY], t, adj_t, alpha_min, here, walked, lit)
+                front, beyond, w, adj_opacity = adj_step(z, g[OPACITY], t, adj_t, alphas, here, walked, lit)
                 sx = adj_opacity * dx
                 sy = adj_opacity * dy
                 grads = vec10(sx, sy, sx * dx, sx * dy, sy * dy, adj_opacity, 0.0, 0.0, 0.0, 0.0)
@@ -152,9 +152,9 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 parcel.yy = g[YY]
                 parcel.opacity = g[OPACITY]
                 parcel.red = lit
-                fall, front = undo(parcel, t, alpha_min, here, walked)
+                fall, front = undo(parcel, t, alphas, here, walked)
                 p, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
-                    parcel, fall, front, adj_t, alpha_min, here, walked, 1.0, 0.0, 0.0, 0.0
+                    parcel, fall, front, adj_t, alphas, here, walked, 1.0, 0.0, 0.0, 0.0
                 )
                 w = p.red
                 grads = vec10(p.dx, p.dy, p.xx, p.xy, p.yy, p.opacity, 0.0, 0.0, 0.0, 0.0)

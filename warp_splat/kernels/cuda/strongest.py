@@ -23,7 +23,7 @@ def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def strongest(
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         count: wp.array2d[int],  # [T, THREADS]
         steps: wp.array[int],  # [T]
         # out
@@ -52,7 +52,7 @@ def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
                 g = staged[j]
                 here = float(first + j)
                 fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
-                alpha = opaque(fall * g[OPACITY], alpha_min, here, walked)
+                alpha = opaque(fall * g[OPACITY], alphas, here, walked)
                 w = alpha * t
                 behind = fma(-alpha, t, t)
                 if t > 0.5 and behind <= 0.5:

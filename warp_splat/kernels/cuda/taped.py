@@ -114,7 +114,7 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     @wp.kernel(module="unique", module_options={**BLOCK_OPTIONS, "enable_backward": True})
     def walk(
         bins: BinsView,
-        alpha_min: float,
+        alphas: wp.vec2,
         final: wp.array2d[float],  # [T, THREADS]
         count: wp.array2d[int],  # [T, THREADS]
         kept: wp.array2d[float],  # [M, THREADS], or nothing
@@ -135,7 +135,7 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
             g = read(bins.splats[bins.instances[k]], slots, k, thread)
             z = exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY])
             raw = fall_known(z, fall_value(z)) * g[OPACITY]
-            alpha = opaque(raw, alpha_min, float(k - start), walked)
+            alpha = opaque(raw, alphas, float(k - start), walked)
             if wp.static(mode == "stored"):
                 front = front_of_kept(t, kept, k, thread)
             else:

@@ -19,7 +19,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.config import BLUR, COMPENSATION_MIN
+from warp_splat.config import COMPENSATION_MIN
 from warp_splat.kernels.columns import columns
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.project.camera_view import CameraView
@@ -94,11 +94,11 @@ def make_adj_intrinsics(lanes: int) -> wp.Kernel:
     total = make_total(lanes)
 
     @wp.func
-    def stretch(xx: number, xy: number, adj_xx: number, adj_xy: number, adj_yy: number):
+    def stretch(camera: CameraView, xx: number, xy: number, adj_xx: number, adj_xy: number, adj_yy: number):
         """What the conic says of a longer focal length along x."""
         one = fill(1.0, xx)
-        blur_xx = times(fill(2.0 * BLUR, xx), xx)
-        blur_xy = times(fill(2.0 * BLUR, xx), xy)
+        blur_xx = times(fill(2.0 * camera.blur, xx), xx)
+        blur_xy = times(fill(2.0 * camera.blur, xx), xy)
         return fma(
             times(adj_xx, xx),
             blur_xx - one - one,
@@ -124,13 +124,13 @@ def make_adj_intrinsics(lanes: int) -> wp.Kernel:
         xx, xy, yy = columns(conics[g])
         adj_px, adj_py = columns(adj_means2d[g])
         adj_xx, adj_xy, adj_yy = columns(adj_conics[g])
-        along_x = fma(adj_px, px - fill(camera.principal[0], px), stretch(xx, xy, adj_xx, adj_xy, adj_yy))
-        along_y = fma(adj_py, py - fill(camera.principal[1], px), stretch(yy, xy, adj_yy, adj_xy, adj_xx))
+        along_x = fma(adj_px, px - fill(camera.principal[0], px), stretch(camera, xx, xy, adj_xx, adj_xy, adj_yy))
+        along_y = fma(adj_py, py - fill(camera.principal[1], px), stretch(camera, yy, xy, adj_yy, adj_xy, adj_xx))
         zero = fill(0.0, px)
         if camera.antialiasing != 0:
             opacity = opacities2d[g]
             free = less(times(opacities[g], root(fill(COMPENSATION_MIN, px))), opacity)
-            fainter = pick(free, times(times(fill(BLUR, px), opacity), adj_opacities2d[g]), zero)
+            fainter = pick(free, times(times(fill(camera.blur, px), opacity), adj_opacities2d[g]), zero)
             along_x = fma(fainter, xx, along_x)
             along_y = fma(fainter, yy, along_y)
         seen = times(less(zero, xx), equal(times(along_x + along_y + adj_px + adj_py, zero), zero))

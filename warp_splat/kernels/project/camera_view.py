@@ -20,6 +20,8 @@ class CameraView:
     sh_degree: int
     antialiasing: int
     alpha_min: float
+    near: float  # world units
+    blur: float  # px^2
     lens: vec16  # coefficients of its formula; last, how far from the axis it is followed (:mod:`.lens`)
 
 

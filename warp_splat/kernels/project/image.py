@@ -1,7 +1,7 @@
 """The image of a Gaussian: where it lies, its covariance there, its opacity. A part of the kernels that need it.
 
 With A = J W R S (2 x 3, rows a1, a2; J the derivative of the lens at the mean, W the camera's rotation, R S the
-Gaussian's rotation and scales), the projected covariance is A A' + e I, e = BLUR. Its determinant is computed as
+Gaussian's rotation and scales), the projected covariance is A A' + e I, e = ``blur``. Its determinant is computed as
 
     |a1 x a2|^2 + e (|a1|^2 + |a2|^2) + e^2,
 
@@ -12,7 +12,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.config import BLUR, COMPENSATION_MIN
+from warp_splat.config import COMPENSATION_MIN
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.simd import TYPES, fill, fma, less, over, pick, root, times
@@ -96,7 +96,7 @@ def make_image(projection: Projection, lanes: int) -> wp.Function:
                 camera, z, px, py, a10, a11, a12, a20, a21, a22, t0, t1, t2, sx, sy, sz, drawn
             )
         xx, xy, yy, sharp = covariance(a10, a11, a12, a20, a21, a22)
-        blur = fill(BLUR, one)
+        blur = fill(camera.blur, one)
         det = fma(blur, xx + yy, fma(blur, blur, sharp))
         xx = xx + blur
         yy = yy + blur

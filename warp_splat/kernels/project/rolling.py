@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_splat.config import FRUSTUM_MARGIN, NEAR
+from warp_splat.config import FRUSTUM_MARGIN
 from warp_splat.kernels.columns import columns
 from warp_splat.kernels.formula import Notes, Number, write_function
 from warp_splat.kernels.project.camera_view import CameraView
@@ -90,7 +90,8 @@ def _held_in_view(notes: Notes, family: Family, x: Number, y: Number, z: Number)
     if family.around:
         return z
     if not family.wide:
-        return np.where(z < NEAR, NEAR, z)
+        near = notes.given("camera.near")
+        return np.where(z < near, near, z)
     limit, across = notes.given(f"camera.lens[{LIMIT}]"), x * x + y * y
     inside = limit + EDGE
     unseen = z < inside * np.sqrt(across + z * z)

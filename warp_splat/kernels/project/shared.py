@@ -14,7 +14,6 @@ import functools
 
 import warp as wp
 
-from warp_splat.config import NEAR
 from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
@@ -138,7 +137,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         depth = fma(r20, ox, fma(r21, oy, times(r22, oz)))
         if wp.static(projection.wide):
             depth = root(fma(ox, ox, fma(oy, oy, times(oz, oz))))
-        here = times(here, less(fill(NEAR, one), depth))
+        here = times(here, less(fill(camera.near, one), depth))
         if not some(here):
             return
         # harmless numbers take the place of those that are left out

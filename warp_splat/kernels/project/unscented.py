@@ -16,7 +16,6 @@ import functools
 import numpy as np
 import warp as wp
 
-from warp_splat.config import NEAR
 from warp_splat.kernels.formula import Notes, Number, write_function
 from warp_splat.kernels.project import COEFFICIENTS, Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
@@ -68,7 +67,8 @@ def through(family: Family, learned: bool = False) -> Projection:
             """From the mean's image to that of a point; none to one that is not seen."""
             x, y, z = (middle + sign * part for middle, part in zip(center, axis, strict=True))
             if not family.wide:
-                z = np.where(z < NEAR, NEAR, z)
+                near = notes.given("camera.near")
+                z = np.where(z < near, near, z)
             (qx, qy), _, too = image_of(notes, family, x, y, z, linear=False, learned=learned)
             dx, dy = qx - px, qy - py
             if family.around:

@@ -1,0 +1,103 @@
+"""Seven points of each Gaussian seen through a lens (Wu et al. 2025, section 4.1), with gsplat's constants.
+
+In float64: its points are a sixth of a standard deviation away from the mean, and what they say of it is multiplied by
+a hundred. Written as sums of squares, so that the covariance cannot become negative. With the offsets e_i of the six
+images from that of the mean, w = 1 / (6 alpha^2) and the shift m = w sum e_i:
+
+    mean p_0 + m,  covariance w sum e_i e_i' + (beta - alpha^2) m m'
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from warp_splat.gsplat.arguments import Request
+from warp_splat.gsplat.turns import rows_turned
+from warp_splat.lenses.formulas import perspective, radial_of
+
+ALPHA, BETA = 0.1, 2.0  # of the transform; kappa is 0
+MARGIN = 0.1  # of the image's size: a point so far outside still counts as seen
+LEAST_RADIAL = 0.8  # where a lens draws points nearer to the axis than this share, it is about to fold
+TINY = 1e-14  # squared distance from the axis, below which a fisheye's formula takes it for this
+
+Points = tuple[torch.Tensor, torch.Tensor]  # images of points [S, C, N, 7, 2] px, and which of them count as seen
+
+
+def see_points(request: Request, axes: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Means [S, C, N, 2] px and variances xx, xy, yy px^2 of the images, the latter's determinant, and a mask.
+
+    ``axes``: [S, N, 3, 3], columns: the Gaussians' axes in the world, a standard deviation long.
+    """
+    means, offsets = request.means.double()[:, :, None], ALPHA * 3**0.5 * axes.double().mT
+    points = torch.cat([means, means + offsets, means - offsets], 2)[:, None]
+    viewmats = request.viewmats.double()[:, :, None, None]
+    points = rows_turned(points, viewmats[..., :3, :3].mT) + viewmats[..., :3, 3]
+    places, seen = (_fisheye if request.camera_model == "fisheye" else _pinhole)(request, points)
+    low = -MARGIN * places.new_tensor([request.width, request.height])
+    seen = seen & ((places >= low) & (places < -low / MARGIN - low)).all(-1)
+    off = places[..., 1:, :] - places[..., :1, :]
+    weight = 1 / (6 * ALPHA**2)
+    moved = weight * off.sum(-2)
+    (x, y), (mx, my) = off.unbind(-1), moved.unbind(-1)
+    rest = BETA - ALPHA**2
+    xx, xy, yy = (
+        weight * (a * b).sum(-1) + rest * c * d for a, b, c, d in ((x, x, mx, mx), (x, y, mx, my), (y, y, my, my))
+    )
+    found = (places[..., 0, :] + moved, xx, xy, yy, (xx * yy - xy * xy).clamp_min(0.0))
+    return *(part.to(request.means.dtype) for part in found), seen.any(-1)
+
+
+def _numbers(request: Request, name: str, count: int) -> tuple[torch.Tensor, ...]:
+    """Coefficients of a kind, [S, C, 1, 1] each; zeros, if there are none."""
+    given = getattr(request, name)
+    given = request.Ks.new_zeros(*request.Ks.shape[:2], count) if given is None else given
+    return given.double()[:, :, None, None].unbind(-1)
+
+
+def _placed(request: Request, u: torch.Tensor, v: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+    """Pixels of what is seen (u, v) focal lengths from the principal point; the rest goes to (0, 0), as in gsplat."""
+    Ks = request.Ks.double()[:, :, None, None]
+    places = torch.stack([Ks[..., 0, 0] * u + Ks[..., 0, 2], Ks[..., 1, 1] * v + Ks[..., 1, 2]], -1)
+    return torch.where(seen[..., None], places, 0.0)
+
+
+def _pinhole(request: Request, points: torch.Tensor) -> Points:
+    """With OpenCV's distortion: radial, tangential, and four coefficients of a thin prism."""
+    k1, k2, k3, k4, k5, k6 = _numbers(request, "radial_coeffs", 6)
+    p1, p2 = _numbers(request, "tangential_coeffs", 2)
+    s1, s2, s3, s4 = _numbers(request, "thin_prism_coeffs", 4)
+    ahead = points[..., 2] > 0
+    x, y, z = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
+    coefficients = (k1, k2, p1, p2, k3, k4, k5, k6)
+    u, v = perspective(coefficients, x, y, z)
+    r2 = (x * x + y * y) / (z * z)
+    places = _placed(request, u + r2 * (s1 + r2 * s2), v + r2 * (s3 + r2 * s4), ahead)
+    return places, ahead & (radial_of(coefficients, r2) > LEAST_RADIAL)
+
+
+def _fisheye(request: Request, points: torch.Tensor) -> Points:
+    """A polynomial of the angle from the axis, which ends where it folds or the image does (OpenCV's)."""
+    k1, k2, k3, k4 = _numbers(request, "radial_coeffs", 4)
+    ahead = points[..., 2] > 0
+    x, y, z = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
+    beside = (x * x + y * y).clamp_min(TINY).sqrt()
+    angle = torch.atan2(beside, z).minimum(_largest_angles(request))
+    square = angle * angle
+    ratio = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))) / beside
+    seen = ahead & (ratio > 0)
+    return _placed(request, ratio * x, ratio * y, seen), seen
+
+
+def _largest_angles(request: Request) -> torch.Tensor:
+    """Up to which a fisheye is followed [rad], [S, C, 1, 1]: there its slope is 0, or the farthest corner lies."""
+    radial, found = torch.cat(_numbers(request, "radial_coeffs", 4), -1).flatten(0, 2), []
+    for k, K in zip(radial.tolist(), request.Ks.flatten(0, 1).tolist(), strict=True):
+        roots = np.roots([9 * k[3], 7 * k[2], 5 * k[1], 3 * k[0], 1.0])
+        folds = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
+        sides = (max(size - middle, middle) for size, middle in ((request.width, K[0][2]), (request.height, K[1][2])))
+        corner = math.hypot(*sides) / min(K[0][0], K[1][1])
+        found.append(min(math.sqrt(min(folds, default=math.inf)), corner))
+    return torch.tensor(found, dtype=torch.float64, device=radial.device).view(*request.Ks.shape[:2], 1, 1)
