@@ -22,11 +22,13 @@ from warp_splat.config import ADJOINTS, STRONGEST_MOST
 from warp_splat.kernels import sh_colors, tiles
 from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.adam import make_adam
+from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
 from warp_splat.kernels.cuda import channels
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.strongest import make_strongest
 from warp_splat.kernels.cuda.taped import make_walk_block
+from warp_splat.kernels.environment import make_adj_put_behind, make_put_behind
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.project import adj_camera, affine, ellipsoid
 from warp_splat.kernels.project.adj_lens import make_bend
@@ -65,6 +67,10 @@ def modules() -> dict[str, wp.Module]:
         "adjoint of activate": make_adj_activate(1).module,
         "observe": make_observe(1).module,
         "adam": make_adam(1, True).module,
+        "map of colors": make_map_colors(1).module,
+        "adjoint of the map": make_adj_map_colors(1).module,
+        "environment": make_put_behind(1).module,
+        "adjoint of environment": make_adj_put_behind(1).module,
         "pack": tiles.make_pack().module,
         "tiles": tiles.list_tiles.module,
     }
