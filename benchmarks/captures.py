@@ -2,8 +2,8 @@ r"""Real captures, `--preset fast` with and without parts: metrics of held-out v
 
 A run whose results are there already is not repeated; `--given` trains nothing and shows what there is.
 
-    python benchmarks/captures.py -s path/to/church --limit 80000 -s path/to/fox --limit 60000 --parts floaters \
-        --models output/captures [-r 2] [--seeds 0 1 2] [--out docs/benchmarks]
+    python benchmarks/captures.py -s path/to/church --limit 80000 -s path/to/fox --limit 60000 -s embedded \
+        --limit 50000 --parts floaters --models output/captures [-r 2] [--seeds 0 1 2] [--out docs/benchmarks]
 """
 
 import argparse
@@ -19,6 +19,7 @@ from warp_splat.formats.png import load_png
 
 ROOT = Path(__file__).parents[1]
 METRICS = {"PSNR": 2, "CC_PSNR": 2, "SSIM": 4, "FLIP": 4}  # and how many decimals
+EMBEDDED = "embedded"  # has defaults of its own if no scene is given
 HEADERS = ("scene", "pixels", "parts", "seeds", *METRICS, "PSNR of the worst view", "Gaussians")
 
 
@@ -50,7 +51,7 @@ def row_of(scene: str, parts: str, found: list[dict]) -> tuple:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-s", "--scene", type=Path, action="append", required=True, help="a scene; may come again")
+    parser.add_argument("-s", "--scene", type=Path, action="append", required=True, help="a scene, or embedded; may come again")
     parser.add_argument("--limit", type=int, action="append", required=True, help="--max_gaussians of each scene")
     parser.add_argument("--parts", action="append", default=[], help="as of train.py; may come again")
     parser.add_argument("-r", "--resolution", default="2", help="as of train.py")
@@ -64,9 +65,10 @@ def main() -> None:
         for parts in ("", *arguments.parts):
             found = []
             for seed in arguments.seeds:
-                name = f"{scene.name}_{arguments.resolution}_{parts or 'none'}_{seed}"
-                flags = ["-s", scene.resolve(), "-r", arguments.resolution, "--max_gaussians", str(limit)]
-                flags += ["--seed", str(seed), *(["--parts", parts] if parts else [])]
+                given, size = str(scene) != EMBEDDED, f"_{arguments.resolution}"
+                name = f"{scene.name}{size * given}_{parts or 'none'}_{seed}"
+                flags = ["--max_gaussians", str(limit), "--seed", str(seed), *(["--parts", parts] if parts else [])]
+                flags += ["-s", scene.resolve(), "-r", arguments.resolution] * given
                 if results := run((arguments.models / name).resolve(), flags, arguments.given):
                     runs[name] = results
                     found.append(results)

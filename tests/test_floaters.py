@@ -1,6 +1,7 @@
 """The price on opacity: its gradient against the formula, one sum in any order, the same bytes after a resume."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -85,3 +86,11 @@ def test_without_it_nothing_changes(scene, tmp_path):
 def test_bad_weights_are_refused(value, tmp_path, capsys):
     command = ["train", "-s", str(SCENE), "-m", str(tmp_path / "m"), "--parts", "floaters", f"--opacity_reg={value}"]
     assert f"--opacity_reg: expected a finite number, at least 0, got {float(value)}." in fails(capsys, *command)
+
+
+def test_verdict(scene):
+    assert "floaters" not in choose(TrainConfig(parts="auto"), scene)[0]
+    used, told = choose(TrainConfig(parts="auto"), replace(scene, train=scene.train[::2]))
+    assert "floaters" in used and any("half of its points lie in 22 photographs or fewer" in line for line in told)
+    without = replace(scene, train=scene.train[::2], find_tracks=dict)
+    assert "floaters" not in choose(TrainConfig(parts="auto"), without)[0]

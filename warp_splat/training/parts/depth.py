@@ -16,6 +16,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime.timers import stage
+from warp_splat.scene.coverage import shown_in
 from warp_splat.scene.depth_maps import read_inverse_depths
 from warp_splat.scene.types import Scene, View, visible
 from warp_splat.training.optimizer import power
@@ -63,10 +64,9 @@ class Depth:
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If few photographs show the same: then they do not tell depth well, and points do."""
-        if not any(view.name in scene.tracks for view in scene.train):
+        shown = shown_in(scene)
+        if shown is None:
             return Verdict(False, "the scene does not say which points its photographs saw")
-        points = scene.points.astype(np.float64)
-        shown = float(np.median(sum(visible(view.camera, points).astype(int) for view in scene.train)))
         figure = f"half of its points lie in {shown:.0f} photographs or fewer"
         return Verdict(shown < FEW, f"{figure}; under {FEW} their depths are worth it")
 
