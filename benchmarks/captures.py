@@ -51,7 +51,9 @@ def row_of(scene: str, parts: str, found: list[dict]) -> tuple:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-s", "--scene", type=Path, action="append", required=True, help="a scene, or embedded; may come again")
+    parser.add_argument(
+        "-s", "--scene", type=Path, action="append", required=True, help="a scene, or embedded; may come again"
+    )
     parser.add_argument("--limit", type=int, action="append", required=True, help="--max_gaussians of each scene")
     parser.add_argument("--parts", action="append", default=[], help="as of train.py; may come again")
     parser.add_argument("-r", "--resolution", default="2", help="as of train.py")

@@ -171,6 +171,9 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
     assert main(["train", "--resume", str(tmp_path / "a"), "--iterations", "24"]) == 0
     assert train(tmp_path / "b", "--config", str(tmp_path / "a" / "config.toml"), "--iterations", "24") == 0
     assert ply_path(tmp_path / "a", 24).read_bytes() == ply_path(tmp_path / "b", 24).read_bytes()
+    capsys.readouterr()
+    assert main(["train", "--resume", str(tmp_path / "b"), "--parts", "floaters", "--no-quiet"]) == 0
+    assert "Warning: the part gain is left out from here on" in "".join(capsys.readouterr())
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     assert "--gain_lr FLOAT" in capsys.readouterr().out

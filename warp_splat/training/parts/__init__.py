@@ -85,13 +85,18 @@ PARTS: dict[str, Entry] = {
 }
 
 
+def asked_for(config: TrainConfig, name: str) -> bool:
+    """Whether a part is named, or a flag of its own asks for it."""
+    return name in config.model.parts.split(",") or bool(getattr(config.plugins[name], name, False))
+
+
 def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
     """The names of the parts to use, and sentences: on each that ``--parts auto`` has weighed, on idle options."""
-    used, told, named = [], [], config.model.parts.split(",")
+    used, told = [], []
     for name, entry in PARTS.items():
-        if name in named or getattr(config.plugins[name], name, False):
+        if asked_for(config, name):
             used.append(name)
-        elif named == [AUTO] and hasattr(entry.load(), "needed"):
+        elif config.model.parts == AUTO and hasattr(entry.load(), "needed"):
             verdict = entry.load().needed(scene)
             told.append(f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}.")
             used += [name] * verdict.needed
