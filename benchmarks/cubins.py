@@ -26,6 +26,7 @@ from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
 from warp_splat.kernels.cuda import channels
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
+from warp_splat.kernels.cuda.gather import make_gather
 from warp_splat.kernels.cuda.strongest import make_strongest
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.environment import make_adj_put_behind, make_put_behind
@@ -38,6 +39,8 @@ from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.lenses.formulas import MODELS, PINHOLE
+from warp_splat.raster.beside import WIDTHS as CHANNEL_WIDTHS
+from warp_splat.raster.data import WIDTHS
 
 REGISTERS = 65536  # of a multiprocessor, all architectures below
 #: Architecture: threads, blocks and KiB of shared memory of a multiprocessor (CUDA C++ Programming Guide, table of
@@ -83,11 +86,13 @@ def modules() -> dict[str, wp.Module]:
         found[f"blend{suffix}"] = make_blend_block(variant).module
         found[f"blend, stored{suffix}"] = make_blend_block(variant._replace(keep=True)).module
         found[f"upstream{suffix}"] = make_upstream_block(variant).module
+        found[f"gather{suffix}"] = make_gather(WIDTHS[: 4 + depth]).module
         for mode in ADJOINTS[:2]:
             found[f"{mode}{suffix}"] = make_reverse_block(mode, variant).module
         for mode in ADJOINTS[2:]:
             found[f"{mode}{suffix}"] = make_walk_block(mode, variant).module
     plain = BlendVariant()
+    found["gather, channels"] = make_gather((*WIDTHS[:3], CHANNEL_WIDTHS[-1])).module
     found["channels"] = channels.make_blend_channels(plain).module
     for mode in ADJOINTS[:2]:
         found[f"{mode}, channels"] = channels.make_adj_channels(mode, plain).module

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import warp as wp
 
 from warp_splat import Camera, InputError, RasterOptions, set_threads
 from warp_splat.raster import api, bin, depth_order
 from warp_splat.raster import project as projection
-from warp_splat.raster.data import Gaussians
+from warp_splat.raster.data import Bins, Gaussians
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime.pool import get_threads
 
@@ -77,7 +78,8 @@ def test_rows_are_summed_by_gaussian(width):
             np.add.at(sums, first_to_last, slots.numpy()[bins.places.numpy()])
             for count in (1, 2, 3):
                 set_threads(count)
-                found = driver.gather(bins, slots)
+                with using(driver):
+                    found = driver.gather(bins, slots)
                 assert [grad.shape[1:].numel() for grad in found] == [2, 3, 1, 3, 1]
                 assert width == 10 or not found[4].any()
                 assert (torch.cat([grad.view(5000, -1) for grad in found], 1)[:, :width].numpy() == sums).all()
@@ -101,6 +103,35 @@ def test_without_gaussians_or_instances_sums_are_zero():
         projected.radii[:] = 0
         bins = CPU.bin(projected, camera, PLAIN)
         assert not torch.cat([grad.view(-1) for grad in CPU.gather(bins, torch.empty(0, 9))]).any()
+
+
+@pytest.mark.parametrize("widths", [(2, 3, 1, 3), (2, 3, 1, 3, 1), (2, 3, 1), (2, 3, 1, 32)])
+def test_splats_of_many_tiles(widths):
+    """On CUDA a warp sums the rows of a splat together, if there are many; two runs give the same bits."""
+    bins, slots, counts = crowded(70, sum(widths))
+    with using(CUDA):
+        first, second = (
+            CUDA.gather(bins, slots, [torch.full((70, width), torch.nan) for width in widths]) for _ in range(2)
+        )
+    owners = bins.gaussians.numpy().repeat(counts)
+    expected = torch.zeros(70, sum(widths), dtype=torch.float64)
+    expected.index_add_(0, torch.from_numpy(owners), slots[bins.places.long()].double())
+    found = torch.cat([grad.view(70, -1) for grad in first], 1)
+    assert (found - expected).norm() < 1e-6 * expected.norm() and counts.max() > 300
+    assert all(map(torch.equal, first, second))
+
+
+def crowded(count, width):
+    """Lists of ``count`` splats, some of hundreds of tiles, as gather reads them; rows; and the tiles of each."""
+    random = np.random.default_rng(0)
+    counts = np.where(np.arange(count) % 7, random.integers(0, 20, count), random.integers(60, 400, count))
+    total, order = int(counts.sum()), random.permutation(count).astype(np.int32)
+    places = torch.from_numpy(random.permutation(total).astype(np.int32))
+    begins = torch.from_numpy((counts.cumsum() - counts).astype(np.int32))
+    rows = torch.from_numpy(random.standard_normal((total, width), np.float32))
+    nothing = torch.empty(0, dtype=torch.int32)
+    gaussians = wp.array(order, dtype=int, device="cpu")
+    return Bins(count, gaussians, None, nothing, places, begins, nothing, [], 1, 0), rows, counts
 
 
 def test_depths_are_sorted_in_bands(monkeypatch):
@@ -202,8 +233,8 @@ def test_images_and_gradients_are_the_same_from_sorted_lists():
         leaves = [tensor.clone().requires_grad_() for tensor in (*tensors, sh)]
         with using(driver):
             out = api.rasterize(*leaves, camera)
+            results.append([out.image, *torch.autograd.grad(out.image.square().sum(), leaves)])
         assert 0 < (out.radii > 0).sum() < 400
-        results.append([out.image, *torch.autograd.grad(out.image.square().sum(), leaves)])
     assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
 
 

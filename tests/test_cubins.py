@@ -11,6 +11,8 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import cubins  # noqa: E402
 
+#: Kernel and architecture: through a lens, or with a rolling shutter, 184 bytes lie in memory.
+SPILLING = {("project, adjoint", 100), ("project, adjoint", 120)}
 KEYS = ("registers", "static_shared", "dynamic_shared", "loop")
 
 
@@ -34,7 +36,7 @@ def test_resources(arch):
         for record in cubins.resources(name, module, arch, cubins.cuobjdump()):
             place = (record["module"], record["kernel"], arch)
             seen.add(place)
-            assert record["stack"] == 0, place
+            assert record["stack"] == 0 or (place[1:] in SPILLING and record["stack"] <= before[place]["stack"]), place
             for key in KEYS:
                 assert record[key] <= before[place][key], (place, key, "rerun benchmarks/cubins.py if that is wanted")
     assert seen == {place for place in before if place[2] == arch}

@@ -11,6 +11,7 @@ import pytest
 import torch
 from cuda_on_host import build, recorded, run
 from scenes import PARAMETERS, cloud, dense_tile, make_camera
+from test_binning import crowded
 
 from warp_splat import RasterOptions, rasterize
 from warp_splat.config import ADJOINTS
@@ -54,6 +55,11 @@ def launches_of(case, monkeypatch, scene):
     return launches
 
 
+def adjoint_of(launches):
+    (launch,) = (launch for launch in launches if launch.kernel.key.startswith("make_reverse_block"))
+    return launch
+
+
 def check_memory(found, launch):
     """What the program left is what the fibers left: to the bit, sums to their rounding."""
     for here, there in zip(found.memory, launch.after, strict=True):
@@ -79,7 +85,7 @@ def check_controls(program, launch, barriers):
 
 
 def test_adjoint_has_no_races(monkeypatch, tmp_path):
-    launch = launches_of("manual", monkeypatch, small(100))[-1]  # more than a warp stages at once
+    launch = adjoint_of(launches_of("manual", monkeypatch, small(100)))  # more than a warp stages at once
     program = build(launch, "thread", tmp_path)
     barriers = check_clean(program, launch)
     assert barriers and all(run(program, launch, without=barrier).code for barrier in barriers)
@@ -105,8 +111,21 @@ def test_more_than_a_batch(monkeypatch, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+def test_sums_of_splats_of_many_tiles(sanitizer, monkeypatch, tmp_path):
+    """The path that no scene of a few tiles takes."""
+    bins, slots, _ = crowded(40, 9)
+    with using(CUDA), recorded(monkeypatch) as launches:
+        CUDA.gather(bins, slots)
+    program = build(launches[0], sanitizer, tmp_path)
+    barriers = check_clean(program, launches[0])
+    if sanitizer == "thread":
+        check_controls(program, launches[0], barriers)
+
+
+@pytest.mark.long
 def test_short_arrays_are_reported(monkeypatch, tmp_path):
-    launch = launches_of("manual", monkeypatch, small())[-1]
+    launch = adjoint_of(launches_of("manual", monkeypatch, small()))
     program = build(launch, "address", tmp_path)
     for which in range(len(launch.memory)):
         memory = [array[:-4] if i == which else array for i, array in enumerate(launch.memory)]

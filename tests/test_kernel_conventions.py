@@ -65,10 +65,11 @@ def test_what_is_written_is_named_so(lines, kernel):
 
 @pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
 def test_order_of_parameters(lines, kernel):
-    """``first`` (of a slice; blocks have none), inputs, a line ``# out``, outputs."""
+    """``first`` (of a slice; blocks have a tile or a group), inputs, a line ``# out``, outputs."""
     names = parameters(kernel)
     assert "first" not in names[1:]
-    assert "first" in names or "tile" in ast.unparse(kernel.body[0]), "no index of the launch"
+    begins = ast.unparse(kernel.body[0])
+    assert "first" in names or begins.startswith(("tile, ", "group, ")), "no index of the launch"
     outputs = [parameter for parameter in kernel.args.args if parameter.arg.endswith("_out")]
     assert names[len(names) - len(outputs) :] == [parameter.arg for parameter in outputs]
     if outputs:

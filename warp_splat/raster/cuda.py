@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import torch
 import warp as wp
-from torch.nn.functional import embedding_bag
 
 from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
+from warp_splat.kernels.cuda.gather import GradientsView, make_gather
 from warp_splat.kernels.cuda.taped import make_walk_block
+from warp_splat.kernels.cuda.warps import WARP
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.bin import room_for_states
 from warp_splat.raster.data import Bins, Pixels, Walk, alphas_of, limits_of, variant_of
-from warp_splat.runtime.launch import launch_blocks, view
+from warp_splat.runtime.launch import launch_blocks, pack_struct, view
 
 THREADS = TILE * TILE
 
@@ -79,14 +82,14 @@ def spread_upstream(bins: Bins, options: RasterOptions, background, final, count
 
 def gather(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
     """See :func:`warp_splat.raster.cpu.gather`; splats are all Gaussians, nearest first."""
-    grads, gaussians = grads or bins.new_gradients(slots), wp.to_torch(bins.gaussians)
-    rows = embedding_bag(bins.places, slots, bins.place_begins, mode="sum")
-    first = 0
-    for grad in grads:
-        last = first + grad.shape[1]
-        if last <= slots.shape[1]:
-            grad[gaussians] = rows[:, first:last]
-        first = last
+    grads = grads or bins.new_gradients(slots)
+    ends = accumulate(grad.shape[1] for grad in grads)
+    tables = [grad for grad, end in zip(grads, ends, strict=True) if end <= slots.shape[1]]  # no depths, maybe
+    filled = [*tables, *[slots.new_empty(0, 0)] * (len(GradientsView.vars) - len(tables))]
+    tables_out = pack_struct(GradientsView, **dict(zip(GradientsView.vars, filled, strict=True)))
+    inputs = [bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32), _float(slots)]
+    kernel, warps = make_gather(tuple(table.shape[1] for table in tables)), -(-len(bins.place_begins) // WARP)
+    launch_blocks(kernel, warps, inputs, [tables_out], slots.device)
     return [grad.squeeze(1) for grad in grads]
 
 
