@@ -29,7 +29,6 @@ CONSTANT = {
     "rounded_up": "whole numbers",
     "rounded_down": "whole numbers",
     "turn": "nobody asks for the camera's rotation",
-    "still": "the coefficients of a lens alone are asked for",
     "largest": "chooses a factor that normalization takes out again",
     "support": "extents choose tiles",
     "covers_pixel": "masks",
@@ -47,7 +46,7 @@ CONSTANT = {
 #: differences of the image in test_gradcheck, in every mode.
 OF_A_LOOP = {"front_of", "front_of_kept", "behind_of", "spread", "collect", "read", "step", "geometry"}
 #: In tests of their own, below; the activations' in test_threads.
-ALONE = {"alpha_of", "alpha_blend", "exp", "logistic"}
+ALONE = {"alpha_of", "alpha_blend", "everywhere", "exp", "logistic"}
 LOW, HIGH = 0.3, 2.0  # of the numbers that pieces are tried with
 
 
@@ -179,6 +178,27 @@ def test_against_differences(name, lanes):
         nudge = 1e-6 * (np.arange(3) == index)[:, None, None]
         slope = (truth(*(given + nudge)) - truth(*(given - nudge))) / 2e-6
         np.testing.assert_allclose(array.grad.numpy().squeeze(), slope.squeeze(), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("lanes", [1, simd.LANES])
+def test_a_number_everywhere_gets_the_sum_of_what_is_finite(lanes):
+    number = simd.TYPES[lanes].number
+
+    @wp.kernel(module="unique")
+    def evaluate(x: wp.array[float], y: wp.array[number], values_out: wp.array[number]):
+        i = wp.tid()
+        values_out[i] = simd.times(simd.everywhere(x[i], y[i]), y[i])
+
+    weights = np.random.default_rng(0).uniform(LOW, HIGH, (3, lanes)).astype(np.float32)
+    weights[1, lanes // 2], weights[2, 0] = np.inf, np.nan
+    kept = {"device": "cpu", "requires_grad": True}
+    x, y = wp.array([2.0, 3.0, 4.0], dtype=float, **kept), wp.array(weights.squeeze(), dtype=number, **kept)
+    values = wp.zeros(3, dtype=number, **kept)
+    with wp.Tape() as tape:
+        wp.launch(evaluate, 3, [x, y], [values], device="cpu")
+    tape.backward(grads={values: wp.full_like(values, number(1.0))})
+    np.testing.assert_array_equal(values.numpy().reshape(3, lanes), weights * x.numpy()[:, None])
+    np.testing.assert_allclose(x.grad.numpy(), np.where(np.isfinite(weights), weights, 0).sum(1), rtol=1e-6)
 
 
 def test_opacity_against_central_differences():

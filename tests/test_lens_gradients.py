@@ -180,16 +180,25 @@ def test_any_number_of_gaussians(count):
     assert torch.equal(*found) and bool(found[0].any()) == (count > 0)
 
 
-def test_nothing_else_changes():
+@pytest.mark.parametrize(
+    ("name", "projection"),
+    [
+        ("opencv", "affine"),
+        pytest.param("fisheye", "affine", marks=pytest.mark.slow),
+        pytest.param("opencv", "unscented", marks=LONG),
+        pytest.param("fisheye", "unscented", marks=LONG),
+    ],
+)
+def test_nothing_else_changes(name, projection):
     """Image and gradients of the Gaussians, bit for bit; nor is anything learned that wants no gradient."""
-    found = []
+    found, options = [], RasterOptions(depth=True, antialiasing=True, projection=projection)
     for learned in (False, True):
-        scene = SCENES["opencv"]()
+        scene = SCENES[name]()
         leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
         coefficients = torch.tensor(scene.camera.lens.coefficients, requires_grad=learned)
         camera = CameraParameters(scene.camera, coefficients=coefficients)
-        out = rasterize(*leaves, camera, scene.background)
-        out.image.square().sum().backward()
+        out = rasterize(*leaves, camera, scene.background, options=options)
+        (out.image.square().sum() + out.depth.square().sum()).backward()
         assert (coefficients.grad is not None) == learned
         tensors = [out.image.detach(), *(leaf.grad for leaf in leaves), camera.twist.grad, camera.intrinsics.grad]
         found.append(tensors)

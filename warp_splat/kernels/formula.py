@@ -42,7 +42,7 @@ class Notes:
 
     def element(self, code: str) -> Number:
         """A number of an array of the kernel, which gets a gradient."""
-        return Number(self, self.note("element", code))
+        return Number(self, self.note("everywhere", code))
 
     def product(self, a: Name, b: Name) -> Name:
         """Of what may be zero or one."""
@@ -83,8 +83,8 @@ class Notes:
                     (other,) = (a for a in operands if a != product)
                     written = [line for line in written if not line.startswith(f"{product} ")]
                     operation, operands = "fma", [*steps[product][1:], other]
-            operands += [like] if operation == "fill" else []
-            code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}", "element": "{}"}.get(operation)
+            operands += [like] if operation in ("fill", "everywhere") else []
+            code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}"}.get(operation)
             code = code.format(*operands) if code else f"{operation}({', '.join(operands)})"
             written.append(f"{name} = {code}")
         return written

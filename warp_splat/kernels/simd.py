@@ -88,6 +88,29 @@ def fill(value: float, like: vec16) -> vec16: ...
 
 
 @wp.func
+def everywhere(value: float, like: float):
+    """``value`` in every lane, which gets the sum of the lanes' gradients that are finite, in pairs."""
+    return value
+
+
+@wp.func_grad(everywhere)
+def adj_everywhere(value: float, like: float, adj_ret: float):
+    wp.adjoint[value] += wp.where(adj_ret * 0.0 == 0.0, adj_ret, 0.0)
+
+
+@wp.func_native(
+    *_vectors(
+        "V{} + value",
+        "V sums = adj_ret * 0.0f == V{} ? adj_ret : V{}; "
+        f"for (int half = {LANES // 2}; half; half /= 2) "
+        "for (int lane = 0; lane < half; lane++) sums[lane] += sums[lane + half]; "
+        "adj_value += sums[0];",
+    )
+)
+def everywhere(value: float, like: vec16) -> vec16: ...
+
+
+@wp.func
 def times(a: float, b: float):
     return a * b
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, pose_gradient, twist_gradient
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.raster.lens_gradient import coefficients_gradient
+from warp_splat.raster.lens_gradient import bent_groups, coefficients_gradient
 from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
 from warp_splat.runtime.launch import filled_up, launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
@@ -106,11 +107,9 @@ def project(
     return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, bend, driver, dropped or Dropped()))
 
 
-def _project_geometry(
-    cam: CameraView,
-    kernel: wp.Kernel,
+def _in_groups(
+    launch_groups: Callable[..., list[torch.Tensor]],
     lanes: int,
-    motion: np.ndarray | None,
     inputs: Sequence[torch.Tensor],
     outputs: Sequence[torch.Tensor],
     adj_inputs: Sequence[torch.Tensor] = (),
@@ -121,32 +120,33 @@ def _project_geometry(
     In groups of ``lanes``: the last ones are filled up with zeros, which are no Gaussians.
 
     Args:
-        cam: camera.
-        kernel: of the projection.
+        launch_groups: takes the other arguments of a multiple of ``lanes``.
         lanes: Gaussians that a kernel takes at once.
-        motion: of the camera, if it has a rolling shutter.
         inputs: means, quats, scales, opacities.
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
         adj_inputs: of all inputs.
         adj_outputs: of all outputs; those of the last two are not read.
 
     Returns:
-        With adjoints and a motion, what holds its gradient (:func:`.moving.motion_gradient`).
+        What ``launch_groups`` did, of all groups.
     """
     count = len(outputs[-1])
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
-    turns = _project_groups(kernel, cam, lanes, motion, *([tensor[:whole] for tensor in table] for table in tables))
+    found = launch_groups(*([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
         last = [[filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
-        turns += _project_groups(kernel, cam, lanes, motion, *last)
+        found += launch_groups(*last)
         for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
             tensor[whole:] = group[: count - whole]
-    return turns
+    return found
 
 
 def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj_outputs) -> list[torch.Tensor]:
-    """See :func:`_project_geometry`; N is a multiple of ``lanes``. Likewise."""
+    """See :func:`_in_groups`; N is a multiple of ``lanes``. ``motion``: of the camera with a rolling shutter.
+
+    With adjoints and a motion, what holds its gradient (:func:`.moving.motion_gradient`); else nothing.
+    """
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
 
@@ -203,7 +203,8 @@ class Project(torch.autograd.Function):
         )
         set_all(0, *splats[:-1])
         set_all(int(UNSEEN), splats.radii)
-        _project_geometry(cam, kernel, lanes, motion_of(camera), _shapes(gaussians), _geometry(splats))
+        launch_groups = partial(_project_groups, kernel, cam, lanes, motion_of(camera))
+        _in_groups(launch_groups, lanes, _shapes(gaussians), _geometry(splats))
         given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
         ctx.save_for_backward(*gaussians, *splats, *learned)
@@ -235,12 +236,12 @@ class Project(torch.autograd.Function):
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
             adj_inputs = _shapes(adj._replace(means=adj_placed))
-            motion = motion_of(ctx.camera)
-            turns = _project_geometry(
-                ctx.cam, ctx.kernel, lanes, motion, _shapes(given), outputs, adj_inputs, adj_outputs
-            )
+            launch_groups = partial(_project_groups, ctx.kernel, ctx.cam, lanes, motion_of(ctx.camera))
+            if ctx.bend:
+                launch_groups = partial(bent_groups, ctx.bend, ctx.cam, lanes, ctx.camera.lens)
+            found = _in_groups(launch_groups, lanes, _shapes(given), outputs, adj_inputs, adj_outputs)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
-            adj_motion = motion_gradient(turns, lanes, wants_pose or wants_intrinsics)
+            adj_motion = motion_gradient([] if ctx.bend else found, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
                 adj_means += adj_placed
                 pose = pose_gradient(ctx.camera, ctx.cam, lanes, given, adj, adj_placed)
@@ -252,15 +253,13 @@ class Project(torch.autograd.Function):
                     ctx.camera, ctx.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3]
                 )
             if ctx.bend:
-                adj_coefficients = coefficients_gradient(
-                    ctx.camera, ctx.cam, ctx.bend, lanes, coefficients, given, splats, adj_splats
-                )
+                adj_coefficients = coefficients_gradient(ctx.camera.lens, found, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
-                found = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
-                launch(quarantine, count, [seen], found, device=device)
+                outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
+                launch(quarantine, count, [seen], outputs, device=device)
                 ctx.dropped.gaussian_count += torch.count_nonzero(bad)
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
         learned = adj_twist, adj_intrinsics, adj_last, adj_coefficients

@@ -15,7 +15,7 @@ import warp as wp
 from warp_splat.errors import InputError
 
 ARGUMENTS = {"lens": 4, "outline": 17}
-COEFFICIENTS = ("coefficients: wp.array2d[number]", "g: int")  # what learned ones take besides: variables of the kernel
+COEFFICIENTS = ("coefficients: wp.array2d[float]", "g: int")  # what learned ones take besides: variables of the kernel
 
 
 class Projection(NamedTuple):

@@ -1,6 +1,9 @@
-"""The gradient of a lens's coefficients: the image of each Gaussian once more, with coefficients of its own.
+"""The adjoint of the projection where a lens's coefficients are learned: it finds their gradients beside all others.
 
-All Gaussians have the same ones. What Warp's adjoint finds for each is summed outside. Nothing reads what it writes.
+Each group of Gaussians has coefficients of its own here, so that no two write into one place. All are the same ones;
+what Warp's adjoint finds for each is summed outside. Only the adjoint is ever launched, after
+:func:`.shared.make_project`, and what it finds for the Gaussians is what that kernel's adjoint does, bit for bit. A
+kernel for the coefficients alone, as first tried, took as long again as projection and adjoint.
 """
 
 import functools
@@ -14,7 +17,7 @@ from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.project.image import make_image, parts_of_image
 from warp_splat.kernels.project.pieces import make_pieces
-from warp_splat.kernels.simd import TYPES, fill, fma, inverse, less, pick, real, some, times
+from warp_splat.kernels.simd import TYPES, fill, fma, inverse, less, pick, real, root, some, times
 
 
 @functools.cache
@@ -27,20 +30,11 @@ def make_bend(projection: Projection, lanes: int) -> wp.Kernel:
     parts = {"offset": offset, "rotation": rotation, "image": image}
     parts |= {"turned_or_not": turned_or_not, "sized_or_one": sized_or_one} | parts_of_image(projection, lanes)
 
-    @wp.func
-    def still(x: number):
-        """A number whose gradient nobody asks for here: the compiler leaves out what leads to it."""
-        return x
-
-    @wp.func_grad(still)
-    def adj_still(x: number, adj_ret: number):
-        pass
-
     @kernel_of_parts(DIFFERENTIABLE, **parts)
     def bend(
         first: int,  # group of Gaussians of this slice
         camera: CameraView,
-        coefficients: wp.array2d[number],  # [N / lanes, K] of the lens's formula
+        coefficients: wp.array2d[float],  # [N / lanes, K] of the lens's formula
         means: wp.array[row3],  # [N / lanes] world
         quats: wp.array[row4],  # [N / lanes] wxyz, any norm
         scales: wp.array[row3],  # [N / lanes] world
@@ -50,10 +44,12 @@ def make_bend(projection: Projection, lanes: int) -> wp.Kernel:
         means2d_out: wp.array[row2],  # [N / lanes] px
         conics_out: wp.array[row3],  # [N / lanes] 1/px^2
         opacities_out: wp.array[number],  # [N / lanes] after antialiasing
+        depths_out: wp.array[number],  # [N / lanes]
     ):
         g = first + wp.tid()
-        opacity = still(opacities[g])
+        opacity = opacities[g]
         zero = fill(0.0, opacity)
+        one = fill(1.0, opacity)
         here = less(zero, real(radii[g]))
         if not some(here):
             return
@@ -61,19 +57,21 @@ def make_bend(projection: Projection, lanes: int) -> wp.Kernel:
         qw, qx, qy, qz = columns(quats[g])
         sx, sy, sz = columns(scales[g])
         size = largest(qw, qx, qy, qz)
-        mx, my, mz = still(mx), still(my), still(mz)
-        qw, qx, qy, qz = still(qw), still(qx), still(qy), still(qz)
-        sx, sy, sz = still(sx), still(sy), still(sz)
         ox, oy, oz = offset(camera, here, mx, my, mz)
+        r20 = turn(camera, 2, 0, one)
+        r21 = turn(camera, 2, 1, one)
+        r22 = turn(camera, 2, 2, one)
+        depth = fma(r20, ox, fma(r21, oy, times(r22, oz)))
+        if wp.static(projection.wide):
+            depth = root(fma(ox, ox, fma(oy, oy, times(oz, oz))))
+        z = pick(here, depth, one)
+        if wp.static(projection.wide):
+            z = fma(r20, ox, fma(r21, oy, times(r22, oz)))
         qw, qx, qy, qz, size = turned_or_not(here, qw, qx, qy, qz, size)
         m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotation(qw, qx, qy, qz, size)
         sx, sy, sz = sized_or_one(here, sx, sy, sz)
-        one = fill(1.0, opacity)
         x = fma(turn(camera, 0, 0, one), ox, fma(turn(camera, 0, 1, one), oy, times(turn(camera, 0, 2, one), oz)))
         y = fma(turn(camera, 1, 0, one), ox, fma(turn(camera, 1, 1, one), oy, times(turn(camera, 1, 2, one), oz)))
-        z = fma(turn(camera, 2, 0, one), ox, fma(turn(camera, 2, 1, one), oy, times(turn(camera, 2, 2, one), oz)))
-        if wp.static(not projection.wide):
-            z = pick(here, z, one)
         px, py, xx, xy, yy, det, opacity, here = image(
             camera, x, y, z, m00, m01, m02, m10, m11, m12, m20, m21, m22, sx, sy, sz, opacity, here
         )
@@ -85,5 +83,6 @@ def make_bend(projection: Projection, lanes: int) -> wp.Kernel:
             pick(here, times(xx, per_det), zero),
         )
         opacities_out[g] = pick(here, opacity, zero)
+        depths_out[g] = pick(here, depth, zero)
 
     return bend
