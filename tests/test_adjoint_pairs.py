@@ -29,6 +29,7 @@ CONSTANT = {
     "rounded_up": "whole numbers",
     "rounded_down": "whole numbers",
     "turn": "nobody asks for the camera's rotation",
+    "of_lens": "where the lens is learned, its numbers are not the camera's",
     "largest": "chooses a factor that normalization takes out again",
     "support": "extents choose tiles",
     "covers_pixel": "masks",

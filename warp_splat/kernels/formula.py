@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_splat.kernels import simd
 from warp_splat.kernels.angle import angle
-from warp_splat.kernels.project.camera_view import CameraView, turn
+from warp_splat.kernels.project.camera_view import CameraView, of_lens, turn
 
 Name = str | None  # of a variable of the function; None: zero
 
@@ -39,6 +39,10 @@ class Notes:
     def given(self, code: str) -> Number:
         """A number of the camera."""
         return Number(self, self.note("fill", code))
+
+    def of_lens(self, index: int) -> Number:
+        """A number of the camera's lens."""
+        return Number(self, self.note("of_lens", "camera", str(index)))
 
     def element(self, code: str) -> Number:
         """A number of an array of the kernel, which gets a gradient."""
@@ -83,7 +87,7 @@ class Notes:
                     (other,) = (a for a in operands if a != product)
                     written = [line for line in written if not line.startswith(f"{product} ")]
                     operation, operands = "fma", [*steps[product][1:], other]
-            operands += [like] if operation in ("fill", "everywhere") else []
+            operands += [like] if operation in ("fill", "of_lens", "everywhere") else []
             code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}"}.get(operation)
             code = code.format(*operands) if code else f"{operation}({', '.join(operands)})"
             written.append(f"{name} = {code}")
@@ -211,7 +215,7 @@ def write_function(
     source = "\n    ".join([head, *body]) + "\n"
     path = f"<{name} {zlib.crc32(source.encode())} of {lanes}>"
     linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
-    known = {**vars(simd), "angle": angle, "CameraView": CameraView, "turn": turn, "number": simd.TYPES[lanes].number}
-
+    known = {**vars(simd), "angle": angle, "CameraView": CameraView, "of_lens": of_lens, "turn": turn}
+    known["number"] = simd.TYPES[lanes].number
     exec(compile(source, path, "exec"), known)
     return wp.func(known[name])

@@ -44,3 +44,24 @@ def adj_turn(camera: CameraView, row: int, column: int, like: float, adj_ret: fl
 @wp.func_grad(turn)
 def adj_turn(camera: CameraView, row: int, column: int, like: vec16, adj_ret: vec16):
     pass
+
+
+@wp.func
+def of_lens(camera: CameraView, index: int, like: float):
+    """A number of the camera's lens, likewise."""
+    return fill(camera.lens[index], like)
+
+
+@wp.func
+def of_lens(camera: CameraView, index: int, like: vec16):
+    return fill(camera.lens[index], like)
+
+
+@wp.func_grad(of_lens)
+def adj_of_lens(camera: CameraView, index: int, like: float, adj_ret: float):
+    pass
+
+
+@wp.func_grad(of_lens)
+def adj_of_lens(camera: CameraView, index: int, like: vec16, adj_ret: vec16):
+    pass

@@ -67,7 +67,7 @@ def bent(
 
     And whether it is seen.
     """
-    limit, one = notes.given(f"camera.lens[{LIMIT}]"), notes.given("1.0")
+    limit, one = notes.of_lens(LIMIT), notes.given("1.0")
     seen, excess = one, one
     if family.wide:
         seen = limit * np.sqrt(x * x + y * y + z * z) < z
@@ -80,8 +80,8 @@ def bent(
     variables = [
         Number(notes, number.name, _unit(axis, one.name) if linear else ()) for axis, number in enumerate((x, y, z))
     ]
-    read, code = (notes.element, "coefficients[g, {}]") if learned else (notes.given, "camera.lens[{}]")
-    coefficients = [read(code.format(index)) for index in range(family.count)]
+    indices = range(family.count)
+    coefficients = [notes.element(f"coefficients[g, {i}]") if learned else notes.of_lens(i) for i in indices]
     return family.formula(coefficients, *variables), excess, seen
 
 

@@ -92,7 +92,7 @@ def _held_in_view(notes: Notes, family: Family, x: Number, y: Number, z: Number)
     if not family.wide:
         near = notes.given("camera.near")
         return np.where(z < near, near, z)
-    limit, across = notes.given(f"camera.lens[{LIMIT}]"), x * x + y * y
+    limit, across = notes.of_lens(LIMIT), x * x + y * y
     inside = limit + EDGE
     unseen = z < inside * np.sqrt(across + z * z)
     return np.where(unseen, inside / np.sqrt(1.0 - inside * inside) * np.sqrt(across), z)
