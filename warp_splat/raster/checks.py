@@ -194,10 +194,10 @@ def check_range(name: str, tensor: torch.Tensor, outside: bool, wanted: str) -> 
 
 
 def _dense(tensor: torch.Tensor) -> torch.Tensor:
-    """Kernels follow strides between Gaussians and coefficients, but not within a vector."""
+    """Row after row, as kernels read it; here, so that several views share the copy."""
     if tensor.numel() == 0:  # which torch calls contiguous, whatever its strides
         return tensor.clone(memory_format=torch.contiguous_format)
-    return tensor if tensor.dim() < 2 or tensor.stride(-1) == 1 else tensor.contiguous()
+    return tensor.contiguous()
 
 
 def _check_finite(name: str, tensor: torch.Tensor) -> None:
