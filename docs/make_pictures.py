@@ -28,6 +28,7 @@ from warp_splat.formats.png import load_png  # noqa: E402
 
 PATIENCE = 180_000  # ms, on a machine without a GPU that is busy
 SHOWN = 6  # frames of each video
+VIEW = 6  # of those held out: its tint shows most
 
 
 def sheet(model: str) -> Path:
@@ -89,6 +90,14 @@ def viewer(model: str) -> Path:
     return path
 
 
+def capture(plain: str, better: str) -> Path:
+    """A held-out view by two models of one scene, between them its photograph."""
+    folders = [Path(model) / "test" / f"ours_{find_iteration(model)}" for model in (plain, better)]
+    shown = (folders[0] / "renders", folders[0] / "gt", folders[1] / "renders")
+    pictures = [load_png(folder / f"{VIEW:05d}.png") for folder in shown]
+    return _save(np.concatenate(pictures, axis=1), "capture.jpg")
+
+
 def _save(picture: np.ndarray, name: str) -> Path:
     """As a JPEG file of about the width of a page."""
     height, width, _ = picture.shape
@@ -104,6 +113,7 @@ PICTURES = {
     "videos": videos,
     "page": page,
     "viewer": viewer,
+    "capture": capture,
     "renderer": partial(renderer_pictures.draw, images=IMAGES),
 }
 
@@ -111,6 +121,6 @@ PICTURES = {
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("picture", choices=PICTURES)
-    parser.add_argument("-m", dest="model", required=True, help="folder of a trained model")
+    parser.add_argument("-m", dest="models", nargs="+", required=True, help="folder of a trained model; capture: two")
     chosen = parser.parse_args()
-    print(PICTURES[chosen.picture](chosen.model))
+    print(PICTURES[chosen.picture](*chosen.models))
