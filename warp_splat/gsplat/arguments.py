@@ -21,13 +21,19 @@ NOT_CARRIED = {
     "covars": "give quats and scales",
     "with_eval3d": "leave it False: Gaussians are evaluated on the image",
     "ftheta_coeffs": "undistort the photographs",
-    "viewmats_rs": "leave it None: the shutter is global; warp_splat.Camera.rolling has a rolling one",
 }
 #: Coefficients of lenses: how many there are, by the camera's model.
 COEFFICIENTS = {
     "radial_coeffs": {"pinhole": 6, "fisheye": 4},
     "tangential_coeffs": {"pinhole": 2},
     "thin_prism_coeffs": {"pinhole": 4},
+}
+#: Of rolling shutters: along which axis of the image they read, and whether from its end.
+SHUTTERS = {
+    "ROLLING_TOP_TO_BOTTOM": (1, False),
+    "ROLLING_LEFT_TO_RIGHT": (0, False),
+    "ROLLING_BOTTOM_TO_TOP": (1, True),
+    "ROLLING_RIGHT_TO_LEFT": (0, True),
 }
 
 
@@ -59,12 +65,14 @@ class Request(NamedTuple):
     radial_coeffs: torch.Tensor | None  # [S, C, 6 or 4]
     tangential_coeffs: torch.Tensor | None  # [S, C, 2]
     thin_prism_coeffs: torch.Tensor | None  # [S, C, 4]
+    rolling_shutter: str  # one of SHUTTERS; empty: all rows at once
+    viewmats_rs: torch.Tensor | None  # [S, C, 4, 4], of the last row; those above of the first
     batch: tuple[int, ...] = ()  # the scenes' dimensions
 
 
 def check_request(request: Request, given: dict[str, Any]) -> Request:
     """The request with flat scenes. Raises InputError for the first argument that is not as it should be."""
-    _check_choices(request, given)
+    shutter = _check_choices(request, given)
     means, viewmats = request.means, request.viewmats
     if not isinstance(means, torch.Tensor) or means.dim() < 2:
         raise InputError(f"means: expected a tensor [..., N, 3], got {_found(means)}.")
@@ -74,6 +82,7 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
     scenes = math.prod(batch)
     shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
     shapes |= {"viewmats": (cameras, 4, 4), "Ks": (cameras, 3, 3)}
+    shapes |= {"viewmats_rs": (cameras, 4, 4)} if shutter else {}
     flat = {}
     for name, shape in shapes.items():
         _check_tensor(name, given[name], (*batch, *shape), means.device)
@@ -82,8 +91,9 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
     check_range("scales", scales, bool((scales < 0).any()), "positive values (activated, not their logarithm)")
     outside = bool(((opacities < 0) | (opacities > 1)).any())
     check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
-    if not bool(torch.linalg.det(viewmats.detach()).all()):
-        raise InputError("viewmats: expected matrices from world to camera, got one that has no inverse.")
+    for name in ("viewmats", *(["viewmats_rs"] if shutter else [])):
+        if not bool(torch.linalg.det(given[name].detach()).all()):
+            raise InputError(f"{name}: expected matrices from world to camera, got one that has no inverse.")
     colors = request.colors
     _check_tensor("colors", colors, None, means.device)
     tail = 1 if request.sh_degree is None else 2
@@ -112,17 +122,22 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
             shape = (cameras, counts[request.camera_model])
             _check_tensor(name, given[name], (*batch, *shape), means.device)
             flat[name] = given[name].reshape(scenes, *shape)
-    return request._replace(**flat, batch=batch)
+    return request._replace(**flat, rolling_shutter=shutter, batch=batch)
 
 
-def _check_choices(request: Request, given: dict[str, Any]) -> None:
-    """Raise InputError for what is not carried, or out of range."""
+def _check_choices(request: Request, given: dict[str, Any]) -> str:
+    """The shutter's name, if it rolls. Raises InputError for what is not carried, or out of range."""
     for name, instead in NOT_CARRIED.items():
         if given[name] is not None and given[name] is not False:
             raise InputError(f"{name}: warp_splat.gsplat does not carry it; {instead}.")
-    shutter = given["rolling_shutter"]
-    if shutter is not None and getattr(shutter, "name", "") != "GLOBAL":
-        raise InputError(f"rolling_shutter: warp_splat.gsplat does not carry {shutter!r:.60}; the shutter is global.")
+    shutter = "GLOBAL" if given["rolling_shutter"] is None else getattr(given["rolling_shutter"], "name", None)
+    if shutter not in ("GLOBAL", *SHUTTERS):
+        wanted = f"None or gsplat's RollingShutterType of {', '.join(SHUTTERS)}"
+        raise InputError(f"rolling_shutter: expected {wanted}, got {given['rolling_shutter']!r:.60}.")
+    if shutter == "GLOBAL" and given["viewmats_rs"] is not None:
+        raise InputError("viewmats_rs: expected None without a rolling_shutter, got some.")
+    if shutter != "GLOBAL" and not (given["with_ut"] and given["viewmats_rs"] is not None):
+        raise InputError(f"rolling_shutter: expected with_ut=True and viewmats_rs with {shutter}; give both.")
     choices = {"render_mode": RENDER_MODES, "camera_model": CAMERA_MODELS}
     choices["rasterize_mode"] = ("classic", "antialiased")
     for name, values in choices.items():
@@ -148,6 +163,7 @@ def _check_choices(request: Request, given: dict[str, Any]) -> None:
     degree = request.sh_degree
     if isinstance(degree, bool) or not is_one_of(degree, (None, *range(5))):
         raise InputError(f"sh_degree: expected 0 to 4 or None, got {degree!r:.60}.")
+    return shutter.removeprefix("GLOBAL")
 
 
 def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device: torch.device) -> None:

@@ -89,8 +89,8 @@ def rasterization(
         tangential_coeffs: OpenCV's p1 and p2, [..., C, 2]; of a pinhole camera.
         thin_prism_coeffs: OpenCV's s1 to s4, [..., C, 4]; of a pinhole camera.
         ftheta_coeffs: must be None.
-        rolling_shutter: None, or gsplat's ``RollingShutterType.GLOBAL``.
-        viewmats_rs: must be None.
+        rolling_shutter: one of gsplat's ``RollingShutterType``; None: all rows at once. Only with ``with_ut``.
+        viewmats_rs: where the camera is at the end, [..., C, 4, 4]; ``viewmats`` are then those of the start.
 
     Returns:
         Images [..., C, H, W, D, and 1 more with a depth], alphas [..., C, H, W, 1], and a dictionary as gsplat's.

@@ -13,6 +13,8 @@ def colors_of(request: Request, seen: Seen) -> torch.Tensor:
     if request.sh_degree is None or request.render_mode in ("D", "ED"):
         return request.colors
     centers = torch.linalg.inv(request.viewmats)[..., :3, 3]
+    if request.viewmats_rs is not None:
+        centers = 0.5 * (centers + torch.linalg.inv(request.viewmats_rs)[..., :3, 3])
     rays = torch.nn.functional.normalize(request.means[:, None] - centers[:, :, None], dim=-1)
     basis = torch.stack(_basis(*rays.unbind(-1), request.sh_degree), -1)
     colors = (basis[..., None] * request.colors[..., : basis.shape[-1], :]).sum(-2)

@@ -11,6 +11,7 @@ import torch
 
 from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
 from warp_splat.gsplat.arguments import Request
+from warp_splat.gsplat.shutters import moved
 from warp_splat.gsplat.sigma_points import TINY, see_points
 from warp_splat.gsplat.turns import rotations, rows_turned
 
@@ -31,6 +32,9 @@ def see(request: Request) -> Seen:
     """Project: linearized at the mean (Zwicker et al. 2001), W' = J V R S, covariance W' W''; or :func:`see_points`."""
     turn, shift = request.viewmats[..., :3, :3], request.viewmats[..., :3, 3]
     points = rows_turned(request.means[:, None], turn.mT[:, :, None]) + shift[:, :, None]
+    if request.rolling_shutter:
+        half = torch.full_like(points[..., 0], 0.5)
+        points = moved(request, request.means.double()[:, None], half.double()).to(points.dtype)
     z = points[..., 2]
     ahead = (z > request.near_plane) & (z < request.far_plane) & (request.quats != 0).any(-1)[:, None]
     axes = rotations(request.quats) * request.scales[:, :, None]

@@ -10,11 +10,13 @@ images from that of the mean, w = 1 / (6 alpha^2) and the shift m = w sum e_i:
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import torch
 
 from warp_splat.gsplat.arguments import Request
+from warp_splat.gsplat.shutters import Points, see_rolling
 from warp_splat.gsplat.turns import rows_turned
 from warp_splat.lenses.formulas import perspective, radial_of
 
@@ -22,8 +24,6 @@ ALPHA, BETA = 0.1, 2.0  # of the transform; kappa is 0
 MARGIN = 0.1  # of the image's size: a point so far outside still counts as seen
 LEAST_RADIAL = 0.8  # where a lens draws points nearer to the axis than this share, it is about to fold
 TINY = 1e-14  # squared distance from the axis, below which a fisheye's formula takes it for this
-
-Points = tuple[torch.Tensor, torch.Tensor]  # images of points [S, C, N, 7, 2] px, and which of them count as seen
 
 
 def see_points(request: Request, axes: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -33,11 +33,12 @@ def see_points(request: Request, axes: torch.Tensor) -> tuple[torch.Tensor, ...]
     """
     means, offsets = request.means.double()[:, :, None], ALPHA * 3**0.5 * axes.double().mT
     points = torch.cat([means, means + offsets, means - offsets], 2)[:, None]
-    viewmats = request.viewmats.double()[:, :, None, None]
-    points = rows_turned(points, viewmats[..., :3, :3].mT) + viewmats[..., :3, 3]
-    places, seen = (_fisheye if request.camera_model == "fisheye" else _pinhole)(request, points)
-    low = -MARGIN * places.new_tensor([request.width, request.height])
-    seen = seen & ((places >= low) & (places < -low / MARGIN - low)).all(-1)
+    look = partial(_look, request)
+    if request.rolling_shutter:
+        places, seen = see_rolling(request, points, look)
+    else:
+        viewmats = request.viewmats.double()[:, :, None, None]
+        places, seen = look(rows_turned(points, viewmats[..., :3, :3].mT) + viewmats[..., :3, 3])
     off = places[..., 1:, :] - places[..., :1, :]
     weight = 1 / (6 * ALPHA**2)
     moved = weight * off.sum(-2)
@@ -48,6 +49,13 @@ def see_points(request: Request, axes: torch.Tensor) -> tuple[torch.Tensor, ...]
     )
     found = (places[..., 0, :] + moved, xx, xy, yy, (xx * yy - xy * xy).clamp_min(0.0))
     return *(part.to(request.means.dtype) for part in found), seen.any(-1)
+
+
+def _look(request: Request, points: torch.Tensor) -> Points:
+    """Images of points in the camera; what falls far outside of the picture does not count as seen."""
+    places, seen = (_fisheye if request.camera_model == "fisheye" else _pinhole)(request, points)
+    low = -MARGIN * places.new_tensor([request.width, request.height])
+    return places, seen & ((places >= low) & (places < -low / MARGIN - low)).all(-1)
 
 
 def _numbers(request: Request, name: str, count: int) -> tuple[torch.Tensor, ...]:

@@ -68,7 +68,9 @@ def blend_beside(
         widths = [channel.shape[1] for channel in channels.values()]
         together = torch.cat(list(channels.values()), 1) if len(channels) > 1 else next(iter(channels.values()))
         together = with_copies(together, crossing)
-        found |= zip(channels, blend_channels(splats, together, blended).split(widths, 2), strict=True)
+        image = blend_channels(splats, together, blended)
+        parts = image.split(widths, 2) if len(widths) > 1 else [image]  # the adjoint of a split copies
+        found |= zip(channels, parts, strict=True)
     if options.strongest or options.median_depth:
         strongest = find_strongest(splats, blended)
         if options.strongest:
