@@ -10,7 +10,6 @@ import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
@@ -21,6 +20,7 @@ from step import synthetic
 
 from warp_splat import Camera, CameraParameters, Lens, RasterOptions, rasterize
 from warp_splat.compare import oracle, truth
+from warp_splat.compare.exact_camera import exact_camera
 from warp_splat.config import ADJOINTS, PROJECTIONS
 from warp_splat.evaluation.report import BLUE, ORANGE, new_panels, plain_axes, save_figure
 from warp_splat.runtime import launch, timers
@@ -34,10 +34,11 @@ SHOWN = {
     "share": ("focal length [share]", 1e-3),
 }
 HEADERS = ("projection", "adjoint", "rotation", "translation", "fx, fy", "cx, cy")
-COUNT, ROUNDS = 194_000, 30  # of the step whose price is measured
+COUNT, ROUNDS = 194_000, 30  # of the steps whose price is measured
 LEVELS = (1, 2, 4, 8, 16)  # px, boxes over which pictures are averaged before they are compared
 RATE, LAST_RATE = 1e-2, 1e-4  # of Adam: radians, meters, share of the focal length
 LENS = Lens("OPENCV", (0.12, -0.05, 0.004, -0.006))
+PRICED = {"pinhole": (None, "affine"), "OPENCV": (LENS, "affine"), "OPENCV, unscented": (LENS, "unscented")}
 LENS_UNITS = (0.1, 0.1, 0.01, 0.01)  # of its coefficients
 LENS_STEPS, LENS_WANTED = 30, 0.05  # px
 ANGLE, SHIFT, ZOOM = np.radians(5.0), 0.1, 1.05
@@ -131,13 +132,7 @@ def exact_gradient(options: RasterOptions, weight: torch.Tensor) -> tuple[torch.
     right = looking()
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     intrinsics = torch.tensor([right.fx, right.fy, right.cx, right.cy], dtype=torch.float64, requires_grad=True)
-    rotation, translation = torch.tensor(right.rotation), torch.tensor(right.translation)
-    fx, fy, cx, cy = intrinsics
-    camera = SimpleNamespace(
-        **{"width": SIZE, "height": SIZE, "fx": fx, "fy": fy, "cx": cx, "cy": cy},
-        rotation=rotation + torch.linalg.cross(twist[:3, None], rotation, dim=0),  # to first order, which is all
-        translation=translation + torch.linalg.cross(twist[:3], translation) + twist[3:],
-    )
+    camera = exact_camera(right, twist, intrinsics)
     gaussians = [tensor.double() for tensor in cube(0)]
     out = oracle.exact_render(*gaussians, camera, **truth.for_oracle(options))
     sure = ~out.fragile[..., None]
@@ -159,27 +154,34 @@ def error_rows(projection: str) -> list[list[str]]:
     return rows
 
 
-def measure_price() -> tuple[float, float]:
+def measure_price(trainer: Trainer, lens: Lens | None, projection: str) -> dict[str, float]:
     """Processor seconds of a training step, and what a camera that learns adds to its projection, both ways.
 
-    In turns, the least of each: what is added is less than the noise of a whole step.
+    In turns, the least of each: what is added is less than the noise of a whole step. Learned are pose and intrinsics,
+    and the coefficients of ``lens``, if there is one.
     """
-    trainer = synthetic(COUNT, 980, 545)
+    trainer.options = replace(trainer.options, projection=projection)
     step, through = steps_of(trainer), Trainer._through
 
-    def learning(self, name, value, *rest):
-        return CameraParameters(value) if name == "camera" else through(self, name, value, *rest)
+    def still(self, name, value, *rest):
+        return replace(value, lens=lens) if name == "camera" else through(self, name, value, *rest)
 
-    whole, projection = [], {through: [], learning: []}
+    def learning(self, name, value, *rest):
+        found = still(self, name, value, *rest)
+        coefficients = torch.tensor(lens.coefficients, requires_grad=True) if lens else None
+        return CameraParameters(found, coefficients=coefficients) if name == "camera" else found
+
+    whole, projecting = [], {still: [], learning: []}
     for _ in range(ROUNDS):
-        for change, seconds in projection.items():
+        for change, seconds in projecting.items():
             clock = patch.object(timers, "_now", time.process_time)
             with patch.object(Trainer, "_through", change), clock, timers.profile() as stages:
                 start = time.process_time()
                 step()
-                whole.append(time.process_time() - start)
+                if change is still:
+                    whole.append(time.process_time() - start)
                 seconds.append(stages["project"] + stages["adjoint of project"])
-    return min(whole), min(projection[learning]) - min(projection[through])
+    return {"step": min(whole), "added": min(projecting[learning]) - min(projecting[still])}
 
 
 def plot(runs: list[list[tuple[float, float, float]]], path: Path) -> None:
@@ -208,9 +210,10 @@ def main() -> None:
     lenses = [recover_lens(seed)[-1] for seed in range(SEEDS)]
     if max(lenses) > LENS_WANTED:
         raise SystemExit(f"A lens came back but for {max(lenses):.2g} px, expected at most {LENS_WANTED}: {lenses}.")
-    step, added = measure_price()
+    trainer = synthetic(COUNT, 980, 545)
+    prices = {name: measure_price(trainer, *changed) for name, changed in PRICED.items()}
     last = {name: [run[-1][column] for run in runs] for column, name in enumerate(SHOWN)}
-    data = {"last": last, "reached": reached, "lenses": lenses, "step": step, "added": added, "machine": machine()}
+    data = {"last": last, "reached": reached, "lenses": lenses, "prices": prices, "machine": machine()}
     note = f"Gradients of a random loss on the cube of seed 0 at {SIZE} x {SIZE} px, relative to those in float64."
     if arguments.out:
         plot(runs, arguments.out / "cameras.png")

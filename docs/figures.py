@@ -69,6 +69,18 @@ def footprint(camera: str, projection: str, size: str, key: str = "psnr", per: s
     return float(row[key]) / (float(row[per]) if per else 1.0)
 
 
+def off_by(*parameters: str) -> str:
+    """The largest error of these gradients in compare/cameras_gradients.csv."""
+    found = [float(row["error"]) for row in rows("cameras_gradients") if row["parameter"] in parameters]
+    return f"{max(found):.1e}".replace("e-0", "e-")
+
+
+def rolling_price() -> float:
+    """Projection and adjoint of a camera with a rolling shutter that learns, over those of one that does not."""
+    found = [row for row in rows("cameras_gradients") if "rolling" in row["camera"]]
+    return max(float(row["learned"]) / float(row["still"]) for row in found)
+
+
 def shutter(way: str, key: str) -> list[float]:
     """Figures of shutter.json, of one way to draw."""
     return [record[key] for record in data("shutter")["records"] if record["way"] == way]
@@ -261,3 +273,11 @@ def images_gained() -> float:
 
 #: Of cameras that find their way back: what it is called, and its unit in the one that is shown.
 CAMERA_ERRORS = {"degrees": 1, "meters": 1e3, "share": 100}
+
+#: How rows of the table of what is learned end, and what they are of.
+LEARNED = {
+    "with a rolling shutter the first row's": ("rotation", "translation"),
+    "but panoramas: their size says them": ("focal", "principal"),
+    "`affine` and `unscented`, every mode": ("coefficients",),
+    "projection and mode, with a rolling shutter": ("last_rotation", "last_translation"),
+}

@@ -253,7 +253,7 @@ def sentences() -> dict[str, list[tuple]]:
             ),
             (
                 "are off by {} at most, relative to float64, over all",
-                f"{max(float(row['error']) for row in f.rows('cameras_gradients')):.1e}".replace("e-0", "e-"),
+                f.off_by("gaussians"),
             ),
             (
                 "find the means to within {} px, one step to within {} px.",
@@ -262,11 +262,15 @@ def sentences() -> dict[str, list[tuple]]:
             ("the adjoint has {} registers, without spills", f.registers("project, rolling shutter")[0]),
             ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
             ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
+            *((f"{where} | {{}} |", f.off_by(*parts)) for where, parts in f.LEARNED.items()),
             (
-                "takes {} % longer with a camera that learns (one thread, {}).",
-                f.one(100 * f.data("cameras")["added"] / f.data("cameras")["step"]),
+                "px takes {} % longer with a camera that learns its pose, fx, fy, cx and cy. Through an OPENCV lens it "
+                "takes {} % longer if that learns all of them and its four coefficients, {} % by the unscented "
+                "transform (one thread, processor time, {}).",
+                *(f.one(100 * price["added"] / price["step"]) for price in f.data("cameras")["prices"].values()),
                 f.data("cameras")["machine"],
             ),
+            ("projection and adjoint take up to {} times as long if all is learned.", f.two(f.rolling_price())),
         ],
         "cuda.md": [
             ("the blend has {} registers and", f.registers("blend")[0]),

@@ -3,7 +3,6 @@
 import functools
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
 from warp_splat.compare import oracle, truth
+from warp_splat.compare.exact_camera import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.raster import project
 from warp_splat.raster.differences import INPUTS
@@ -34,17 +34,6 @@ NAMES = ("rotation", "translation", "focal", "principal")
 
 def split(twist, intrinsics):
     return dict(zip(NAMES, (twist[:3], twist[3:], intrinsics[:2], intrinsics[2:]), strict=True))
-
-
-def exact_camera(base, twist, intrinsics):
-    """The camera of :class:`CameraParameters` as torch has it, by its own exponential."""
-    w = twist[:3]
-    turn = torch.linalg.matrix_exp(torch.linalg.cross(w.expand(3, 3), torch.eye(3, dtype=torch.float64)).T)
-    rotation, translation = (torch.tensor(value) for value in (base.rotation, base.translation))
-    fx, fy, cx, cy = intrinsics
-    pose = {"rotation": turn @ rotation, "translation": turn @ translation + twist[3:]}
-    lens = {"lens": base.lens, "reach": base.reach if base.lens else None}  # which stay
-    return SimpleNamespace(width=base.width, height=base.height, fx=fx, fy=fy, cx=cx, cy=cy, **pose, **lens)
 
 
 def exact_render(scene, options, twist, intrinsics):

@@ -3,7 +3,6 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from scenes import SCENES
 
 from warp_splat import Camera, CameraParameters, InputError, Lens, RasterOptions, check_gradients, rasterize
 from warp_splat.compare import exact_lenses, oracle, truth
+from warp_splat.compare.exact_camera import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.lenses.formulas import MODELS
 from warp_splat.raster import project as projection
@@ -35,12 +35,10 @@ def coefficients_of(lens):
     return torch.tensor(lens.coefficients, dtype=torch.float64, requires_grad=True)
 
 
-def exact_camera(base, coefficients):
-    """As the oracle takes it; how far the lens is followed stays."""
-    lens = SimpleNamespace(model=base.lens.model, coefficients=coefficients, limit=base.lens.limit)
-    names = ("width", "height", "fx", "fy", "cx", "cy", "reach")
-    pose = {"rotation": torch.tensor(base.rotation), "translation": torch.tensor(base.translation)}
-    return SimpleNamespace(**{name: getattr(base, name) for name in names}, **pose, lens=lens)
+def with_coefficients(base, coefficients):
+    """As the oracle takes it."""
+    intrinsics = torch.tensor([base.fx, base.fy, base.cx, base.cy], dtype=torch.float64)
+    return exact_camera(base, torch.zeros(6, dtype=torch.float64), intrinsics, coefficients=coefficients)
 
 
 def exact_gradient(scene, options):
@@ -48,7 +46,7 @@ def exact_gradient(scene, options):
     exact, coefficients = scene.to("cpu", torch.float64), coefficients_of(scene.camera.lens)
 
     def draw(k):
-        camera = exact_camera(scene.camera, k)
+        camera = with_coefficients(scene.camera, k)
         return oracle.exact_render(*exact.parameters(), camera, exact.background, **truth.for_oracle(options))
 
     out = draw(coefficients)
@@ -112,16 +110,54 @@ def with_slopes(rays, lens):
     return Numeric.apply(rays, Lens(lens.model, tuple(lens.coefficients)))
 
 
-@LONG
-@pytest.mark.parametrize("projection", ["affine", "unscented"])
-@pytest.mark.parametrize("model", [model for model, (_, count) in MODELS.items() if count])
-def test_splats_of_every_lens(model, projection, monkeypatch):
-    """Means, conics and opacities that are drawn, against float64 differences by the coefficients."""
-    scene, options = SCENES["fisheye"](), RasterOptions(projection=projection, antialiasing=True)
-    lens = Lens(model, COEFFICIENTS.get(model, SMALL[: MODELS[model][1]]))
-    camera = replace(scene.camera, fx=60.0, fy=63.0, lens=lens)
+def through(model, monkeypatch):
+    """A scene through any lens, and how the oracle is told."""
+    scene, lens = SCENES["fisheye"](), Lens(model, COEFFICIENTS.get(model, SMALL[: MODELS[model][1]]))
     monkeypatch.setattr(exact_lenses, "bend", with_slopes)
     monkeypatch.setattr(exact_lenses, "WIDE", [name for name, (family, _) in MODELS.items() if family.wide])
+    return replace(scene, camera=replace(scene.camera, fx=60.0, fy=63.0, lens=lens))
+
+
+EVERY_LENS = pytest.mark.parametrize(
+    ("model", "projection"),
+    [(model, way) for model, (_, count) in MODELS.items() if count for way in ("affine", "unscented")],
+)
+
+
+@LONG
+@EVERY_LENS
+def test_image_of_every_lens(model, projection, monkeypatch):
+    """In every mode, against float64 differences of the image, where no Gaussian comes or goes between them."""
+    scene, options = through(model, monkeypatch), RasterOptions(projection=projection)
+    exact = scene.to("cpu", torch.float64)
+
+    def draw(k):
+        camera = with_coefficients(scene.camera, k)
+        return oracle.exact_render(*exact.parameters(), camera, exact.background, **truth.for_oracle(options))
+
+    with torch.no_grad():
+        start = coefficients_of(scene.camera.lens).detach()
+        out = draw(start)
+        slopes, finer = (
+            torch.stack([(draw(start + row).image - draw(start - row).image) / (2 * step) for row in rows])
+            for step in (1e-6, 3e-7)
+            for rows in (step * torch.eye(len(start), dtype=torch.float64),)
+        )
+        sure = ~out.fragile & ((slopes - finer).abs() < 0.05 * (1 + slopes.abs())).all(0).all(-1)
+        upstream = (out.image - draw(1.3 * start).image) * sure[..., None]
+    assert sure.float().mean() > 0.98
+    expected = (slopes * upstream).sum((1, 2, 3))
+    for adjoint in ADJOINTS:
+        _, found = found_gradient(scene, {"image": upstream.float()}, options, adjoint)
+        assert (found - expected).norm() < ERROR * expected.norm(), (adjoint, found, expected)
+
+
+@LONG
+@EVERY_LENS
+def test_splats_of_every_lens(model, projection, monkeypatch):
+    """Means, conics and opacities that are drawn, against float64 differences by the coefficients."""
+    scene, options = through(model, monkeypatch), RasterOptions(projection=projection, antialiasing=True)
+    camera, lens = scene.camera, scene.camera.lens
     coefficients = coefficients_of(lens)
     *shapes, sh = scene.parameters()
     splats = project(
@@ -137,7 +173,7 @@ def test_splats_of_every_lens(model, projection, monkeypatch):
         return sum((part * weight.to(part)).sum() for part, weight in zip((means2d, conics), weights, strict=True))
 
     def exact_loss(k):
-        found = oracle.exact_splats(*exact.parameters(), exact_camera(camera, k), **view_options(options))
+        found = oracle.exact_splats(*exact.parameters(), with_coefficients(camera, k), **view_options(options))
         conics = torch.linalg.inv(found.cov2d)
         conics = torch.stack([conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]], 1)
         keep = [torch.where(drawn[:, None], part, 0) for part in (found.means2d, conics)]
@@ -154,7 +190,8 @@ def test_splats_of_every_lens(model, projection, monkeypatch):
 
 
 def view_options(options):
-    return {name: value for name, value in truth.for_oracle(options).items() if name not in ("alpha_min", "t_min")}
+    names = ("sh_degree", "antialiasing", "projection", "near", "blur")
+    return {name: value for name, value in truth.for_oracle(options).items() if name in names}
 
 
 def test_any_number_of_threads(monkeypatch):

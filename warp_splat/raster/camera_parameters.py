@@ -83,7 +83,7 @@ class CameraParameters:
         fx, fy, cx, cy = _numbers(self.intrinsics)
         lens = self.base.lens
         if lens and self.coefficients is not None:
-            lens = Lens(lens.model, tuple(_numbers(self.coefficients)))
+            lens = Lens(lens.model, tuple(_numbers(self.coefficients).tolist()))
         base = replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
         if self.last_twist is None:
             return _twisted(base, "twist", self.twist)

@@ -17,23 +17,22 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.compare import oracle
+from warp_splat.compare import camera_gradients, oracle
 from warp_splat.compare.scenes import distinct_depths, make_camera, to_world
 from warp_splat.compare.volume import light
 from warp_splat.compare.volume.light import Volume
-from warp_splat.config import ADJOINTS, RasterOptions
+from warp_splat.config import PROJECTIONS, RasterOptions
 from warp_splat.evaluation import report
 from warp_splat.formats.atomic import write_csv
 from warp_splat.formats.splats import SH_C0
 from warp_splat.lenses import Lens
-from warp_splat.raster.api import rasterize
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 from warp_splat.text import format_table
 
 PROJECTED = ("affine", "unscented")
 SIZES = (0.03, 0.12)  # rad, the standard deviations of Gaussians as the camera sees them
-COUNT, TIMED = 40, 20_000  # Gaussians
+COUNT, TIMED, MANY = 40, 20_000, 200_000  # Gaussians; the last of cameras that learn
 TURNS = 7  # of the timings
 LEAST, MOST_ERROR = 1e-4, 0.3  # of the maps
 
@@ -52,7 +51,7 @@ CAMERAS: dict[str, tuple[Camera, float]] = {
 
 
 def compare_cameras(out: Path, say: Callable[[str], None] = print) -> list[dict[str, Any]]:
-    """Measure everything; takes about a minute on one core, besides what compiles the kernels.
+    """Measure everything; takes about two minutes on one core, besides what compiles the kernels.
 
     Args:
         out: folder for cameras.csv and cameras.png; created if it is missing.
@@ -79,9 +78,12 @@ def compare_cameras(out: Path, say: Callable[[str], None] = print) -> list[dict[
                 records.append({"camera": name, "projection": projection, "size": size, **found})
     say("Footprints against rays through the lens (colors 0 to 1), and the time of projection and adjoint\n")
     say(_footprint_table(records))
-    gradients = [row for name in CAMERAS for row in measure_gradients(name)]
-    say("\nGradients of a random loss against float64, relative: the worst of all inputs\n")
-    say(_gradient_table(gradients))
+    gradients = []
+    for name, (camera, most) in CAMERAS.items():
+        few, many = (_tensors(made_volume(camera, most, SIZES[0], count)) for count in (COUNT, MANY))
+        projections = PROJECTED if camera.lens else PROJECTIONS
+        gradients += camera_gradients.measure(name, camera, projections, few, many)
+    camera_gradients.report_gradients(gradients, say)
     write_csv(out / "cameras.csv", [{"table": "footprints", **r} for r in records])
     write_csv(out / "cameras_gradients.csv", gradients)
     plot_cameras(out / "cameras.png", pictures)
@@ -141,26 +143,6 @@ def measure_times(camera: Camera, most: float) -> dict[str, float]:
     return best
 
 
-def measure_gradients(name: str) -> list[dict[str, Any]]:
-    """For each projection and mode, the worst relative error of the inputs' gradients, at pixels that are sure."""
-    camera, most = CAMERAS[name]
-    volume = made_volume(camera, most, SIZES[0])
-    found = []
-    for projection in PROJECTED:
-        exact = [tensor.float().double().requires_grad_() for tensor in _tensors(volume)]
-        truth = oracle.exact_render(*exact, camera, projection=projection)
-        weights = torch.randn(truth.image.shape, generator=torch.Generator().manual_seed(1))
-        weights[truth.fragile] = 0
-        wanted = torch.autograd.grad((truth.image * weights).sum(), exact)
-        for mode in ADJOINTS:
-            leaves = [tensor.detach().float().requires_grad_() for tensor in exact]
-            out = rasterize(*leaves, camera, adjoint=mode, options=RasterOptions(projection=projection))
-            given = torch.autograd.grad((out.image * weights).sum(), leaves)
-            errors = [float((a.double() - b).norm() / b.norm()) for a, b in zip(given, wanted, strict=True)]
-            found.append({"camera": name, "projection": projection, "mode": mode, "error": max(errors)})
-    return found
-
-
 def _footprint_table(records: Sequence[Mapping[str, Any]]) -> str:
     rows = [
         [
@@ -172,12 +154,6 @@ def _footprint_table(records: Sequence[Mapping[str, Any]]) -> str:
     ]
     headers = ["camera", "size [rad]", "projection", "mean error", "max error", "PSNR [dB]", "ns a Gaussian"]
     return format_table([*headers, "times a pinhole's"], rows)
-
-
-def _gradient_table(records: Sequence[Mapping[str, Any]]) -> str:
-    cells = {(r["camera"], r["projection"], r["mode"]): f"{r['error']:.1e}" for r in records}
-    rows = [[*key, *(cells[*key, mode] for mode in ADJOINTS)] for key in dict.fromkeys(k[:2] for k in cells)]
-    return format_table(["camera", "projection", *ADJOINTS], rows)
 
 
 def plot_cameras(path: Path, pictures: Mapping[str, Mapping[float, Mapping[str, np.ndarray]]]) -> None:
