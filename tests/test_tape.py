@@ -187,10 +187,13 @@ def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mod
         ("quats", lambda a: wp.array(a.numpy()[:, :3], dtype=wp.vec3), r"quats: .* got \[120, 3\]"),
         ("sh", lambda a: (a, None), r"sh\[1\]: expected a Warp array, got NoneType"),
         ("twist", lambda _: wp.zeros(5, dtype=float), "twist: expected a tensor of 6 real numbers"),
+        ("features", lambda _: wp.zeros((120, 0), dtype=float), "features: expected 1 to 512 channels, got 0"),
+        ("features", lambda _: wp.zeros((119, 2), dtype=float), r"features: expected shape \[120, C\], got \[119, 2\]"),
         ("twist", lambda _: wp.zeros(6, dtype=int), "twist: expected an array of float32 or float64, got one of int"),
     ],
 )
 def test_bad_input(name, change, found):
+    wp.init()  # where no other test has run before
     scene, _, _ = scene_of("cpu")
     arrays = {key: wp.from_torch(getattr(scene, key), kind) for key, kind in KINDS.items()}
     with pytest.raises(InputError, match=found):
