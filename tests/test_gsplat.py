@@ -240,6 +240,7 @@ def test_its_strategy_grows_a_model(packed, steps):
         ({"colors": torch.zeros(120, 0), "sh_degree": None}, "colors: expected 1 to 512 channels, got 0"),
         ({"viewmats": torch.zeros(0, 4, 4)}, "viewmats: expected a tensor"),
         ({"viewmats": torch.zeros(2, 4, 4)}, "viewmats: expected matrices from world to camera"),
+        ({"Ks": torch.zeros(2, 3, 3)}, "Ks: expected matrices with focal lengths fx and fy .*, got a singular one"),
         ({"opacities": torch.full((120,), 2.0)}, "opacities: expected values in 0..1"),
         ({"scales": torch.full((120, 3), -1.0)}, "scales: expected positive values"),
         ({"means": torch.zeros(120, 3).to_sparse()}, "means: expected a dense tensor"),

@@ -94,6 +94,8 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
     for name in ("viewmats", *(["viewmats_rs"] if shutter else [])):
         if not bool(torch.linalg.det(given[name].detach()).all()):
             raise InputError(f"{name}: expected matrices from world to camera, got one that has no inverse.")
+    if not bool(flat["Ks"].detach()[..., (0, 1), (0, 1)].all()):
+        raise InputError("Ks: expected matrices with focal lengths fx and fy [px], got a singular one; correct it.")
     colors = request.colors
     _check_tensor("colors", colors, None, means.device)
     tail = 1 if request.sh_degree is None else 2
