@@ -26,9 +26,11 @@ from warp_splat.runtime import launch
 
 FREE = {"pose": 0, "and fx, fy": 2, "and cx, cy": 4}  # intrinsics that are free
 ASIDE = 0.02  # of the principal point, in widths and heights
-STAGES = ((4, 200, 1e-2, 1e-3), (1, 120, 1e-3, 5e-5))  # how many times smaller, steps, rates of Adam at start and end
+#: How many times smaller, steps, rates of Adam at start and end.
+STAGES = ((4, 200, 1e-2, 3e-3), (2, 200, 3e-3, 1e-3), (1, 200, 1e-3, 5e-5))
 COLORS = dict(zip(FREE, (BLUE, ORANGE, GREEN), strict=True))
-TITLES = ("direction [degrees]", "place [% of the extent]", "focal length [%]", "principal point [% of the size]")
+#: What a panel shows, and how many intrinsics have to be free for it.
+TITLES = {"direction [degrees]": 0, "place [% of extent]": 0, "focal length [%]": 2, "principal point [%]": 4}
 HEADERS = ("scene", "photograph", "free", "direction", "place", "fx, fy", "cx, cy")
 
 
@@ -96,10 +98,11 @@ def follow_all(model: Path) -> dict[tuple[str, str, str], list[list[float]]]:
 def plot(runs: dict[tuple[str, str, str], list[list[float]]], path: Path) -> None:
     """Errors over steps, a panel for each."""
     figure, panels = new_panels(2.6, columns=len(TITLES))
-    for column, (axes, title) in enumerate(zip(panels[0], TITLES, strict=True)):
+    for column, (axes, (title, least)) in enumerate(zip(panels[0], TITLES.items(), strict=True)):
         for (_, photo, free), run in runs.items():
             style = "--" if "held out" in photo else "-"
-            axes.semilogy([max(errors[column], 1e-4) for errors in run], style, color=COLORS[free], linewidth=0.9)
+            if FREE[free] >= least:
+                axes.semilogy([errors[column] for errors in run], style, color=COLORS[free], linewidth=0.9)
         plain_axes(axes, title, "steps")
     save_figure(figure, path)
 
