@@ -110,6 +110,28 @@ def test_a_camera_that_stands_still_sees_as_ever():
     assert all(call[name].grad.isfinite().all() for name in LEAVES if name in call)
 
 
+def test_the_image_is_that_of_cameras_that_stand_still_row_by_row():
+    """Up to the shear that one Gaussian cannot show."""
+    call = call_of("degree2", cameras=1, with_ut=True)
+    first = call["viewmats"].detach()
+    last = first.clone()
+    last[:, :3, :3] = matrices(torch.tensor([[1.0, 0.02, -0.03, 0.01]])) @ last[:, :3, :3]
+    last[:, :3, 3] += torch.tensor([0.05, -0.04, 0.1])
+    rolling = {"rolling_shutter": RollingShutterType.ROLLING_BOTTOM_TO_TOP, "viewmats_rs": last}
+    ends = [quaternion(pose[:, :3, :3].double()) for pose in (first, last)]
+    angle, rows = torch.arccos((ends[0] * ends[1]).sum()), call["height"]
+    with torch.no_grad():
+        image, still = (rasterization(**call | more)[0][0] for more in (rolling, {}))
+        by_rows = torch.zeros_like(image)
+        for row in range(rows):
+            time = 1 - row / (rows - 1)
+            turned = torch.sin((1 - time) * angle) * ends[0] + torch.sin(time * angle) * ends[1]
+            pose = torch.lerp(first, last, time)
+            pose[:, :3, :3] = matrices(turned).float()
+            by_rows[row] = rasterization(**call | {"viewmats": pose})[0][0, row]
+    assert (image - by_rows).abs().mean() < 0.1 * (still - by_rows).abs().mean()
+
+
 @pytest.mark.parametrize(
     ("changes", "found"),
     [

@@ -125,7 +125,8 @@ def rasterize_views(
     """:func:`rasterize` through each of ``cameras``, which may differ in size; the Gaussians are checked but once.
 
     Outputs and gradients are those of separate calls, bit for bit. Without gradients an output keeps 56 bytes per
-    Gaussian besides its image; with gradients it keeps what its adjoint reads, until that has run.
+    Gaussian besides its image, and all share one copy of harmonics that come as one tensor; with gradients it keeps
+    what its adjoint reads, until that has run.
 
     Args:
         means: as in :func:`rasterize`, like all but ``cameras``.
