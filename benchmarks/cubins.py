@@ -26,6 +26,7 @@ from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
 from warp_splat.kernels.cuda import channels
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
+from warp_splat.kernels.cuda.comparison import compare_block
 from warp_splat.kernels.cuda.gather import make_gather
 from warp_splat.kernels.cuda.strongest import make_strongest
 from warp_splat.kernels.cuda.taped import make_walk_block
@@ -69,6 +70,7 @@ def modules() -> dict[str, wp.Module]:
         "activate": make_activate(1).module,
         "adjoint of activate": make_adj_activate(1).module,
         "observe": make_observe(1).module,
+        "loss": compare_block.module,
         "adam": make_adam(1, True).module,
         "map of colors": make_map_colors(1).module,
         "adjoint of the map": make_adj_map_colors(1).module,

@@ -11,16 +11,15 @@ for bit, a small case under compute-sanitizer's memcheck, racecheck and syncchec
 measurement has a process of its own: one that ends by an illegal address ends no other.
 Measures: training steps by stage and as a whole against the sum of stages and of kernels; the two blends' share of the
 card's bandwidth and arithmetic; slots against atomics; an orbit with and without the thesis's loop cap; all adjoints,
-error against time; what the host needs for a step. Times are medians. What the time does not suffice for is listed.
+error against time; what the host needs for a step; whole training against the CPU's; gsplat beside ours, if it can be
+imported; kernels by ncu, if it is installed. Times are medians. What the time does not suffice for is listed.
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -28,114 +27,26 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
-from gpu_blends import ATOMIC_HEADERS, SHARE_HEADERS, measure_blends
-from gpu_steps import STEP_HEADERS, measure_errors, measure_modes, measure_orbit, measure_step
+from gpu_blends import measure_blends
+from gpu_results import Results
+from gpu_steps import measure_errors, measure_modes, measure_orbit, measure_step
+from gpu_training import NOISE, measure_gsplat, measure_training, profile_by_ncu
 from made_up import cameras, make_crowd, make_gaussians
 
 from warp_splat import rasterize
 from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
-from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import atomic_write, write_json
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.raster.selftest import check_device
-from warp_splat.runtime.devices import is_out_of_memory
 from warp_splat.runtime.launch import prepare
-from warp_splat.text import format_table
 
 SMALL, LARGE = (980, 545), (1920, 1080)
 COUNT = 1_000_000
 CHECKED, STORED = (20_000, 320, 200), (500, 64, 40)  # cases; what the CPU says of the second lies in a file
 EXPECTED = Path(__file__).with_name("gpu_expected.npz")
 TOOLS = ("memcheck", "racecheck", "synccheck")
-ROWS = "rows: "  # begins a line that a process prints for its parent
 LIMIT, DECISION, RARE = 1e-4, 2e-2, 1e-3  # of errors; of those where rounding decides; share of pixels where it may
 NAMES = ("image", "means", "quats", "scales", "opacities", "sh")
-HEADERS = {
-    "Checks": ("check", "found"),
-    "Training step": STEP_HEADERS,
-    "Kernels of a step": ("kernel", "ms per step"),
-    "Share of the card": SHARE_HEADERS,
-    "Slots against atomics": ATOMIC_HEADERS,
-    "Orbit": ("size", "Gaussians", "loop cap", "frames per second"),
-    "Adjoints: error against time": ("scene", "variant", "error", "of", "forward ms", "backward ms"),
-    "Adjoints: time and memory": ("size", "Gaussians", "mode", "forward ms", "forward + backward ms", "peak MiB"),
-    "Left out": ("what", "why"),
-}
-
-
-class Results:
-    """Tables by heading, written anew whenever a row comes in; what the time does not suffice for is noted."""
-
-    def __init__(self, out: Path | None, device: str, seconds: float, only: str = "", apart: Sequence[str] = ()):
-        """Attempt ``only`` one thing; or each in a process of its own, by the command line ``apart``."""
-        self.out, self.end, self.only, self.apart = out, time.monotonic() + seconds, only, apart
-        self.tables: dict[str, list[Sequence]] = {}
-        self.wrong: list[str] = []
-        card = torch.cuda.get_device_name() if device == "cuda" else "Dry run on the CPU, which says nothing of a GPU"
-        self.where = f"{card}; {machine()}; torch {torch.__version__}, Warp {wp.__version__}"
-
-    @property
-    def left(self) -> float:
-        """Seconds."""
-        return self.end - time.monotonic()
-
-    def add(self, heading: str, rows: Sequence[Sequence]) -> None:
-        self.tables.setdefault(heading, []).extend(rows)
-        if heading == "Checks":
-            self.wrong += [what for what, found in rows if found.startswith("WRONG")]
-        if self.only:
-            print(ROWS + json.dumps([heading, rows]), flush=True)
-            return
-        for row in rows:
-            print(f"{heading}: {' | '.join(map(str, row))}", flush=True)
-        if self.out:
-            tables = [f"## {name}\n\n{format_table(HEADERS[name], found)}\n" for name, found in self.tables.items()]
-            with atomic_write(self.out / "gpu.md") as path:
-                path.write_text("\n".join([*tables, f"Measured by `benchmarks/gpu.py` on {self.where}.\n"]))
-            named = {name: [dict(zip(HEADERS[name], row, strict=True)) for row in found]
-                     for name, found in self.tables.items()}  # fmt: skip
-            write_json(self.out / "gpu.json", {"tables": named, "where": self.where})
-
-    def judge(self, what: str, found: str, right: bool) -> None:
-        """A row of the checks; one that fails stops nothing, for a card may be at hand only now, but ends in code 1."""
-        self.add("Checks", [(what, found if right else f"WRONG: {found}")])
-
-    def attempt(self, what: str, run: Callable[[], None], needs: float) -> None:
-        """Run, if ``needs`` seconds are left; what runs out of memory is a row, too."""
-        if self.only and what != self.only:
-            return
-        if self.left < needs:
-            self.add("Left out", [(what, "no time left")])
-            return
-        if self.apart:
-            self._start(what)
-            return
-        start = time.monotonic()
-        try:
-            run()
-        except (MemoryError, RuntimeError, InputError) as error:
-            if not (is_out_of_memory(error) or isinstance(error, InputError)):
-                raise
-            self.add("Left out", [(what, str(error).splitlines()[0])])
-        if torch.cuda.is_initialized():
-            torch.cuda.empty_cache()
-        print(f"{what}: {time.monotonic() - start:.0f} s, {self.left:.0f} s left", flush=True)
-
-    def _start(self, what: str) -> None:
-        """A process that attempts ``what``; its rows are added here, and how it ended if that was not well."""
-        try:
-            done = subprocess.run(
-                [*self.apart, "--only", what], capture_output=True, text=True, check=False, timeout=self.left
-            )
-        except subprocess.TimeoutExpired:
-            self.add("Left out", [(what, "not finished")])
-            return
-        for line in done.stdout.splitlines():
-            if line.startswith(ROWS):
-                self.add(*json.loads(line.removeprefix(ROWS)))
-        if done.returncode:
-            self.judge(what, (done.stderr.strip().splitlines() or ["no word"])[-1], False)
 
 
 def differentiate(count: int, width: int, height: int, device: str, mode: str) -> list[torch.Tensor]:
@@ -235,6 +146,16 @@ def measure(results: Results, device: str) -> None:
         rows = measure_errors((100, 1000, 10_000) if real else (10,), device, print)
         results.add("Adjoints: error against time", rows)
 
+    def training() -> None:
+        for row, behind in measure_training(device, None if real else 2):
+            results.add("Training", [row])
+            if real:
+                results.judge(f"training, photographs on {row[0]}", f"{behind:.2f} dB behind the CPU", behind < NOISE)
+
+    def profiled() -> None:
+        found = profile_by_ncu(results.left)
+        results.add(*(("Kernels by ncu", found) if found else ("Left out", [("ncu", "not installed, or not allowed")])))
+
     attempt = results.attempt
     attempt("step", lambda: step(count, size), 20)
     attempt("blends, ball", lambda: blends(make_gaussians, size, "ball"), 20)
@@ -243,6 +164,10 @@ def measure(results: Results, device: str) -> None:
     attempt("modes", lambda: modes(count, size), 20)
     attempt("errors", errors, 60)
     attempt("host", lambda: step(100, (64, 64)), 10)  # hardly any arithmetic: what the host does, at most
+    attempt("training", training, 60)
+    attempt("gsplat", lambda: results.add("Beside gsplat", measure_gsplat(count, *size, device, 20 if real else 1)), 20)
+    if real:
+        attempt("ncu", profiled, 60)
     others = [(count // 10, size), (count, large), (5 * count, size), (count // 10, large), (5 * count, large)]
     for place in others:
         attempt(f"step, {place}", lambda place=place: step(*place), 40 * place[0] / (5 * count))

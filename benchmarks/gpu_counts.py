@@ -1,7 +1,7 @@
 """For ``gpu_model.py``: what there is to do in a training step on a GPU, counted without one.
 
-Of a step: launches of Warp, operations of torch, bytes that these move, and how often the host waits for a number. The
-real trainer takes it by the driver of a GPU, in fibers. Of a scene: what the blends walk, by the CPU's lists.
+Of a step: launches of Warp, operations of torch, and how often the host waits for a number. The real trainer takes it
+by the driver of a GPU, in fibers. Of a scene: what the blends walk, by the CPU's lists.
 """
 
 import re
@@ -33,7 +33,7 @@ from warp_splat.runtime import timers
 from warp_splat.runtime.launch import launch, view
 from warp_splat.runtime.pool import get_threads, set_threads
 
-LAUNCHES, OPERATIONS, BYTES, WAITS = range(4)  # of an array of counts
+LAUNCHES, OPERATIONS, WAITS = range(3)  # of an array of counts
 REST = "between stages"
 COUNTED = (300, 64, 48)  # Gaussians, width, height: the counts do not depend on them
 WARPS = 8  # of a tile, two lines of sixteen pixels each, where a thread has one
@@ -62,15 +62,7 @@ class Operations(TorchDispatchMode):
             self.counts[WAITS] += 1
         elif not NO_LAUNCH.match(name):
             self.counts[OPERATIONS] += 1
-            tensors = [leaf for leaf in tree_leaves((args, kwargs, found)) if isinstance(leaf, torch.Tensor)]
-            self.counts[BYTES] += sum(map(touched, tensors))
         return found
-
-
-def touched(tensor: torch.Tensor) -> int:
-    """Bytes that lie behind it; what is repeated lies there once."""
-    sizes = (size if stride else 1 for size, stride in zip(tensor.shape, tensor.stride(), strict=True))
-    return tensor.element_size() * int(np.prod([*sizes], dtype=np.int64))
 
 
 def count_step(**options) -> dict[str, np.ndarray]:
@@ -78,7 +70,7 @@ def count_step(**options) -> dict[str, np.ndarray]:
 
     The stages' clock tells of what was counted instead of the time.
     """
-    threads, counts = get_threads(), np.zeros(4)
+    threads, counts = get_threads(), np.zeros(3)
     try:
         set_threads(1)
         with using(CUDA), counted_launches(counts), mock.patch.object(timers, "_now", counts.copy):

@@ -2,10 +2,10 @@
 
     python benchmarks/gpu_model.py [--out docs/cuda] [--measured docs/benchmarks/gpu.json --card H200]
 
-Bytes are those of arrays that a stage reads and writes, each once; of torch's operations on images, their operands'.
-Instructions are the machine code's (``cubins.json``). A stage takes at least the longer of the two times: bytes by the
-card's bandwidth, instructions of warps by four per cycle and multiprocessor. Launches and operations of torch are
-counted in a step of the real trainer, in fibers. With a result of ``gpu.py``, its stages stand beside the model's.
+Bytes are those of arrays that a stage reads and writes, each once. Instructions are the machine code's
+(``cubins.json``). A stage takes at least the longer of the two times: bytes by the card's bandwidth, instructions of
+warps by four per cycle and multiprocessor. Launches and operations of torch are counted in a step of the real trainer,
+in fibers. With a result of ``gpu.py``, its stages stand beside the model's.
 """
 
 import argparse
@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from gpu_counts import BYTES, COUNTED, LAUNCHES, OPERATIONS, REST, WAITS, Scene, count_scene, count_step
+from gpu_counts import LAUNCHES, OPERATIONS, REST, WAITS, Scene, count_scene, count_step
 from gpu_steps import STAGES
 from made_up import cameras, make_crowd, make_gaussians
 
 from warp_splat.evaluation.report import machine
 from warp_splat.formats.atomic import write_json
+from warp_splat.kernels.cuda.comparison import BAND, STRIP
+from warp_splat.kernels.window import RADIUS
 from warp_splat.runtime import launch
 from warp_splat.text import format_table
 
@@ -50,7 +52,7 @@ SCENES = {
     "ball": (make_gaussians, 1_000_000, 980, 545),
     "crowd": (make_crowd, 1_000_000, 1920, 1080),
 }
-SHAPE, SH, SPLAT, RADIUS = 44, 192, 48, 4  # bytes of a Gaussian, its harmonics, projected, and the radius of that
+SHAPE, SH, SPLAT, RADII = 44, 192, 48, 4  # bytes of a Gaussian, its harmonics, projected, and the radius of that
 GRADIENT, ROW, PLACE = 40, 36, 4  # of a projected Gaussian, of a tile instance, of an index
 PARAMETERS = (SHAPE + SH) // 4
 BLOCK = 58  # instructions of the adjoint for one of the eight blocks of a tile instance (docs/cuda.md)
@@ -59,55 +61,60 @@ CARD_HEADERS = (
     *(f"{name}: {what} ms" for name in SCENES for what in ("blend", "its adjoint", "step")),
 )
 ADJOINT_HEADERS = ("scene", "adjoint", "found", "instructions", "shuffles", "barriers", "atomic additions")
+PASSED = 3  # instructions of the blend's warp for an instance that misses it: its bit, and the votes
 ADD_ROW = 24  # of gather for a row: nine loads, nine additions, its place, the loop
 
 
-def instructions(arch: int) -> dict[str, int]:
-    """Of the longest innermost loop of each kernel: all of a kernel that has none but that over its threads."""
+def instructions(arch: int) -> dict[tuple[str, str], int]:
+    """By module and kernel, of the longest innermost loop: all of a kernel that has none but that over its threads."""
     records = json.loads(CUBINS.read_text())["records"]
-    return {
-        record["module"] + (", adjoint" if record["kernel"].endswith(", adjoint") else ""): record["loop"]
-        for record in records
-        if record["arch"] == arch
-    }
+    return {(record["module"], record["kernel"]): record["loop"] for record in records if record["arch"] == arch}
 
 
-def stages(scene: Scene, arch: int, image_bytes: dict[str, float]) -> dict[str, tuple[float, float]]:
-    """Bytes, and instructions of warps, by stage; ``image_bytes`` of torch's operations, by stage and pixel."""
+def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
+    """Bytes, and instructions of warps, by stage."""
     n, drawn, pixels, m, walked = scene.gaussians, scene.drawn, scene.pixels, scene.instances, scene.walked
     code = instructions(arch)
-    each = lambda *names: -(-n // 32) * sum(code[name] for name in names)  # noqa: E731
+    each = lambda *kernels: -(-n // 32) * sum(code[kernel] for kernel in kernels)  # noqa: E731
     by_depth = 8 * 12 * n + 32 * n  # four passes over keys and indices; keys and their order
     by_tile = 90 * m  # two passes over keys of 16 bits and indices of 64, then instances and places from these
-    passes = code["manual"] - 8 * BLOCK  # of a tile instance, whatever it touches
+    passes = code["manual", "adj_blend"] - 8 * BLOCK  # of a tile instance, whatever it touches
+    rows = 8 * (BAND + 2 * RADIUS) / BAND * 3 * pixels / STRIP  # of warps, in strips of three colors a pixel
     return {
         # activated; filled with zeros and projected; colors of those drawn
-        "project": (32 * n + (SHAPE + 2 * GRADIENT) * n + (SH + 24) * drawn, each("activate", "project", "shade")),
-        "bin": (by_depth + 2 * SPLAT * drawn + 40 * n + by_tile, each("pack")),
-        "blend": ((PLACE + SPLAT) * walked + 24 * pixels, 8 * code["blend"] * walked),
-        "loss": (image_bytes["loss"] * pixels, 0.0),
-        "adjoint of loss": (image_bytes["adjoint of loss"] * pixels, 0.0),
+        "project": (
+            32 * n + (SHAPE + 2 * GRADIENT) * n + (SH + 24) * drawn,
+            each(("activate", "activate"), ("project", "project"), ("shade", "shade")),
+        ),
+        "bin": (by_depth + 2 * SPLAT * drawn + 40 * n + by_tile, each(("pack", "pack"))),
+        "blend": (
+            (PLACE + SPLAT) * walked + 24 * pixels,
+            8 * PASSED * walked + code["blend", "blend"] * scene.blocks,
+        ),
+        # image and photograph in bytes; slopes of three colors
+        "loss": ((12 + 3 + 36) * pixels, rows * code["loss", "compare_block"]),
+        "adjoint of loss": ((12 + 3 + 36 + 12) * pixels, rows * code["loss", "adj_compare_block"]),
         # upstream; rows of the walked, zeros in the others; their sums
         "adjoint of blend": (
             60 * pixels + (PLACE + SPLAT) * walked + ROW * m + 28 * pixels + (PLACE + ROW) * m + (8 + GRADIENT) * n,
-            8 * scene.tiles * code["upstream"] + passes * walked + BLOCK * scene.blocks + ADD_ROW * m / 32,
+            8 * scene.tiles * code["upstream", "upstream"] + passes * walked + BLOCK * scene.blocks + ADD_ROW * m / 32,
         ),
         "adjoint of project": (
-            (2 * SHAPE + SH + 32 + RADIUS) * n + (2 * GRADIENT + SH + SHAPE) * drawn + 48 * n,
-            each("adjoint of shade, adjoint" if "adjoint of shade, adjoint" in code else "adjoint of shade")
-            + each("project, adjoint", "quarantine", "adjoint of activate"),
+            (2 * SHAPE + SH + 32 + RADII) * n + (2 * GRADIENT + SH + SHAPE) * drawn + 48 * n,
+            each(("adjoint of shade", "adj_shade"), ("project", "project, adjoint"))
+            + each(("quarantine", "quarantine"), ("adjoint of activate", "adj_activate")),
         ),
-        "densify": (28 * n, each("observe")),
+        "densify": (28 * n, each(("observe", "observe"))),
         "Adam": (7 * 4 * PARAMETERS * n, 0.0),
     }
 
 
-def times(scene: Scene, card: Card, image_bytes: dict[str, float]) -> dict[str, tuple[float, float]]:
+def times(scene: Scene, card: Card) -> dict[str, tuple[float, float]]:
     """Milliseconds by bytes and by instructions, of each stage."""
     rate = ISSUED * card.processors * 1e6 * card.clock
     return {
         stage: (1e3 * size / (1e9 * card.bandwidth), 1e3 * issued / rate)
-        for stage, (size, issued) in stages(scene, card.arch, image_bytes).items()
+        for stage, (size, issued) in stages(scene, card.arch).items()
     }
 
 
@@ -115,7 +122,7 @@ def step_rows(counts: dict[str, np.ndarray], found: dict[str, dict]) -> list[lis
     """Of each stage what it launches, and the least milliseconds by bytes and instructions on an H200."""
     rows = []
     for stage in (*STAGES, REST):
-        here = counts.get(stage, np.zeros(4))
+        here = counts.get(stage, np.zeros(3))
         cells = [f"{bound:.3f}" for name in found for bound in found[name].get(stage, (0.0, 0.0))]
         rows.append([stage, *(int(here[kind]) for kind in (LAUNCHES, OPERATIONS, WAITS)), *cells])
     total = sum(counts.values())
@@ -124,12 +131,12 @@ def step_rows(counts: dict[str, np.ndarray], found: dict[str, dict]) -> list[lis
     return [*rows, ["step", *(int(total[kind]) for kind in (LAUNCHES, OPERATIONS, WAITS)), *cells]]
 
 
-def card_rows(scenes: dict[str, Scene], image_bytes: dict[str, float]) -> list[list]:
+def card_rows(scenes: dict[str, Scene]) -> list[list]:
     rows = []
     for name, card in CARDS.items():
         row = [name, f"sm_{card.arch}", card.processors, f"{card.clock:.0f}", f"{card.bandwidth:.0f}"]
         for scene in scenes.values():
-            found = times(scene, card, image_bytes)
+            found = times(scene, card)
             row += [f"{max(found[stage]):.2f}" for stage in ("blend", "adjoint of blend")]
             row += [f"{sum(map(max, found.values())):.2f}"]
         rows.append(row)
@@ -144,7 +151,7 @@ def adjoint_rows(scenes: dict[str, Scene]) -> list[list]:
     atomics. The reference's (backward.cu) has the same warps and no sums: a pixel that blends adds nine numbers by
     atomics. The operators of both are counted by hand in the sources: 30 for the test, 55 and 60 for the gradients.
     """
-    code, rows = instructions(90)["manual"], []
+    code, rows = instructions(90)["manual", "adj_blend"], []
     for name, scene in scenes.items():
         blocks, warps, pairs = (value / scene.walked for value in (scene.blocks, scene.warps, scene.pairs))
         ours = code - 8 * BLOCK + BLOCK * blocks
@@ -158,13 +165,13 @@ def adjoint_rows(scenes: dict[str, Scene]) -> list[list]:
     return rows
 
 
-def measured_rows(path: Path, card: Card, scenes: dict[str, Scene], image_bytes: dict[str, float]) -> list[list]:
+def measured_rows(path: Path, card: Card, scenes: dict[str, Scene]) -> list[list]:
     """Stages as gpu.py measured them, over the model's least times."""
     rows = []
     for row in json.loads(path.read_text())["tables"]["Training step"]:
         for name, scene in scenes.items():
             if (row["size"], row["Gaussians"]) == ("{} x {}".format(*SCENES[name][2:]), scene.gaussians):
-                for stage, bounds in times(scene, card, image_bytes).items():
+                for stage, bounds in times(scene, card).items():
                     took, least = float(row[f"{stage} ms"]), max(bounds)
                     rows.append([name, stage, f"{took:.3f}", f"{least:.3f}", f"{took / least:.1f}"])
     return rows
@@ -178,20 +185,18 @@ def main() -> None:
     arguments = parser.parse_args()
     launch.prepare("cpu", 0)
     counts = count_step()
-    area = COUNTED[1] * COUNTED[2]
-    image_bytes = {stage: counts[stage][BYTES] / area for stage in ("loss", "adjoint of loss")}
     scenes = {
         name: count_scene(make(count, "cpu"), cameras(*size, 1)[0]) for name, (make, count, *size) in SCENES.items()
     }
-    found = {name: times(scene, CARDS["H200"], image_bytes) for name, scene in scenes.items()}
+    found = {name: times(scene, CARDS["H200"]) for name, scene in scenes.items()}
     each = [f"{name}: {what} ms" for name in scenes for what in ("bytes", "instructions")]
     tables = [
         (("stage", "launches", "torch", "waits", *each), step_rows(counts, found), described(scenes)),
-        (CARD_HEADERS, card_rows(scenes, image_bytes), "The longer of both times, stage by stage."),
+        (CARD_HEADERS, card_rows(scenes), "The longer of both times, stage by stage."),
         (ADJOINT_HEADERS, adjoint_rows(scenes), "For a tile instance that is walked, on sm_90."),
     ]
     if arguments.measured:
-        rows = measured_rows(arguments.measured, CARDS[arguments.card], scenes, image_bytes)
+        rows = measured_rows(arguments.measured, CARDS[arguments.card], scenes)
         headers = ("scene", "stage", "measured ms", "modeled ms", "ratio")
         tables.append((headers, rows, f"Measured on an {arguments.card}."))
     parts = [f"{format_table(headers, rows)}\n\n{note}" for headers, rows, note in tables]
@@ -199,7 +204,7 @@ def main() -> None:
     print(text)
     if arguments.out:
         (arguments.out / "gpu_model.md").write_text(f"{text}\n")
-        data = {"scenes": {name: asdict(scene) for name, scene in scenes.items()}, "image_bytes": image_bytes}
+        data = {"scenes": {name: asdict(scene) for name, scene in scenes.items()}}
         data["counts"] = {stage: here.tolist() for stage, here in counts.items()}
         write_json(arguments.out / "gpu_model.json", data)
 

@@ -54,6 +54,7 @@ class Launch:
 @contextmanager
 def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
     """Every launch in blocks of what is run inside."""
+    wp.init()  # or arguments cannot be packed
     launches, launch_tiled = [], wp.launch_tiled
 
     def record(kernel, dim, inputs, outputs, block_dim, adjoint=False, adj_inputs=(), adj_outputs=(), **where):

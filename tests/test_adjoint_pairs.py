@@ -21,6 +21,8 @@ KERNELS = Path(splat.__file__).parent
 #: Derivatives that are nothing on purpose, and why.
 CONSTANT = {
     "fill": "constants",
+    "ballot": "votes of a warp",
+    "lowest": "the place of a bit",
     "less": "masks",
     "equal": "masks",
     "some": "masks",

@@ -16,6 +16,7 @@ from test_binning import crowded
 from warp_splat import RasterOptions, rasterize
 from warp_splat.config import ADJOINTS
 from warp_splat.raster.drivers import CUDA, using
+from warp_splat.training.loss import image_loss
 
 pytestmark = [
     pytest.mark.skipif(cuda_on_host.COMPILER is None, reason="g++ is missing: it compiles the kernels for the host."),
@@ -108,6 +109,22 @@ def test_more_than_a_batch(monkeypatch, tmp_path):
     for number, launch in enumerate(launches_of("manual", monkeypatch, dense_tile())):
         (folder := tmp_path / str(number)).mkdir()
         check_clean(build(launch, "thread", folder), launch)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+def test_loss(sanitizer, monkeypatch, tmp_path):
+    """Two strips of two bands: of 256 numbers, 30 only lend theirs."""
+    image, target = torch.rand(2, 70, 80, 3, generator=torch.Generator().manual_seed(0))
+    with using(CUDA), recorded(monkeypatch) as launches:
+        image_loss(image.requires_grad_(), target).backward()
+    assert [launch.blocks for launch in launches] == [4, 4]
+    for number, launch in enumerate(launches):
+        (folder := tmp_path / str(number)).mkdir()
+        program = build(launch, sanitizer, folder)
+        barriers = check_clean(program, launch)
+        if sanitizer == "thread":
+            check_controls(program, launch, barriers)
 
 
 @pytest.mark.long

@@ -12,9 +12,11 @@ import warp as wp
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
+from warp_splat.gsplat import rasterization
+from warp_splat.raster.api import render
 from warp_splat.raster.blend import blend
 from warp_splat.raster.data import Gaussians, Splats2D
-from warp_splat.raster.drivers import CPU
+from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
 
 ROOT = Path(__file__).parents[1]
@@ -22,6 +24,8 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import gpu  # noqa: E402
 import gpu_blends  # noqa: E402
+import gpu_results  # noqa: E402
+import gpu_training  # noqa: E402
 import made_up  # noqa: E402
 
 
@@ -63,6 +67,25 @@ def test_trainer_of_the_benchmark_trains():
         trainer.update(iteration)
     assert len(trainer.model) == 500 and trainer.degree == 3 and int(trainer.growth.views.max()) == 3
     assert all((trainer.model.parameters[name] != tensor).any() for name, tensor in before.items())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", [(), ("linear",), ("composited",)])
+def test_steps_of_training_are_those_of_the_cpu(kinds):
+    """Loss and gradients of three steps, from the photographs to Adam, by the driver of a GPU in fibers."""
+    found = []
+    for driver in (CPU, CUDA):
+        with using(driver):
+            trainer = made_up.make_trainer(500, 64, 48, "cpu", kinds)
+            for iteration in range(10, 13):
+                loss = trainer.differentiate(iteration)
+                gradients = {name: leaf.grad.clone() for name, leaf in trainer.model.parameters.items()}
+                trainer.update(iteration)
+        found.append((loss, gradients))
+    (loss, gradients), (other, others) = found
+    assert abs(other - loss) < 1e-6
+    for name, gradient in gradients.items():
+        assert (others[name] - gradient).norm() < 1e-5 * gradient.norm(), name
 
 
 def test_rows_survive_what_comes_after_them(tmp_path, capsys):
@@ -111,10 +134,36 @@ def test_what_is_stored_is_what_the_cpu_says():
         assert (tensor - found[name]).norm() < 1e-5 * tensor.norm(), name
 
 
+def test_gsplat_gets_the_same_scene(monkeypatch):
+    """By our function of the same arguments, in its place: the same image."""
+    images = []
+
+    def spying(*arguments, **options):
+        found = rasterization(*arguments, **options)
+        images.append(found[0].detach()[0])
+        return found
+
+    monkeypatch.setattr(gpu_training, "_gsplat", lambda device: spying)
+    rows = gpu_training.measure_gsplat(500, 64, 40, "cpu", 1)
+    assert [row[2] for row in rows] == ["ours", "gsplat"]
+    gaussians = Gaussians(*(tensor.detach() for tensor in made_up.make_gaussians(500, "cpu").activated()))
+    expected = render(gaussians, made_up.cameras(64, 40, 1)[0], torch.zeros(3), RasterOptions()).image
+    assert (images[0] - expected).abs().max() < 0.02 and expected.max() > 0.5  # alpha is clamped to another value
+
+
+def test_lines_of_ncu():
+    names = ",".join(f'"{name}"' for name in ("ID", "Kernel Name", *gpu_training.METRICS))
+    lines = ["==PROF== x", names, '"","","ns","%","%","%"', '"0","short","1,500","1.0","2.0","3.0"',
+             '"1","long","2,000,000","50.4","9.6","25.0"']  # fmt: skip
+    rows = gpu_training.rows_of_ncu("\n".join(lines))
+    assert rows == [["long", "2.000", "50", "10", "25"], ["short", "0.002", "1", "2", "3"]]
+    assert gpu_training.rows_of_ncu("nothing") == []
+
+
 @pytest.mark.slow
 def test_dry_run(tmp_path):
     command = [sys.executable, ROOT / "benchmarks/gpu.py", "--device", "cpu", "--out", tmp_path]
     subprocess.run(command, check=True, capture_output=True)
     tables = json.loads((tmp_path / "gpu.json").read_text())["tables"]
-    assert set(tables) == set(gpu.HEADERS) - {"Left out", "Kernels of a step"}
+    assert set(tables) == set(gpu_results.HEADERS) - {"Left out", "Kernels of a step", "Kernels by ncu"}
     assert {row["size"] for row in tables["Training step"]} == {"64 x 64", "98 x 54", "192 x 108"}

@@ -19,8 +19,9 @@ from test_losses import oracle
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS, psnr, ssim
 from warp_splat.evaluation.views import evaluate_views
+from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.scene.images import read_mask
-from warp_splat.training.loss import LossByConvolution, image_loss
+from warp_splat.training.loss import image_loss
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -80,9 +81,9 @@ def test_masks_of_another_shape_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("bytes_", [False, True])
-@pytest.mark.parametrize("loss_of", ["kernels", "convolutions"])
+@pytest.mark.parametrize("driver", [CPU, CUDA])
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_masked_loss(share, loss_of, bytes_):
+def test_masked_loss(share, driver, bytes_):
     generator = torch.Generator().manual_seed(4)
     image, target, other = torch.rand(3, 40, 53, 3, generator=generator)
     if bytes_:
@@ -92,11 +93,9 @@ def test_masked_loss(share, loss_of, bytes_):
 
     def loss(image, target):
         leaf = image.clone().requires_grad_()
-        if loss_of == "kernels":
+        with using(driver):
             value = image_loss(leaf, target, share, mask)
-        else:
-            value = LossByConvolution.apply(leaf * mask, target * mask, share)
-        value.backward()
+            value.backward()
         return value.item(), leaf.grad
 
     value, gradient = loss(image, target)
@@ -110,12 +109,9 @@ def test_masked_loss(share, loss_of, bytes_):
     hidden = mask == 0
     again = loss(torch.where(hidden, 1 - image, image), torch.where(hidden, other, target))
     assert again[0] == value and torch.equal(again[1], gradient)
-    if loss_of == "kernels":  # nor does it matter what stands for "counts", or that a hidden pixel is no number
-        mask *= 255
-        again = loss(
-            torch.where(hidden, torch.nan, image), target if bytes_ else torch.where(hidden, torch.inf, target)
-        )
-        assert again[0] == value and torch.equal(again[1], gradient)
+    mask *= 255  # nor does it matter what stands for "counts", or that a hidden pixel is no number
+    again = loss(torch.where(hidden, torch.nan, image), target if bytes_ else torch.where(hidden, torch.inf, target))
+    assert again[0] == value and torch.equal(again[1], gradient)
 
 
 def test_metrics_do_not_see_what_is_masked(tmp_path):

@@ -24,6 +24,8 @@ blurred along columns. Tried:
 - no faster: four rows at once instead of two
 """
 
+from typing import Any
+
 import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
@@ -121,6 +123,28 @@ def between(values: vec16, limits: wp.vec2):
 
 
 @wp.func
+def similarity(mx: Any, my: Any, squares: Any, product: Any, outside: Any, p: float, q: float):
+    """SSIM, and its derivatives by m1, e11 and e12, from the moments: e11 + e22, e12; ``outside`` is 1 - s."""
+    one = fill(1.0, mx)
+    inner = one - outside
+    mu_x = mx + inner * p
+    mu_y = my + inner * q
+    covariance = product - times(mx, my) + times(outside, my * p + mx * q + inner * (p * q))
+    variances = squares - times(mx, mx) - times(my, my)
+    variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
+    a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
+    b = covariance * 2.0 + fill(C2, mu_x)
+    c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
+    d = over(one, wp.max(variances, fill(0.0, mx)) + fill(C2, mu_x))  # rounding must not make it negative
+    scale = times(c, d)
+    ssim = times(times(a, b), scale)
+    far_x = mu_x - fill(p, mx)
+    far_y = mu_y - fill(q, mx)
+    slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
+    return ssim, slope * 2.0, -times(ssim, d), times(a, scale) * 2.0
+
+
+@wp.func
 def compare_row(
     moments: wp.array2d[vec16],  # [G, MOMENTS]
     missing: wp.array[vec16],
@@ -134,7 +158,6 @@ def compare_row(
     """The slopes of a row, and the sum of its SSIM."""
     p = centers[0]
     q = centers[1]
-    one = vec16(1.0)
     zero = vec16(0.0)
     groups = missing.shape[0]
     above = float(0.0)  # share of the window above or below the image
@@ -144,33 +167,24 @@ def compare_row(
     for plane in range(SLOPES):
         slopes_out[plane, 0] = zero
         slopes_out[plane, groups + 1] = zero
-    similarity = zero
+    sums = zero
     for group in range(groups):
-        mx = moments[group, 0]
-        my = moments[group, 1]
-        squares = moments[group, 2] + moments[group, 3]
         outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
-        inner = one - outside
-        mu_x = mx + inner * p
-        mu_y = my + inner * q
-        covariance = moments[group, 4] - times(mx, my) + times(outside, my * p + mx * q + inner * (p * q))
-        variances = squares - times(mx, mx) - times(my, my)
-        variances = variances + times(outside, (mx * p + my * q) * 2.0 + inner * (p * p + q * q))
-        a = times(mu_x, mu_y) * 2.0 + fill(C1, mu_x)
-        b = covariance * 2.0 + fill(C2, mu_x)
-        c = over(one, times(mu_x, mu_x) + times(mu_y, mu_y) + fill(C1, mu_x))
-        d = over(one, wp.max(variances, zero) + fill(C2, mu_x))  # rounding must not make it negative
-        scale = times(c, d)
-        ssim = times(times(a, b), scale)
-        far_x = mu_x - vec16(p)
-        far_y = mu_y - vec16(q)
-        slope = times(times(mu_y, b) - times(far_y, a), scale) - times(ssim, times(mu_x, c) - times(far_x, d))
+        ssim, mean, square, product = similarity(
+            moments[group, 0],
+            moments[group, 1],
+            moments[group, 2] + moments[group, 3],
+            moments[group, 4],
+            outside,
+            p,
+            q,
+        )
         start = LANES * group
-        similarity = similarity + inside(ssim, start, length)
-        slopes_out[0, group + 1] = inside(slope * 2.0, start, length)
-        slopes_out[1, group + 1] = inside(-times(ssim, d), start, length)
-        slopes_out[2, group + 1] = inside(times(a, scale) * 2.0, start, length)
-    return total(similarity)
+        sums = sums + inside(ssim, start, length)
+        slopes_out[0, group + 1] = inside(mean, start, length)
+        slopes_out[1, group + 1] = inside(square, start, length)
+        slopes_out[2, group + 1] = inside(product, start, length)
+    return total(sums)
 
 
 @wp.kernel

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
-from torch.nn import functional
 
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
@@ -20,9 +19,9 @@ from warp_splat.raster.drivers import DRIVERS, driver_of
 from warp_splat.runtime.launch import launch, pack_struct, view
 from warp_splat.runtime.pool import even_slices
 from warp_splat.runtime.timers import stage
+from warp_splat.training.loss_in_blocks import FAR_APART, LossInBlocks
 
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
-FAR_APART = 10.0  # in units of an image's usual range
 
 
 def image_loss(
@@ -54,9 +53,8 @@ def image_loss(
     if mask is not None:
         counts = mask != 0
         image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))
-    if driver_of(image.device).lanes == 1:
-        return LossByConvolution.apply(image.clamp(0.0, 1.0) if clamped else image, target, lambda_dssim)
-    return ImageLoss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
+    loss = LossInBlocks if driver_of(image.device).lanes == 1 else ImageLoss
+    return loss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
 
 
 def _problem(image, target, lambda_dssim: float, mask) -> str | None:
@@ -80,63 +78,6 @@ def _problem(image, target, lambda_dssim: float, mask) -> str | None:
         return None
     found = f"{list(mask.shape)} of {mask.dtype}" if is_tensor else type(mask).__name__
     return f"a mask, a tensor {wanted} of uint8, 0 for pixels that do not count, got {found}"
-
-
-def loss_by_convolution(image: torch.Tensor, target: torch.Tensor, lambda_dssim: float) -> torch.Tensor:
-    """:func:`image_loss` for a GPU: the formula of ``kernels.ssim`` in torch's convolutions, which derives it."""
-    with stage("loss"):
-        p, q = _centers(image, target)
-        # planes [3, H, W], dense: then grouped convolutions are torch's own, which do not round to TF32 as cuDNN's do
-        x, y = (
-            (picture / 255.0 if picture.dtype == torch.uint8 else picture).permute(2, 0, 1).contiguous() - center
-            for picture, center in ((image, p), (target, q))
-        )
-        m1, m2, e11, e22, e12 = _blur(torch.stack([x, y, x * x, y * y, x * y]))
-        s = _inside(image.shape[0], image.shape[1], image.device)
-        mu1, mu2 = m1 + p * s, m2 + q * s
-        var1 = e11 - m1 * m1 + (1.0 - s) * (2.0 * p * m1 + p * p * s)
-        var2 = e22 - m2 * m2 + (1.0 - s) * (2.0 * q * m2 + q * q * s)
-        covariance = e12 - m1 * m2 + (1.0 - s) * (p * m2 + q * m1 + p * q * s)
-        above = (2.0 * mu1 * mu2 + ssim.C1) * (2.0 * covariance + ssim.C2)
-        below = (mu1 * mu1 + mu2 * mu2 + ssim.C1) * (var1 + var2 + ssim.C2)
-        l1 = (x - y + (p - q)).abs().mean()
-        return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - (above / below).mean())
-
-
-def _blur(planes: torch.Tensor) -> torch.Tensor:
-    """Weighted mean over the window around each pixel, [B, 3, H, W], with zeros outside the image."""
-    window = _window(planes.device)
-    rows = functional.conv2d(planes, window, padding=(0, RADIUS), groups=CHANNELS)
-    return functional.conv2d(rows, window.mT, padding=(RADIUS, 0), groups=CHANNELS)
-
-
-@functools.cache  # copied once: a copy from the host would wait for the GPU in every step
-def _window(device: torch.device) -> torch.Tensor:
-    """The window's weights for each channel, [3, 1, 1, 11]."""
-    return torch.tensor(list(WEIGHTS), dtype=torch.float32, device=device).repeat(CHANNELS, 1, 1, 1)
-
-
-@functools.lru_cache(16)
-def _inside(height: int, width: int, device: torch.device) -> torch.Tensor:
-    """The share of the window inside the image around each pixel, [1, H, W]."""
-    return _blur(torch.ones(1, CHANNELS, height, width, dtype=torch.float32, device=device))[0, :1]
-
-
-class LossByConvolution(torch.autograd.Function):
-    """:func:`loss_by_convolution` with its adjoint as a stage of its own."""
-
-    @staticmethod
-    def forward(ctx, image, target, lambda_dssim):
-        with torch.set_grad_enabled(ctx.needs_input_grad[0]):
-            ctx.image = image.detach().requires_grad_(ctx.needs_input_grad[0])
-            ctx.loss = loss_by_convolution(ctx.image, target, lambda_dssim)
-        return ctx.loss.detach()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, adj_loss):
-        with stage("adjoint of loss"):
-            return *torch.autograd.grad(ctx.loss, ctx.image, adj_loss), None, None
 
 
 class ImageLoss(torch.autograd.Function):

@@ -20,7 +20,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.simd import Types
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch_in_lanes, load, view
+from warp_splat.runtime.launch import launch_in_lanes, load, there, view
 from warp_splat.training.options import LearnOptions
 
 BETAS = (0.9, 0.999)
@@ -47,17 +47,16 @@ def move(
     """Launch the kernel of :mod:`warp_splat.kernels.adam` on tables of ``count`` rows."""
     device = tables[0][0].device
     sizes = [table[0].numel() // count for table in tables]
-    widths = torch.tensor(sizes, dtype=torch.int32, device=device)
-    of_tables = torch.tensor(numbers, dtype=torch.float32, device=device)
-    keys = torch.tensor([KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))])
-    keys = keys.to(torch.int32).to(device)
+    numbered = [KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))]
+    widths, keys = (there(values, torch.int32, device) for values in (sizes, numbered))
+    of_tables = there(numbers, torch.float32, device)
 
     def arguments(_types: Types, rows: slice) -> tuple[list, list]:
         places = [
             [t.data_ptr() + t.element_size() * size * rows.start for t in table]
             for table, size in zip(tables, sizes, strict=True)
         ]
-        addresses = torch.tensor(places, device=device)
+        addresses = there(places, torch.int64, device)
         shown = widths if radii is None else radii[rows]
         inputs = [rows.start, view(widths, wp.int32), view(keys, wp.int32), view(of_tables, wp.float32)]
         inputs.append(view(shown, wp.int32))

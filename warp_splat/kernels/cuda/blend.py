@@ -1,7 +1,8 @@
 """The CUDA driver of the blend: one block of 256 threads per 16 x 16 tile, one pixel per thread.
 
-Each thread stages one Gaussian of a batch of 256 in shared memory; all threads blend the batch; the block votes whether
-every pixel has stopped. The mathematics is that of the CPU's lanes (:mod:`warp_splat.kernels.splat`), for one pixel.
+Each thread stages one Gaussian of a batch of 256 in shared memory, and which warps its box touches; these blend it; the
+block votes whether every pixel has stopped. A warp has 8 x 4 pixels, as blocks of the adjoint. The mathematics is that
+of the CPU's lanes (:mod:`warp_splat.kernels.splat`), for one pixel.
 """
 
 import functools
@@ -9,8 +10,8 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.cuda.warps import vec10
-from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.cuda.warps import PIXELS, WARP, across_of, ballot, blocks_of, down_of, lowest, vec10
+from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
@@ -33,7 +34,8 @@ def staged_of(splat: Splat2D):
 @functools.cache
 def make_blend_block(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
-    fall_at, CHANNELS = make_falloff(variant.falloff).value, variant.channels
+    falloff, CHANNELS = make_falloff(variant.falloff), variant.channels
+    fall_at, reach_of = falloff.value, falloff.reach_of
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
     def blend(
@@ -49,10 +51,16 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         kept_out: wp.array2d[float],  # [M, THREADS] transmittance in front of each Gaussian
     ):
         tile, thread = wp.tid()
-        column = (tile % bins.tiles_x) * TILE + thread % TILE
-        line = (tile // bins.tiles_x) * TILE + thread // TILE
+        warp = thread // WARP
+        across = across_of(thread % WARP, warp)
+        down = down_of(thread % WARP, warp)
+        place = down * TILE + across
+        column = (tile % bins.tiles_x) * TILE + across
+        line = (tile // bins.tiles_x) * TILE + down
         x = float(column) + 0.5
         y = float(line) + 0.5
+        left = float((tile % bins.tiles_x) * TILE) + 0.5
+        top = float((tile // bins.tiles_x) * TILE) + 0.5
         start = bins.ranges[tile][0]
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
         inside = line < pixels_out.image.shape[0] and column < pixels_out.image.shape[1]
@@ -65,28 +73,47 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         for batch in range((length + THREADS - 1) // THREADS):
             first = batch * THREADS
             mine = vec10(0.0)
+            touched = int(0)
             if first + thread < length:
-                mine = staged_of(bins.splats[bins.instances[start + first + thread]])
-            staged = wp.tile(mine, preserve_type=True)
-            for j in range(wp.min(THREADS, length - first)):
-                g = staged[j]
-                fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
-                alpha = alpha_of(fall * g[OPACITY], alphas)
-                behind = advance(t, alpha, t_min)
-                w = weight(t, alpha, behind)
+                splat = bins.splats[bins.instances[start + first + thread]]
+                mine = staged_of(splat)
                 if wp.static(variant.keep):
-                    kept_out[start + first + j, thread] = t
-                color += wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2]) * w
-                if wp.static(CHANNELS > 3):
-                    far += g[CHANNEL + 3] * w
-                t = behind
-                if behind >= 0.0:
-                    count = first + j + 1
+                    touched = -1  # every T is kept
+                else:
+                    touched = blocks_of(splat, 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0]), left, top)
+            staged = wp.tile(mine, preserve_type=True)
+            word = int(0)  # of a warp's lane: which of the warp's Gaussians touch the block of that number
+            for block in range(PIXELS):
+                touching = ballot((touched & (1 << block)) != 0, thread)
+                if thread % WARP == block:
+                    word = touching
+            words = wp.tile(word)
+            for group in range((wp.min(THREADS, length - first) + WARP - 1) // WARP):
+                left_over = words[group * WARP + warp]
+                if wp.static(not variant.keep):
+                    if ballot(t >= 0.0, thread) == 0:
+                        left_over = 0
+                while left_over != 0:
+                    j = group * WARP + lowest(left_over)
+                    left_over = left_over & (left_over - 1)
+                    g = staged[j]
+                    fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
+                    alpha = alpha_of(fall * g[OPACITY], alphas)
+                    behind = advance(t, alpha, t_min)
+                    w = weight(t, alpha, behind)
+                    if wp.static(variant.keep):
+                        kept_out[start + first + j, place] = t
+                    color += wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2]) * w
+                    if wp.static(CHANNELS > 3):
+                        far += g[CHANNEL + 3] * w
+                    t = behind
+                    if behind >= 0.0:
+                        count = first + j + 1
             if wp.tile_max(wp.tile(t))[0] < 0.0:
                 break
         t = wp.abs(t)
-        final_out[tile, thread] = t
-        count_out[tile, thread] = count
+        final_out[tile, place] = t
+        count_out[tile, place] = count
         if inside:
             for channel in range(3):
                 pixels_out.image[line, column, channel] = color[channel] + t * background[channel]

@@ -1,4 +1,4 @@
-"""Sums over the lanes of a warp, by shuffles; and a warp for a whole tile, of which a lane takes eight pixels.
+"""Sums and votes of the lanes of a warp; and a warp for a whole tile, of which a lane takes eight pixels.
 
 These lie in blocks of 8 x 4, of which a Gaussian reaches fewer than of pairs of lines: in a million Gaussians on
 980 x 545 px, 32 % instead of 39.
@@ -62,6 +62,37 @@ def lane_sum(row: vec10, thread: int) -> float:
 
 @wp.func_native(_halving(16))
 def lane_sum(row: vec_channels, thread: int) -> float: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return (int)__ballot_sync(0xffffffffu, vote);
+#else
+    wp::wp_block_shared<wp::vec_t<WP_TILE_BLOCK_DIM, int>> votes;
+    (*votes)[thread] = vote;
+    WP_TILE_SYNC();
+    unsigned bits = 0;
+    for (int lane = 0; lane < 32; ++lane)
+        bits |= (unsigned)((*votes)[thread / 32 * 32 + lane] != 0) << lane;
+    WP_TILE_SYNC();
+    return (int)bits;
+#endif
+""")
+def ballot(vote: bool, thread: int) -> int:
+    """Which lanes of the thread's warp vote for it: a bit for each."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ffs(bits) - 1;
+#endif
+""")
+def lowest(bits: int) -> int:
+    """The place of the lowest bit that is set; -1 if there is none."""
+    ...
 
 
 @wp.func
