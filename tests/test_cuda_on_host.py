@@ -15,6 +15,7 @@ from test_binning import crowded
 
 from warp_splat import RasterOptions, rasterize
 from warp_splat.config import ADJOINTS
+from warp_splat.gsplat import rasterization
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.training.loss import image_loss
 
@@ -109,6 +110,26 @@ def test_more_than_a_batch(monkeypatch, tmp_path):
     for number, launch in enumerate(launches_of("manual", monkeypatch, dense_tile())):
         (folder := tmp_path / str(number)).mkdir()
         check_clean(build(launch, "thread", folder), launch)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+def test_magnitudes(sanitizer, monkeypatch, tmp_path):
+    """Sums of magnitudes, which gsplat's function asks for; it repeats kernels that others watch."""
+    scene = small()
+    leaves = [getattr(scene, name).detach().clone().requires_grad_() for name in PARAMETERS]
+    camera, pose = scene.camera, torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = torch.tensor(camera.rotation), torch.tensor(camera.translation)
+    lens = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    more = {"sh_degree": int(scene.sh.shape[1] ** 0.5) - 1, "absgrad": True}
+    with using(CUDA), recorded(monkeypatch) as launches:
+        image, *_ = rasterization(*leaves, pose[None], lens[None], camera.width, camera.height, **more)
+        image.square().sum().backward()
+    (launch,) = (launch for launch in launches if launch.kernel.key.startswith("make_adj_channels"))
+    program = build(launch, sanitizer, tmp_path)
+    barriers = check_clean(program, launch)
+    if sanitizer == "thread":
+        check_controls(program, launch, barriers)
 
 
 @pytest.mark.long
