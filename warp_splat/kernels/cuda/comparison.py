@@ -35,7 +35,7 @@ class PicturesView:
 
 
 @wp.func
-def shown(pictures: PicturesView, row: int, place: int):
+def pair_at(pictures: PicturesView, row: int, place: int):
     """Image and target at a place, less their centers; 0 outside."""
     pair = wp.vec2(0.0, 0.0)
     image = pictures.image
@@ -93,7 +93,7 @@ def compare_block(
     ring = mat_moments(0.0)
     loss = float(0.0)
     for ahead in range(top - RADIUS, bottom + RADIUS):
-        own = shown(pictures, ahead, place)
+        own = pair_at(pictures, ahead, place)
         staged = wp.tile(own, preserve_type=True)
         moments = vec_moments(0.0)
         for tap in range(WINDOW):
@@ -160,7 +160,7 @@ def adj_compare_block(
             sums = wp.vec3(0.0)
             for tap in range(WINDOW):
                 sums += ring[tap] * WEIGHTS[tap]
-            pair = shown(pictures, row, place)
+            pair = pair_at(pictures, row, place)
             delta = pair[0] - pair[1] + (p - q)
             adj = where_less(0.0, delta, weights[0], where_less(delta, 0.0, -weights[0], 0.0))
             adj += weights[1] * (sums[0] + 2.0 * pair[0] * sums[1] + pair[1] * sums[2])
