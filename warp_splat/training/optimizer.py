@@ -44,10 +44,21 @@ def _root(base: float, degree: int) -> Decimal:
 def move(
     tables: list[list[torch.Tensor]], numbers: list, count: int, radii: torch.Tensor | None, iteration: int
 ) -> None:
-    """Launch the kernel of :mod:`warp_splat.kernels.adam` on tables of ``count`` rows."""
+    """Launch the kernel of :mod:`warp_splat.kernels.adam` on tables of ``count`` rows.
+
+    A core follows few streams of memory at a time: all tables together take twice as long. A GPU takes them together.
+    """
+    keys = [KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))]
+    together = list(zip(tables, numbers, keys, strict=True))
+    apart = [[one] for one in together] if driver_of(tables[0][0].device).lanes > 1 else [together]
+    for some in apart:
+        _launch(*map(list, zip(*some, strict=True)), count, radii)
+
+
+def _launch(tables: list, numbers: list, numbered: list[int], count: int, radii: torch.Tensor | None) -> None:
+    """All of them in one kernel; ``numbered``: keys for rounding at random."""
     device = tables[0][0].device
     sizes = [table[0].numel() // count for table in tables]
-    numbered = [KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))]
     widths, keys = (there(values, torch.int32, device) for values in (sizes, numbered))
     of_tables = there(numbers, torch.float32, device)
 
