@@ -218,7 +218,7 @@ def sentences() -> dict[str, list[tuple]]:
         ],
         "performance.md": [
             (
-                "Two threads do {} times the multiply-adds of one, but move only {} times the bytes",
+                "Two threads do {} times the multiply-adds of one, and moved {} times the bytes in that run",
                 f.two(f.of_two_threads("rate")),
                 f.two(f.of_two_threads("bandwidth")),
             ),
