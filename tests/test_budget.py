@@ -40,10 +40,10 @@ def count_steps(scene, budget, **options):
     return trainer, found
 
 
-@pytest.mark.parametrize(("budget", "until"), [(POINTS, 45), (5017, 45), (12_000, 45), (9001, 10**6)])
+@pytest.mark.parametrize(("budget", "until"), [(POINTS, 45), (5017, 45), (12_000, 45), (9001, 10**6), (1001, 45)])
 def test_it_ends_with_exactly_as_many_as_asked_for(budget, until, scene):
     _, found = count_steps(scene, budget, densify_until_iter=until, opacity_lr=0.3)  # some fade away meanwhile
-    assert found[-1] == budget and found == sorted(found) and found[19] == POINTS
+    assert found[-1] == budget and found == sorted(found, reverse=budget < POINTS) and found[19] == POINTS
     due = [round(POINTS + (budget - POINTS) * (step / (min(until, 50) - 10)) ** 0.5) for step in (10, 20)]
     assert [found[20], found[30]] == due
 
@@ -60,21 +60,30 @@ def test_any_number_of_threads_makes_the_same_bytes(growth, scene):
     assert found[0] == found[1] and found[0][0][-1] > POINTS
 
 
+def test_a_budget_has_to_be_named(capsys, tmp_path):
+    command = ["train", "-s", str(SCENE), "-r", "8", "-m", str(tmp_path / "a"), "--growth", "budget"]
+    sentence = "--max_gaussians 0: expected the number of Gaussians that --growth budget ends with, at least 1"
+    assert sentence in fails(capsys, *command)
+
+
 @pytest.mark.parametrize(
-    ("flags", "sentence"),
+    ("budget", "until", "sentence"),
     [
+        (POINTS, 45, ""),
+        (2 * POINTS, 21, ""),
+        (4000, 45, f"The weakest of {POINTS} Gaussians go, until there are --max_gaussians 4000."),
         (
-            "",
-            "--max_gaussians 0: expected the number of Gaussians that --growth budget ends with, at least the 4500 of",
+            9001,
+            21,
+            f"--max_gaussians 9001 will not be reached, since 1 densifications double {POINTS} to 9000 at most.",
         ),
-        ("--max_gaussians 4499", "at least the 4500 of the start; raise it, or take --growth reference."),
-        ("--max_gaussians 9001 --densify_until_iter 601", "at most 9000, since 1 densifications double 4500"),
-        ("--max_gaussians 4501 --densify_until_iter 600", "at most 4500, since 0 densifications double 4500"),
+        (9001, 11, f"Warning: no densification before step 11: there will be {POINTS} Gaussians as now."),
     ],
 )
-def test_a_budget_that_cannot_be(flags, sentence, capsys, tmp_path):
-    command = ["train", "-s", str(SCENE), "-r", "8", "-m", str(tmp_path / "a"), "--growth", "budget", *flags.split()]
-    assert sentence in fails(capsys, *command)
+def test_what_a_budget_makes_is_told(budget, until, sentence, scene):
+    trainer, found = count_steps(scene, budget, densify_until_iter=until)
+    assert sentence in " ".join(trainer.told) and bool(trainer.told) == bool(sentence)
+    assert found[-1] == (POINTS if until == 11 else min(budget, 2 * POINTS))
 
 
 def growth_on(model, budget=None, processes=ALONE):

@@ -19,8 +19,8 @@ from splat_files import some_file
 
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
+from warp_splat.scene import load_scene
 from warp_splat.training.loss import image_loss
-from warp_splat.training.opening import open_scene
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -91,12 +91,11 @@ def test_start_from_a_file(tmp_path, degree):
 
 
 def test_a_limit_below_the_points_is_told(tmp_path):
-    root, lines = write_colmap(tmp_path), []
-    config = TrainConfig(source_path=str(root), max_gaussians=5)
-    count = len(open_scene(config, None, lines.append).points)
-    assert lines[-1] == f"Warning: --max_gaussians 5 bounds growth alone; training starts with all {count} points."
-    open_scene(config.changed(max_gaussians=count), None, lines.append)
-    assert "--max_gaussians" not in lines[-1]
+    scene = load_scene(write_colmap(tmp_path))
+    count = len(scene.points)
+    told = Trainer(scene, TrainConfig(max_gaussians=5, device="cpu")).told
+    assert told == [f"Warning: --max_gaussians 5 bounds growth alone; training starts with all {count} Gaussians."]
+    assert not Trainer(scene, TrainConfig(max_gaussians=count, device="cpu")).told
 
 
 def seen_targets(monkeypatch, scene, steps, **options):

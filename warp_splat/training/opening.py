@@ -119,9 +119,6 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene
     scene = load_scene(data.source_path, **same, start=start, report=say)
     if scene.random_points and not begun:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
-    if not begun and 0 < config.grow.max_gaussians < len(scene.points):
-        most = f"--max_gaussians {config.grow.max_gaussians}"
-        say(f"Warning: {most} bounds growth alone; training starts with all {len(scene.points)} points.")
     if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:
         which = "with" if scene.start.antialiased else "without"
         say(f"Warning: {data.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")

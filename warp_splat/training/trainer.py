@@ -99,6 +99,7 @@ class Trainer:
         groups = [group for parameters in having(self.parts, "parameters") for group in parameters()]
         self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)
         self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
+        self.told += [sentence for told in having([self.growth], "told") for sentence in told()]
         self.quarantine = Quarantine()
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0

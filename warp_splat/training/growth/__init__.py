@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from warp_splat.errors import InputError
@@ -25,13 +24,13 @@ class ReferenceOptions:
     prune_screen_size: int = growing(0, "prune Gaussians wider than this radius in px; 0: never, as in the reference")
 
 
-def check_budget(growth: str, budget: int, start: int, most: float = math.inf, why: str = "") -> None:
-    """Raise InputError if --max_gaussians is not what a growth can end with: ``start`` to ``most``."""
-    what = f"--max_gaussians {budget}: expected the number of Gaussians that --growth {growth} ends with"
+def check_budget(growth: str, budget: int, start: int = 1) -> None:
+    """Raise InputError if --max_gaussians is not what a growth can end with: ``start`` or more."""
     if budget < start:
-        raise InputError(f"{what}, at least the {start} of the start; raise it, or take --growth reference.")
-    if budget > most:
-        raise InputError(f"{what}, at most {most:.0f}, since {why}; lower it, or raise --densify_until_iter.")
+        raise InputError(
+            f"--max_gaussians {budget}: expected the number of Gaussians that --growth {growth} ends with, at least "
+            f"{start}; raise it, or take --growth reference."
+        )
 
 
 GROWTHS: dict[str, Entry] = {

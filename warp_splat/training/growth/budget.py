@@ -36,10 +36,20 @@ class Budget(Reference):
         super().__init__(options, setting, optimizer)
         self.start = len(self.model)
         self.end = min(options.densify_until_iter, setting.iterations)
-        interval = options.densification_interval
-        doublings = max((self.end - 1) // interval - options.densify_from_iter // interval, 0)
-        why = f"{doublings} densifications double {self.start}"
-        check_budget("budget", setting.max_gaussians, self.start, self.start * 2.0**doublings, why)
+        check_budget("budget", setting.max_gaussians)
+
+    def told(self) -> list[str]:
+        """What may surprise about the budget, as sentences."""
+        budget, interval = self.setting.max_gaussians, self.options.densification_interval
+        doublings = max((self.end - 1) // interval - self.options.densify_from_iter // interval, 0)
+        if not doublings and budget != self.start:
+            return [f"Warning: no densification before step {self.end}: there will be {self.start} Gaussians as now."]
+        if budget < self.start:
+            return [f"The weakest of {self.start} Gaussians go, until there are --max_gaussians {budget}."]
+        if budget > self.start * 2.0**doublings:
+            most = f"{doublings} densifications double {self.start} to {self.start * 2**doublings}"
+            return [f"Warning: --max_gaussians {budget} will not be reached, since {most} at most."]
+        return []
 
     def clear(self) -> None:
         """Begin to observe the present set."""
@@ -89,8 +99,8 @@ class Budget(Reference):
             self.processes.sum(rows)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         keep = survivors(raw)
-        if int(keep.sum()) >= due:
-            keep &= ~self._weakest(keep)
+        if (kept := int(keep.sum())) >= due:
+            keep &= ~self._weakest(keep, kept - due)
         kept = int(keep.sum())
         pruned, room = len(keep) - kept, min(max(due - kept, 0), kept)
         if not pruned + room or not kept:  # an empty scene could never recover
@@ -104,12 +114,13 @@ class Budget(Reference):
         self.clear()
         return Change(0, len(split), pruned)
 
-    def _weakest(self, keep: torch.Tensor) -> torch.Tensor:
-        """Of those that were looked at, a share with the least weight in the pixels [N]."""
+    def _weakest(self, keep: torch.Tensor, excess: int) -> torch.Tensor:
+        """Those with the least weight in the pixels [N]: a share of what was looked at, or the ``excess`` if more."""
         seen = keep & (self.looks > 0)
         weight = torch.where(seen, self.weight / self.looks.clamp_min(1.0), torch.inf)
-        order = torch.sort(weight, stable=True).indices[: min(round(MOVED * int(keep.sum())), int(seen.sum()))]
-        return torch.zeros_like(keep).index_fill_(0, order, True)
+        order = torch.sort(torch.where(keep, weight, torch.nan), stable=True).indices  # the unknown, then the left out
+        count = max(min(round(MOVED * int(keep.sum())), int(seen.sum())), excess)
+        return torch.zeros_like(keep).index_fill_(0, order[:count], True)
 
     def _score(self) -> torch.Tensor:
         gradient = self.gradient / self.views.clamp_min(1.0)

@@ -38,6 +38,13 @@ class Reference:
         self.random = torch.Generator().manual_seed(setting.seed)
         self.clear()
 
+    def told(self) -> list[str]:
+        """What may surprise about the limit, as sentences."""
+        limit, start = self.setting.max_gaussians, len(self.model)
+        if not 0 < limit < start:
+            return []
+        return [f"Warning: --max_gaussians {limit} bounds growth alone; training starts with all {start} Gaussians."]
+
     def clear(self) -> None:
         """Begin to observe the present set."""
         new = self.model.parameters["means"].new_zeros
