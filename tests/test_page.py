@@ -19,8 +19,9 @@ from splat_files import covariances, some_splats
 from warp_splat.cli import main
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation.metrics import psnr
+from warp_splat.export_html import pack
 from warp_splat.export_html.command import make_page
-from warp_splat.export_html.pack import pack_gaussians, shown
+from warp_splat.export_html.pack import parts, shown
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.png import load_png
@@ -53,16 +54,21 @@ class Blocks(HTMLParser):
         self.open = None
 
 
-def unpacked(data, count, coefficients):
-    """The numbers of warp_splat/export_html/pack.py's table, decoded as it says."""
-    planes = np.frombuffer(gzip.decompress(data), np.uint8).reshape(-1, count)
-    rows = np.ascontiguousarray(planes.T)
+def unpacked(blocks, count, coefficients):
+    """The numbers of warp_splat/export_html/pack.py's tables, decoded as it says."""
+
+    def table(name):
+        found = [np.frombuffer(gzip.decompress(data), np.uint8) for id, data in blocks.items() if id.startswith(name)]
+        parts = [part.reshape(-1, min(pack.CHUNK, count - k * pack.CHUNK)).T for k, part in enumerate(found)]
+        return np.concatenate(parts) if parts else np.zeros((count, 0), np.uint8)
+
+    rows = table("gaussians")
     shorts = rows[:, 12:32].copy().view("<i2").astype(np.float64)
     opacities = rows[:, 18:20].copy().view("<u2")[:, 0] / 65535
     half = shorts[:, 4:7] / 8192  # tan(angle / 4) times the axis
     norm = (half**2).sum(axis=1, keepdims=True)
     quats = np.concatenate([(1 - norm) / (1 + norm), 2 * half / (1 + norm)], axis=1)
-    groups = rows[:, 32:].reshape(count, -1, 16)
+    groups = table("harmonics").reshape(count, pack.texels(coefficients), 16)
     rest = (
         groups[:, :, :15].view(np.int8).reshape(count, -1, 5, 3)
         * (2.0 ** groups[:, :, 15].astype(np.float64) / 128)[:, :, None, None]
@@ -76,7 +82,7 @@ def test_what_is_embedded_decodes_within_the_stated_error(coefficients):
     wanted, origin = some_splats(200, coefficients), np.array([1e4, -20.0, 3.0])
     wanted.sh[7:9] *= 40.0
     wanted = wanted._replace(means=(wanted.means + origin).astype(np.float32))
-    found = unpacked(pack_gaussians(wanted, origin), 200, coefficients)
+    found = unpacked(parts(wanted, origin), 200, coefficients)
     offsets = wanted.means - origin
     np.testing.assert_allclose(found.means, offsets, rtol=2**-18 * 1.01, atol=0)
     np.testing.assert_allclose(found.scales, wanted.scales, atol=1.01 / 512, rtol=0)
@@ -97,7 +103,7 @@ def test_what_is_embedded_decodes_within_the_stated_error(coefficients):
 def test_coefficients_beyond_the_range_stay_finite():
     splats = some_splats(5)
     splats.sh[:] = np.float32([3e38, -3e38, 1e3])[None, None]
-    found = unpacked(pack_gaussians(splats, np.zeros(3)), 5, 16)
+    found = unpacked(parts(splats, np.zeros(3)), 5, 16)
     np.testing.assert_allclose(found.sh[:, 1:], np.broadcast_to([127.0, -127, 127], (5, 15, 3)))
 
 

@@ -28,7 +28,8 @@ SHADERS = ("screen.glsl", "project.glsl", "outline.glsl", "blend.glsl", "resolve
 HARMONICS = ("C0", "C1", "C2A", "C2B", "C2C", "C3A", "C3B", "C3C", "C3D", "C3E")
 STEPS = ("LOG_STEPS", "ROTATION_STEPS", "COLOR_STEPS", "HARMONIC_STEPS")
 SCRIPTS = ("camera.js", "renderer.js", "viewer.js")
-LONGEST = 2**29 - 24  # characters in a browser's string (V8)
+LONGEST = 2**29  # characters of Gaussians in a page: none larger was ever tried
+MOST_MOVING = 2 * pack.CHUNK  # Gaussians drawn while the camera moves
 LARGE = 100  # MB: a page above it is called large
 START_SIZE, START_FOV = (1200, 800), 0.9  # of the view of a file that comes without cameras: px, rad (vertical)
 
@@ -45,7 +46,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     check_numbers(config)
     iteration, (splats, _), trained = model_folder.open_model(config.model)
     cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
-    kept = pack.shown(splats, config.max_gaussians)
+    kept = pack.shown(splats, config.max_gaussians, [camera for _, camera in cameras])
     options = {
         "ANTIALIASED": bool(trained.get("antialiasing")),
         "ELLIPSOID": trained.get("projection") == "ellipsoid",
@@ -94,36 +95,50 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         InputError: if there are more Gaussians than browsers take.
     """
     origin = np.median(splats.means, axis=0).astype(np.float64) if len(splats.means) else np.zeros(3)
-    packed = base64.b64encode(pack.pack_gaussians(splats, origin)).decode()
-    if len(packed) > LONGEST:
+    parts = {id: base64.b64encode(data).decode() for id, data in pack.parts(splats, origin).items()}
+    size = sum(map(len, parts.values()))
+    if size > LONGEST:
         raise InputError(
-            f"{name}: {len(splats.means)} Gaussians make a page of {len(packed) / 1e6:.0f} MB, expected at most "
+            f"{name}: {len(splats.means)} Gaussians make a page of {size / 1e6:.0f} MB, expected at most "
             f"{LONGEST / 1e6:.0f} MB, which browsers can read; use --max_gaussians."
         )
-    stride = pack.texels(splats.sh.shape[1])
+    before = 1 if len(splats.means) > pack.CHUNK else len(parts)
+    texels = pack.texels(splats.sh.shape[1])
     up = -np.mean([camera.rotation[1] for _, camera in cameras], axis=0)
     scene = {
         "count": len(splats.means),
-        "stride": stride,
+        "chunk": pack.CHUNK,
+        "moving": MOST_MOVING,
+        "harmonics": texels,
+        "parts": list(parts),
+        "before": before,
         "near": constants.NEAR,
         "origin": origin.tolist(),
         "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
         "cameras": [{"name": name, **model_folder.camera_entry(camera)} for name, camera in cameras],
     }
     blocks = {file: _source(file) for file in (*SHADERS, "sort.js")}
-    blocks["constants.glsl"] = _constants({"STRIDE": stride, **options})
+    blocks["constants.glsl"] = _constants({"HARMONICS": texels, **options})
     blocks["scene"] = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
-    blocks["gaussians"] = packed
-    script = "\n".join(_source(file) for file in SCRIPTS)
+    blocks |= dict(list(parts.items())[:before])
+    rest = dict(list(parts.items())[before:])
+    # no module: those wait for the whole page
+    script = "\n".join(["(async () => {", '"use strict";', *map(_source, SCRIPTS), "})();"])
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return Template(_source("viewer.html")).substitute(
         # no other script runs, and nothing is fetched, even if a stranger's file holds one in a name
         policy=f"default-src 'none'; script-src 'sha256-{digest}'; worker-src blob:; style-src 'unsafe-inline'",
         title=escape(name),
         background="#fff" if options["BACKGROUND"] else "#000",
-        blocks="\n".join(f'<script type="text/plain" id="{id}">{text}</script>' for id, text in blocks.items()),
+        blocks=_blocks(blocks),
         script=script,
+        rest=_blocks(rest),
     )
+
+
+def _blocks(texts: dict[str, str]) -> str:
+    """What the program reads, by id."""
+    return "\n".join(f'<script type="text/plain" id="{id}">{text}</script>' for id, text in texts.items())
 
 
 def _source(name: str) -> str:

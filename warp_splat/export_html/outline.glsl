@@ -3,6 +3,7 @@
 uniform highp usampler2D order; // which Gaussian, nearest first
 uniform highp usampler2D meanAndRoot, rootAndColor; // of project.glsl
 uniform vec2 size; // px
+uniform int first; // of the order, in this call
 flat out vec2 mean;
 flat out vec3 root;
 flat out vec4 color; // and opacity
@@ -12,7 +13,7 @@ ivec2 placeOf(int index) {
 }
 
 void main() {
-  ivec2 place = placeOf(int(texelFetch(order, placeOf(gl_VertexID / 4), 0).x));
+  ivec2 place = placeOf(int(texelFetch(order, placeOf(first + gl_VertexID / 4), 0).x));
   uvec4 first = texelFetch(meanAndRoot, place, 0), second = texelFetch(rootAndColor, place, 0);
   mean = uintBitsToFloat(first.xy);
   root = uintBitsToFloat(uvec3(first.zw, second.x));

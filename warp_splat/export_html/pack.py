@@ -6,18 +6,22 @@
         opacity             uint16, 0 to 1
         rotation            three int16, (x, y, z) / (1 + w) of the unit quaternion with w >= 0, steps of 1/8192
         base color         three int16, SH coefficients of degree 0, steps of 1/256
-    2.. five more SH coefficients, RGB each: int8 in steps of 2^e / 128, and e, uint8
 
-An attribute's bytes lie together, first bytes first, before gzip: so they compress. Half a step is the largest error.
+and in a table of their own, five more SH coefficients a texel, RGB each: int8 in steps of 2^e / 128, and e, uint8.
+
+Both are cut into parts of CHUNK Gaussians. An attribute's bytes lie together in a part, first bytes first, before gzip:
+so they compress. Half a step is the largest error.
 """
 
 from __future__ import annotations
 
 import gzip
+from collections.abc import Sequence
 
 import numpy as np
 
-from warp_splat.config import ALPHA_MIN
+from warp_splat.camera import Camera
+from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
 from warp_splat.formats.splats import SplatArrays, sigmoid, sizes, unit_quats
 
 ROUNDED_BITS = 6  # of the 23 of a position's mantissa
@@ -27,6 +31,9 @@ COLOR_STEPS = 256  # of SH coefficients of degree 0
 HARMONIC_STEPS = 128  # of the others, where none of five is larger than 127 steps
 LARGEST = 127.0  # SH coefficients beyond it are moved there
 TEXEL = 16  # bytes
+MOST_CAMERAS = 16  # that are asked what is important
+REACH = 0.5 * (1 + FRUSTUM_MARGIN)  # of an image, from its middle: what is just outside reaches into it
+CHUNK = 24 * 4096  # Gaussians in a part: whole rows of textures as wide as this or any smaller power of two
 IN_TEXEL = 5  # SH coefficients of a degree above 0
 
 CORE = np.dtype(
@@ -34,45 +41,75 @@ CORE = np.dtype(
 )
 
 
-def shown(splats: SplatArrays, most: int = 0) -> SplatArrays:
-    """The Gaussians that can be seen at all; of these the ``most`` opaque and large ones, if it is not 0.
+def shown(splats: SplatArrays, most: int = 0, cameras: Sequence[Camera] = ()) -> SplatArrays:
+    """The Gaussians that can be seen at all, the most important ones in the first CHUNK, and so on.
+
+    Within one they stay as they were: neighbors compress, and are found in caches.
 
     Args:
         splats: finite Gaussians.
-        most: the largest number to keep, by opacity times the area of the largest section; 0 keeps all.
+        most: the largest number to keep, by importance; 0 keeps all.
+        cameras: see :func:`importance`.
     """
     opacities = sigmoid(splats.opacities)
     rows = np.flatnonzero((opacities >= ALPHA_MIN) & splats.quats.any(axis=1))
-    if 0 < most < len(rows):
-        rows = np.sort(rows[np.argsort(-sizes(splats)[rows], kind="stable")[:most]])
-    return SplatArrays(*(array[rows] for array in splats))
+    order = np.lexsort((-sizes(splats)[rows], -importance(splats, cameras)[rows]))  # by size what no camera sees
+    rows = rows[order[: most or None]]
+    chunks = [np.sort(rows[first : first + CHUNK]) for first in range(0, len(rows), CHUNK)]
+    return SplatArrays(*(array[np.concatenate([rows[:0], *chunks])] for array in splats))
+
+
+def importance(splats: SplatArrays, cameras: Sequence[Camera]) -> np.ndarray:
+    """Opacity times the area of the largest section [N]: in the images of some ``cameras``, summed.
+
+    Without cameras, in world units.
+    """
+    total = np.zeros(len(splats.means))
+    for camera in cameras[:: -(-len(cameras) // MOST_CAMERAS) or 1]:
+        x, y, z = camera.rotation @ splats.means.T + camera.translation[:, None]
+        z = np.maximum(z, NEAR)
+        across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
+        inside = (z > NEAR) & (np.abs(across - 0.5) < REACH) & (np.abs(down - 0.5) < REACH)
+        total += np.where(inside, camera.fx * camera.fy / z**2, 0.0)
+    return sizes(splats) * (total if cameras else 1.0)
 
 
 def texels(coefficients: int) -> int:
-    """How many a Gaussian of this number of SH coefficients takes."""
-    return 2 + -(-(coefficients - 1) // IN_TEXEL)
+    """How many texels the harmonics above degree 0 take, of this number of SH coefficients."""
+    return -(-(coefficients - 1) // IN_TEXEL)
 
 
-def pack_gaussians(splats: SplatArrays, origin: np.ndarray) -> bytes:
-    """The Gaussians, compressed.
+def parts(splats: SplatArrays, origin: np.ndarray) -> dict[str, bytes]:
+    """The Gaussians, compressed, in the order of the page: all without harmonics, "gaussians0" and on, then those.
 
     Args:
-        splats: finite Gaussians.
+        splats: finite Gaussians, the most important first.
         origin: the point [3] that positions are relative to, world units.
     """
-    count, coefficients, _ = splats.sh.shape
+    starts = range(0, max(1, len(splats.means)), CHUNK)
+    chunks = [SplatArrays(*(array[start : start + CHUNK] for array in splats)) for start in starts]
+    found = {f"gaussians{index}": _compressed(_core(chunk, origin)) for index, chunk in enumerate(chunks)}
+    if splats.sh.shape[1] > 1:
+        found |= {f"harmonics{index}": _compressed(_harmonics(chunk.sh[:, 1:])) for index, chunk in enumerate(chunks)}
+    return found
+
+
+def _compressed(rows: np.ndarray) -> bytes:
+    """Rows [N, bytes], byte by byte."""
+    return gzip.compress(rows.T.tobytes(), mtime=0)
+
+
+def _core(splats: SplatArrays, origin: np.ndarray) -> np.ndarray:
+    """[N, 2 TEXEL] uint8: all but the harmonics above degree 0."""
     quats = unit_quats(splats.quats).astype(np.float64)
     quats *= np.where(quats[:, :1] < 0, -1, 1)
-    core = np.zeros(count, CORE)
+    core = np.zeros(len(quats), CORE)
     core["means"] = _rounded((splats.means - origin).astype("<f4"))
     core["scales"] = _steps(splats.scales, LOG_STEPS)
     core["opacity"] = np.round(sigmoid(splats.opacities.astype(np.float64)) * 65535)
     core["rotation"] = _steps(quats[:, 1:] / (1 + quats[:, :1]), ROTATION_STEPS)
     core["color"] = _steps(splats.sh[:, 0], COLOR_STEPS)
-    rows = np.zeros((count, texels(coefficients), TEXEL), np.uint8)
-    rows[:, :2] = core.view(np.uint8).reshape(count, 2, TEXEL)
-    rows[:, 2:] = _harmonics(splats.sh[:, 1:], rows.shape[1] - 2)
-    return gzip.compress(rows.reshape(count, rows.shape[1] * TEXEL).T.tobytes(), mtime=0)
+    return core.view(np.uint8).reshape(-1, 2 * TEXEL)
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
@@ -85,15 +122,17 @@ def _steps(values: np.ndarray, steps: int) -> np.ndarray:
     return np.clip(np.round(values.astype(np.float64) * steps), -32768, 32767)
 
 
-def _harmonics(sh: np.ndarray, groups_of_five: int) -> np.ndarray:
-    """[N, groups, TEXEL] uint8 from [N, K, 3] coefficients; steps are as small as the largest of five allows."""
+def _harmonics(sh: np.ndarray) -> np.ndarray:
+    """[N, texels TEXEL] uint8 from [N, K, 3] coefficients; steps are as small as the largest of five allows."""
     count, coefficients, _ = sh.shape
-    padded = np.zeros((count, groups_of_five * IN_TEXEL, 3), np.float32)
-    padded[:, :coefficients] = np.clip(sh, -LARGEST, LARGEST)
-    groups = padded.reshape(count, groups_of_five, IN_TEXEL, 3)
-    largest = np.abs(groups).max(axis=(2, 3), initial=0) * (HARMONIC_STEPS / 127)
+    shape = (count, texels(coefficients + 1), IN_TEXEL, 3)
+    groups = np.zeros((count, shape[1] * IN_TEXEL, 3), np.float32)
+    groups[:, :coefficients] = np.clip(sh, -LARGEST, LARGEST)
+    groups = groups.reshape(shape)
+    largest = np.abs(groups).max(axis=(2, 3)) * (HARMONIC_STEPS / 127)
     exponents = np.ceil(np.log2(np.maximum(largest, 1)))
     steps = np.round(groups * (HARMONIC_STEPS / 2**exponents)[:, :, None, None]).astype(np.int8)
-    return np.concatenate(
-        [steps.view(np.uint8).reshape(count, groups_of_five, TEXEL - 1), exponents.astype(np.uint8)[:, :, None]], axis=2
-    )
+    rows = np.zeros((*shape[:2], TEXEL), np.uint8)
+    rows[:, :, :-1] = steps.view(np.uint8).reshape(*shape[:2], TEXEL - 1)
+    rows[:, :, -1] = exponents
+    return rows.reshape(count, shape[1] * TEXEL)

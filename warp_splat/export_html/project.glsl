@@ -1,6 +1,7 @@
 // From 3D Gaussians to 2D ones, a pixel for each: the mathematics of warp_splat/kernels/project/.
-uniform highp usampler2D gaussians; // STRIDE texels each, as warp_splat/export_html/pack.py lays them out
+uniform highp usampler2D gaussians, harmonics; // 2 and HARMONICS texels each, as warp_splat/export_html/pack.py has them
 uniform int count;
+uniform float enlarged; // what a share of the Gaussians stands in for all
 uniform mat3 rotation; // camera from world
 uniform vec3 center; // of the camera, from the origin of the positions
 uniform vec2 focal, principal, size; // px
@@ -8,8 +9,8 @@ uniform vec2 focal, principal, size; // px
 layout(location = 0) out uvec4 meanAndRoot; // mean [px], root xx and xy [1/px], float bits
 layout(location = 1) out uvec4 rootAndColor; // root yy, half floats (r, g) and (b, 0), opacity: 0 where nothing is seen
 
-uvec4 texel(int index) {
-  return texelFetch(gaussians, ivec2(index % WIDTH, index / WIDTH), 0);
+uvec4 texel(highp usampler2D table, int index) {
+  return texelFetch(table, ivec2(index % WIDTH, index / WIDTH), 0);
 }
 
 int low(uint word) {
@@ -43,21 +44,22 @@ vec3 weighted(uvec4 t, float w0, float w1, float w2, float w3, float w4) {
   return sum * (exp2(float(t.w >> 24)) / HARMONIC_STEPS);
 }
 
-vec3 colorAlong(vec3 d, int first, vec3 base) {
+vec3 colorAlong(vec3 d, int index, vec3 base) {
   vec3 color = C0 * base + 0.5;
+  int first = index * HARMONICS;
   float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-  if (STRIDE > 2) {
-    color += weighted(texel(first + 2), -C1 * y, C1 * z, -C1 * x, C2A * x * y, -C2A * y * z);
+  if (HARMONICS > 0) {
+    color += weighted(texel(harmonics, first), -C1 * y, C1 * z, -C1 * x, C2A * x * y, -C2A * y * z);
   }
-  if (STRIDE > 3) {
+  if (HARMONICS > 1) {
     color += weighted(
-      texel(first + 3), C2B * (2.0 * zz - xx - yy), -C2A * x * z, C2C * (xx - yy), -C3A * y * (3.0 * xx - yy),
+      texel(harmonics, first + 1), C2B * (2.0 * zz - xx - yy), -C2A * x * z, C2C * (xx - yy), -C3A * y * (3.0 * xx - yy),
       C3B * x * y * z
     );
   }
-  if (STRIDE > 4) {
+  if (HARMONICS > 2) {
     color += weighted(
-      texel(first + 4), -C3C * y * (4.0 * zz - xx - yy), C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+      texel(harmonics, first + 2), -C3C * y * (4.0 * zz - xx - yy), C3D * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
       -C3C * x * (4.0 * zz - xx - yy), C3E * z * (xx - yy), -C3A * x * (xx - 3.0 * yy)
     );
   }
@@ -69,8 +71,7 @@ void main() {
   rootAndColor = uvec4(0);
   int index = int(gl_FragCoord.y) * WIDTH + int(gl_FragCoord.x);
   if (index >= count) return;
-  int first = index * STRIDE;
-  uvec4 t = texel(first), u = texel(first + 1);
+  uvec4 t = texel(gaussians, 2 * index), u = texel(gaussians, 2 * index + 1);
   vec3 offset = uintBitsToFloat(t.xyz) - center;
   vec3 p = rotation * offset;
   if (!(p.z > NEAR)) return;
@@ -80,7 +81,7 @@ void main() {
     vec2 margin = FRUSTUM_MARGIN * 0.5 * size / focal;
     bounded = clamp(slope, -principal / focal - margin, (size - principal) / focal + margin);
   }
-  vec3 scale = exp(vec3(low(t.w), high(t.w), low(u.x)) / LOG_STEPS);
+  vec3 scale = enlarged * exp(vec3(low(t.w), high(t.w), low(u.x)) / LOG_STEPS);
   mat3 axes = rotation * rotationMatrix(vec3(low(u.y), high(u.y), low(u.z)) / ROTATION_STEPS);
   mat3 rows = transpose(axes);
   vec3 a1 = focal.x / p.z * scale * (rows[0] - bounded.x * rows[2]);
@@ -107,7 +108,7 @@ void main() {
   root.x = sqrt(0.5 * LOG2_E * (yy + BLUR) / det);
   root.y = -0.5 * LOG2_E * dot(a1, a2) / det / root.x;
   root.z = sqrt(0.5 * LOG2_E / (yy + BLUR));
-  vec3 color = colorAlong(normalize(offset), first, vec3(high(u.z), low(u.w), high(u.w)) / COLOR_STEPS);
+  vec3 color = colorAlong(normalize(offset), index, vec3(high(u.z), low(u.w), high(u.w)) / COLOR_STEPS);
   meanAndRoot = floatBitsToUint(vec4(mean, root.xy));
   rootAndColor = uvec4(
     floatBitsToUint(root.z), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, 0)), floatBitsToUint(opacity)

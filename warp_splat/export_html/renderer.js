@@ -3,37 +3,36 @@
 const source = (name) => document.getElementById(name).textContent;
 
 const LEAST_DETAIL = 0.2;
+const ENLARGED = 1 / 8; // power of the share: a tenth of the Gaussians are drawn by a third larger
+const BATCH = 1 << 16; // Gaussians drawn by one call
 
 class Renderer {
-  constructor(canvas, scene, packed) {
+  constructor(canvas, scene) {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks or has switched off.");
     this.gl = gl;
-    this.count = scene.count;
+    this.total = scene.count;
     this.width = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));
-    this.rows = Math.max(1, Math.ceil(scene.count / this.width));
-    const rows = Math.max(1, Math.ceil((scene.count * scene.stride) / this.width));
-    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+    const rows = (texels) => Math.max(1, Math.ceil((scene.count * texels) / this.width));
+    if (rows(Math.max(2, scene.harmonics)) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new Error(`${scene.count} Gaussians are more than this graphics card takes; export fewer.`);
     }
-    this.gaussians = this.texture(gl.RGBA32UI, this.width, rows);
-    const texels = new Uint32Array(4 * this.width * rows);
-    texels.set(new Uint32Array(packed.buffer));
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.width, rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, texels);
-    this.projected = [0, 1].map(() => this.texture(gl.RGBA32UI, this.width, this.rows));
+    this.gaussians = this.texture(gl.RGBA32UI, this.width, rows(2));
+    this.harmonics = this.texture(gl.RGBA32UI, this.width, rows(scene.harmonics)); // 0 until they come: no harmonics
+    this.projected = [0, 1].map(() => this.texture(gl.RGBA32UI, this.width, rows(1)));
     this.projectTarget = this.framebuffer(this.projected);
     this.programs = {
       project: this.program("screen.glsl", "project.glsl"),
       blend: this.program("outline.glsl", "blend.glsl"),
       resolve: this.program("screen.glsl", "resolve.glsl"),
     };
-    this.order = this.texture(gl.R32UI, this.width, this.rows);
-    this.visible = 0;
-    const corners = new Uint32Array(6 * scene.count); // two triangles of each four vertices
+    this.order = this.texture(gl.R32UI, this.width, rows(1));
+    [this.count, this.visible] = [0, 0];
+    const corners = new Uint32Array(6 * BATCH); // two triangles of each four vertices
     for (let i = 0; i < corners.length; i++) corners[i] = 4 * Math.floor(i / 6) + [0, 1, 2, 1, 3, 2][i % 6];
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
-    [this.detail, this.frameTime, this.fence] = [1, 0, null];
+    [this.detail, this.drawn, this.frameTime, this.fence] = [1, 0, 0, null];
     // blended in float32 where the card can (software renderers need half the time of float16), in float16, which costs
     // 4 dB, or in the last resort in 8 bits, which costs 20
     this.imageFormat = gl.getExtension("EXT_color_buffer_float")
@@ -85,12 +84,22 @@ class Renderer {
     this.size = [width, height];
   }
 
-  // The Gaussians to draw, nearest first: the first `visible` of `order`, which fills rows of the texture.
-  setOrder(order, visible) {
-    const { gl } = this;
-    gl.bindTexture(gl.TEXTURE_2D, this.order);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, this.width, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
-    this.visible = visible;
+  // Numbers for whole rows of one of the textures, from this one on.
+  fill(texture, row, format, numbers) {
+    const { gl } = this, rows = numbers.length / this.width / (format === gl.RED_INTEGER ? 1 : 4);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, this.width, rows, format, gl.UNSIGNED_INT, numbers);
+  }
+
+  // A part of the "gaussians" or "harmonics": the texels of those from `first` on.
+  add(table, first, texels, numbers) {
+    this.fill(this[table], (first * texels) / this.width, this.gl.RGBA_INTEGER, numbers);
+  }
+
+  // The Gaussians to draw, of the first `count`, nearest first: the first `visible` of `order`, which fills rows.
+  setOrder(order, visible, count) {
+    this.fill(this.order, 0, this.gl.RED_INTEGER, order);
+    [this.visible, this.count] = [visible, count];
   }
 
   // Draws what `camera` sees; its size is that of the canvas times `detail`.
@@ -102,7 +111,7 @@ class Renderer {
     this.project(camera, size);
     this.blend(size);
     this.resolve(detail);
-    this.detail = detail;
+    [this.detail, this.drawn] = [detail, this.count];
     this.started = performance.now();
     this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     this.gl.flush();
@@ -119,20 +128,21 @@ class Renderer {
     return true;
   }
 
-  // The detail at which a frame should take as long, judged by the last one [ms].
+  // The detail at which a frame should take as long, judged by the last one [ms] and by how many each draws.
   detailFor(milliseconds) {
-    const factor = Math.sqrt(milliseconds / Math.max(1, this.frameTime));
+    const factor = Math.sqrt(milliseconds / Math.max(1, (this.frameTime * this.count) / Math.max(1, this.drawn)));
     return Math.min(1, Math.max(LEAST_DETAIL, this.detail * Math.min(1.1, factor)));
   }
 
   project(camera, size) {
     const { gl } = this, { handle, at } = this.programs.project;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projectTarget);
-    gl.viewport(0, 0, this.width, this.rows);
+    gl.viewport(0, 0, this.width, Math.ceil(this.count / this.width));
     gl.disable(gl.BLEND);
     gl.useProgram(handle);
-    this.bind([this.gaussians], handle, ["gaussians"]);
+    this.bind([this.gaussians, this.harmonics], handle, ["gaussians", "harmonics"]);
     gl.uniform1i(at("count"), this.count);
+    gl.uniform1f(at("enlarged"), (this.total / Math.max(1, this.count)) ** ENLARGED);
     gl.uniformMatrix3fv(at("rotation"), false, camera.rotation.flat());
     gl.uniform3fv(at("center"), camera.position);
     gl.uniform2f(at("focal"), camera.fx, camera.fy);
@@ -151,7 +161,10 @@ class Renderer {
     gl.useProgram(handle);
     this.bind([this.order, ...this.projected], handle, ["order", "meanAndRoot", "rootAndColor"]);
     gl.uniform2fv(at("size"), size);
-    gl.drawElements(gl.TRIANGLES, 6 * this.visible, gl.UNSIGNED_INT, 0);
+    for (let first = 0; first < this.visible; first += BATCH) {
+      gl.uniform1i(at("first"), first);
+      gl.drawElements(gl.TRIANGLES, 6 * Math.min(BATCH, this.visible - first), gl.UNSIGNED_INT, 0);
+    }
   }
 
   resolve(detail) {

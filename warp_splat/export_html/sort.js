@@ -1,11 +1,10 @@
 // Runs in a worker. Sorts the Gaussians by depth, nearest first: a counting sort by 16 bits of the depth's float32
 // number, which for positive numbers grows as they do and divides each factor of two alike.
 "use strict";
-let means, depths, bits, near, room;
+let means, depths, bits, near, width;
 const starts = new Uint32Array(1 << 16);
 
-function sort([x, y, z], [fx, fy, fz]) {
-  const count = depths.length;
+function sort([x, y, z], [fx, fy, fz], count) {
   let least = Infinity, most = 0, seen = 0;
   for (let i = 0; i < count; i++) {
     depths[i] = (means[3 * i] - x) * fx + (means[3 * i + 1] - y) * fy + (means[3 * i + 2] - z) * fz;
@@ -25,19 +24,22 @@ function sort([x, y, z], [fx, fy, fz]) {
     starts[key] = sum;
     sum += size;
   }
-  const order = new Uint32Array(room);
+  const order = new Uint32Array(width * Math.ceil(count / width)); // whole rows of a texture
   for (let i = 0; i < count; i++) if (depths[i] > near) order[starts[(bits[i] - low) >>> shift]++] = i;
   return [order, seen];
 }
 
 onmessage = ({ data }) => {
-  if (data.means) {
-    ({ means, near, room } = data);
-    depths = new Float32Array(means.length / 3);
+  if (data.total !== undefined) {
+    ({ near, width } = data);
+    means = new Float32Array(3 * data.total);
+    depths = new Float32Array(data.total);
     bits = new Uint32Array(depths.buffer);
-    return;
+  } else if (data.means) {
+    means.set(data.means, 3 * data.first);
+  } else {
+    const start = performance.now(), { version, count } = data;
+    const [order, visible] = sort(data.position, data.forward, count);
+    postMessage({ order, visible, version, count, milliseconds: performance.now() - start }, [order.buffer]);
   }
-  const start = performance.now();
-  const [order, visible] = sort(data.position, data.forward);
-  postMessage({ order, visible, version: data.version, milliseconds: performance.now() - start }, [order.buffer]);
 };

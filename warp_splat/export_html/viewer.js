@@ -1,49 +1,93 @@
-// The page: unpacks the Gaussians, sorts and draws them as the camera moves, follows mouse, fingers and keys.
+// The page: unpacks the Gaussians, part by part as the browser reads it, sorts and draws them as the camera moves,
+// follows mouse, fingers and keys.
 
 const MOVING = 200; // ms after the last input until the image is drawn in full detail
 const FRAME = 50; // ms that a frame should take while moving; its detail is chosen so
 const element = (id) => document.getElementById(id);
 const say = (text) => { element("message").textContent = text; };
 
-async function unpack(scene) {
+// The text of a part, once the browser has read past it; it is megabytes, and leaves the page.
+function partText(id) {
+  return new Promise((resolve, reject) => {
+    const look = () => {
+      const found = element(id);
+      if (found?.nextSibling) {
+        observer.disconnect();
+        found.remove();
+        resolve(found.textContent);
+      } else if (document.readyState !== "loading") {
+        reject(new Error("This page ends too early: copy or load it again."));
+      }
+    };
+    const observer = new MutationObserver(look);
+    observer.observe(document.body, { childList: true });
+    document.addEventListener("DOMContentLoaded", look);
+    look();
+  });
+}
+
+// A part as numbers for whole rows of `width` texels, from what pack.py made of it.
+async function unpack(base64, texels, width) {
   if (typeof DecompressionStream === "undefined") {
     throw new Error("This page needs a browser of 2023 or later (DecompressionStream).");
   }
-  const text = atob(source("gaussians"));
+  const text = atob(base64);
   const bytes = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
-  const width = 16 * scene.stride, packed = new Uint8Array(planes.length);
-  for (let plane = 0, from = 0; plane < width; plane++) {
-    for (let to = plane; to < packed.length; to += width) packed[to] = planes[from++];
+  const row = 16 * width, packed = new Uint8Array(row * Math.ceil(planes.length / row)), each = 16 * texels;
+  for (let plane = 0, from = 0; plane < each; plane++) {
+    for (let to = plane; to < planes.length; to += each) packed[to] = planes[from++];
   }
-  const numbers = new Float32Array(packed.buffer), means = new Float32Array(3 * scene.count);
-  for (let i = 0; i < scene.count; i++) {
-    for (let k = 0; k < 3; k++) means[3 * i + k] = numbers[4 * scene.stride * i + k];
-  }
-  return [packed, means];
+  return new Uint32Array(packed.buffer);
 }
 
 class Viewer {
-  constructor(scene, packed, means) {
+  constructor(scene) {
     this.scene = scene;
-    this.means = means;
     this.canvas = element("canvas");
-    this.renderer = new Renderer(this.canvas, scene, packed);
+    this.renderer = new Renderer(this.canvas, scene);
     this.canvas.addEventListener("webglcontextlost", () => say("The graphics card was reset: load this page again."));
     this.worker = new Worker(URL.createObjectURL(new Blob([source("sort.js")], { type: "text/javascript" })));
-    this.worker.postMessage({ means, near: scene.near, room: this.renderer.width * this.renderer.rows });
+    this.worker.postMessage({ total: scene.count, near: scene.near, width: this.renderer.width });
     this.worker.onmessage = ({ data }) => this.sorted(data);
     this.worker.onerror = () => say("The Gaussians could not be sorted: this browser refuses workers.");
-    this.version = this.sortedVersion = 0; // of the camera
+    this.version = this.loaded = 0; // of the camera; how many Gaussians came
+    this.missing = scene.parts.length;
+    this.sortedVersion = this.sortedCount = -1;
     this.sorting = this.requested = false;
     this.lastInput = -Infinity;
     this.waiting = [];
     new ResizeObserver(() => this.request()).observe(this.canvas);
   }
 
-  // Shows what `camera` sees (world coordinates; see camera.js); resolves once it is sorted and drawn in full detail.
+  // Adds these parts of the page as they come.
+  async load(parts) {
+    const { scene, renderer } = this;
+    for (const part of parts) {
+      const [, table, chunk] = part.match(/(\D+)(\d+)/), first = chunk * scene.chunk;
+      const texels = table === "gaussians" ? 2 : scene.harmonics;
+      const numbers = await unpack(await partText(part), texels, renderer.width);
+      renderer.add(table, first, texels, numbers);
+      if (table === "gaussians") this.addMeans(first, new Float32Array(numbers.buffer));
+      this.missing--;
+      this.request();
+    }
+    const [loaded, all] = [this.loaded, scene.count].map((count) => count.toLocaleString("en"));
+    element("count").textContent = loaded === all ? `${all} Gaussians` : `${loaded} of ${all} Gaussians`;
+  }
+
+  addMeans(first, numbers) {
+    this.loaded = Math.min(first + this.scene.chunk, this.scene.count);
+    const means = new Float32Array(3 * (this.loaded - first));
+    for (let i = 0; i < this.loaded - first; i++) for (let k = 0; k < 3; k++) means[3 * i + k] = numbers[8 * i + k];
+    this.worker.postMessage({ means, first });
+    this.means ??= means; // the most important ones: enough to find what the camera looks at
+  }
+
+  // Shows what `camera` sees (world coordinates; see camera.js); resolves once what came is sorted and drawn in full
+  // detail.
   setCamera(camera) {
     this.lastInput = -Infinity;
     this.move({ ...camera, position: sum(camera.position, this.scene.origin, -1) });
@@ -62,38 +106,51 @@ class Viewer {
   move(camera) {
     this.camera = camera;
     this.version++;
-    if (!this.sorting) this.sort();
+    this.sort();
     this.request();
   }
 
-  sort() {
-    this.sorting = true;
-    const { position } = this.camera;
-    this.worker.postMessage({ position, forward: axis(this.camera, 2), version: this.version });
+  // How long the camera still counts as moving [ms].
+  get rest() {
+    return this.lastInput + MOVING - performance.now();
   }
 
-  sorted({ order, visible, version, milliseconds }) {
-    this.renderer.setOrder(order, visible);
+  // How many Gaussians to draw, the most important ones: a bounded number while moving.
+  get wanted() {
+    return this.rest > 0 ? Math.min(this.loaded, this.scene.moving) : this.loaded;
+  }
+
+  sort() {
+    if (this.sorting || (this.sortedVersion === this.version && this.sortedCount === this.wanted)) return;
+    this.sorting = true;
+    const { position } = this.camera;
+    this.worker.postMessage({ position, forward: axis(this.camera, 2), version: this.version, count: this.wanted });
+  }
+
+  sorted({ order, visible, version, count, milliseconds }) {
+    this.renderer.setOrder(order, visible, count);
     this.sorting = false;
-    this.sortedVersion = version;
-    this.sortTime = milliseconds;
-    if (version !== this.version) this.sort();
+    [this.sortedVersion, this.sortedCount, this.sortTime] = [version, count, milliseconds];
+    this.sort();
     this.request();
   }
 
   request() {
-    if (!this.requested) requestAnimationFrame((now) => this.frame(now));
+    if (!this.requested) requestAnimationFrame(() => this.frame());
     this.requested = true;
   }
 
-  frame(now) {
+  frame() {
     this.requested = false;
+    if (!this.camera) return;
     if (!this.renderer.ready) return this.request(); // nothing piles up before a slow card
     const { canvas } = this, ratio = window.devicePixelRatio;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((size) => Math.max(1, Math.round(size * ratio)));
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    const rest = this.lastInput + MOVING - now;
-    if (rest <= 0 && this.sortedVersion !== this.version) return; // the sort's end draws it
+    const { rest } = this;
+    this.sort();
+    const current = this.sortedVersion === this.version && (this.missing || this.sortedCount === this.loaded);
+    if (rest > 0 ? this.sortedCount > this.scene.moving : !current) return; // the sort's end draws it
     if (rest > 0) {
       clearTimeout(this.sharpen);
       this.sharpen = setTimeout(() => this.request(), rest + 1);
@@ -103,10 +160,11 @@ class Viewer {
     if (rest <= 0) for (const resolve of this.waiting.splice(0)) resolve();
   }
 
-  // Of the last sort and of the last frame [ms], and the share of the canvas's pixels in a row that it had.
+  // Of the last sort and of the last frame [ms], the share of the canvas's pixels in a row that it had, and how many
+  // Gaussians it was made of.
   get times() {
-    const { frameTime, detail } = this.renderer;
-    return { sort: this.sortTime, frame: frameTime, detail };
+    const { frameTime, detail, drawn } = this.renderer;
+    return { sort: this.sortTime, frame: frameTime, detail, drawn };
   }
 
   // What the hand does: `dx`, `dy` in px of the page.
@@ -172,17 +230,19 @@ function follow(viewer) {
 
 try {
   const scene = JSON.parse(source("scene"));
-  const viewer = new Viewer(scene, ...(await unpack(scene)));
-  element("gaussians").remove(); // megabytes of text
+  const viewer = new Viewer(scene);
+  await viewer.load(scene.parts.slice(0, scene.before));
   follow(viewer);
   element("bar").hidden = false;
   element("previous").hidden = element("next").hidden = scene.cameras.length < 2;
-  element("count").textContent = `${scene.count.toLocaleString("en")} Gaussians`;
-  await viewer.step(0);
+  const first = viewer.step(0).then(() => say(scene.count ? "" : "This model holds no Gaussians."));
+  const all = viewer.load(scene.parts.slice(scene.before));
   window.warpSplat = {
-    cameras: scene.cameras, setCamera: (camera) => viewer.setCamera(camera), get times() { return viewer.times; },
+    cameras: scene.cameras, get times() { return viewer.times; },
+    setCamera: (camera) => all.then(() => viewer.setCamera(camera)),
   };
-  say(scene.count ? "" : "This model holds no Gaussians.");
+  await Promise.allSettled([first, all]);
+  await all;
 } catch (error) {
   say(error.message);
 }
