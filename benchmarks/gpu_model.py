@@ -55,7 +55,7 @@ SCENES = {
 SHAPE, SH, SPLAT, RADII = 44, 192, 48, 4  # bytes of a Gaussian, its harmonics, projected, and the radius of that
 GRADIENT, ROW, PLACE = 40, 36, 4  # of a projected Gaussian, of a tile instance, of an index
 PARAMETERS = (SHAPE + SH) // 4
-BLOCK = 58  # instructions of the adjoint for one of the eight blocks of a tile instance (docs/cuda.md)
+BLOCK = 48  # instructions of the adjoint for one of the eight blocks of a tile instance (docs/cuda.md)
 CARD_HEADERS = (
     *("card", "code", "SMs", "MHz", "GB/s"),
     *(f"{name}: {what} ms" for name in SCENES for what in ("blend", "its adjoint", "step")),

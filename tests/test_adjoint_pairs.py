@@ -44,6 +44,7 @@ CONSTANT = {
     "odds_of": "only states are recovered by it",
     "lane_sum": "sums of gradients",
     "fall_value": "exp2_known has the derivative",
+    "by_instruction": "the same",
 }
 #: Derivatives that are right only together, in the loop that Warp replays, and adjoints of whole steps: against
 #: differences of the image in test_gradcheck, in every mode.

@@ -65,7 +65,8 @@ class RasterOptions:
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.
         extent: which tiles list a Gaussian: "ellipse" (exactly those where its opacity reaches ``alpha_min``) or
             "square" (of the reference: 3 standard deviations of the long axis).
-        exp_degree: degree of the polynomial in the exponential, 3 to 6; None calls the C library's, without lanes.
+        exp_degree: degree of the polynomial in the exponential, 3 to 6; None calls the C library's, without lanes. On a
+            GPU its own instruction, with an error of 2.4e-7, stands for 3 to 5.
         falloff: of your own instead of the Gaussian's, see :class:`warp_splat.Falloff`; not with adjoint "manual".
         median_depth: also return the depth per pixel at which half of the light is gone.
         normals: also blend the Gaussians' normals: their shortest axes, towards the camera.

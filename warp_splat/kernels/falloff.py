@@ -30,6 +30,9 @@ EXP2 = {
     5: (0.9999999404, -0.6931415796, 0.2401674092, -0.0552690737, 0.0091788266, -0.0009355642),
     6: (1.0, -0.6931471825, 0.2402262986, -0.0554987676, 0.0095929541, -0.0012853512, 0.0001120476),
 }
+#: The highest degree that is no better than a GPU's instruction, of which one counts, not eleven: its error is that of
+#: exp2f, 2 units in the last place (CUDA C++ Programming Guide), 2.4e-7.
+EX2_DEGREE = 5
 LOG2_E = wp.constant(1.4426950408889634)
 LN_2 = wp.constant(0.6931471805599453)
 
@@ -119,6 +122,7 @@ def make_exp(degree: int | None) -> wp.Function:
     """2^-z for z >= 0 by a polynomial of ``degree`` (3 to 6), or by the C library (None).
 
     wp.exp is a scalar libm call, which defeats the vectorizer. 2^-z = 2^-n 2^-f with n whole; 2^-125 is the least.
+    On a GPU its own instruction stands for degrees up to 5.
     """
     if degree is None:
 
@@ -137,9 +141,30 @@ def make_exp(degree: int | None) -> wp.Function:
         p = fill(coefficients[degree], z)
         for power in range(degree):
             p = fma(f, p, fill(coefficients[degree - 1 - power], z))
+        if wp.static(degree <= EX2_DEGREE):
+            return by_instruction(z, halved(p, n))
         return halved(p, n)
 
     return exp2_minus
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float found;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(found) : "f"(-z));
+    return found;
+#else
+    return known;
+#endif
+""")
+def by_instruction(z: float, known: float) -> float:
+    """2^-z by a GPU's instruction; elsewhere ``known``, which a GPU then need not compute. Below 2^-126 it is 0."""
+    ...
+
+
+@wp.func
+def by_instruction(z: vec16, known: vec16):
+    return known
 
 
 @wp.func
