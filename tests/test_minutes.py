@@ -29,7 +29,7 @@ from warp_splat.training.plan import (
 )
 from warp_splat.training.record import keep, restore
 
-TASK, COST = Task(500_000, 10_000, 200_000), Cost(0.004, 3e-7, 5e-8)
+TASK, COST = Task(500_000, 10_000, 200_000, (0.5, 1.0)), Cost(0.004, 3e-7, 5e-8)
 FAST = parse(["train", "-s", "x", "--preset", "fast"])
 
 
@@ -74,7 +74,7 @@ def test_a_slower_machine_gets_fewer_steps_and_gaussians():
 
 
 def test_a_shape_without_a_cooldown_gets_one():
-    plan = plan_for(parse(["train", "-s", "x"]), COST, 60.0, TASK)
+    plan = plan_for(parse(["train", "-s", "x"]), COST, 60.0, TASK._replace(shares=()))
     assert plan.learn.cooldown == pytest.approx(0.2 * plan.learn.iterations, abs=1)
 
 

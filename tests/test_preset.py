@@ -11,6 +11,7 @@ from warp_splat.flags import flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
 from warp_splat.training.options import TrainConfig
+from warp_splat.training.sizes import shares_of_size, shrink_at
 from warp_splat.training.trainer import Trainer
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"
@@ -58,6 +59,22 @@ def test_images_grow_to_their_full_size(scene):
         shrinks.append(view.camera.width // camera.width)
     assert shrinks == [4] * 4 + [2] * 5 + [1] * 2
     assert camera is view.camera and np.array_equal(photograph.image.numpy(), view.image)
+
+
+def test_a_size_lasts_as_long_as_its_share_of_the_detail():
+    """White noise has as much in every frequency; a wave has all of it in one."""
+    learn = TrainConfig(coarse=4, coarse_by="detail", coarse_until_iter=1000).learn
+    camera = load_scene(SCENE, resolution=8, report=str).train[0].camera
+    noise = np.repeat(np.random.default_rng(0).integers(0, 256, (240, 320, 1), dtype=np.uint8), 3, 2)
+    wave = np.broadcast_to(np.rint(127 + 100 * np.sin(2 * np.pi * 16 * np.arange(80) / 80)), (240, 80))  # 0.2 per px
+    wave = np.repeat(wave[..., None], 3, 2).astype(np.uint8)
+    even = np.full((240, 320, 3), 9, np.uint8)
+    for image, expected, margin in ((noise, (1 / 16, 1 / 4), 0.02), (wave, (0.0, 1.0), 0.05), (even, (0.25, 0.5), 0.0)):
+        shares = shares_of_size(learn, [View("a", camera, image, camera)])
+        assert shares == pytest.approx(expected, abs=margin)
+        steps = [shrink_at(learn, shares, step) for step in range(1001)]
+        assert steps == sorted(steps, reverse=True) and steps.count(4) == pytest.approx(1000 * shares[0], abs=1)
+        assert steps[-1] == 1 and steps.count(1) == pytest.approx(1000 * (1 - shares[1]) + 1, abs=1)
 
 
 def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):

@@ -80,7 +80,8 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     trial.warm_up()
     camera, start = scene.train[0].camera, len(trial.model)
     pixels = camera.width * camera.height
-    task = Task(pixels, start, config.grow.max_gaussians or expected_gaussians(start, pixels)[0])
+    most = config.grow.max_gaussians or expected_gaussians(start, pixels)[0]
+    task = Task(pixels, start, most, trial.photographs.shares)
     measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
     for row in measured:
         say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")

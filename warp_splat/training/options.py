@@ -82,6 +82,11 @@ class LearnOptions:
     half_moments: bool = learning(False, "keep Adam's moments in 16 bits, rounded at random: less memory")
     coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
     coarse_until_iter: int = learning(3000, "by this step the size has doubled to the full one", least=1, schedule=True)
+    coarse_by: str = learning(
+        "steps",
+        "when it doubles: after as many steps each time, or by the share of the photographs' detail that a size shows",
+        choices=("steps", "detail"),
+    )
     seed: int = learning(0, "seed of everything random", most=2**63 - 1)
 
     @property

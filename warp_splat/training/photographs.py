@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from warp_splat.camera import Camera
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import View
 from warp_splat.training.options import TrainConfig
+from warp_splat.training.sizes import shares_of_size, shrink_at
 
 
 class Photograph(NamedTuple):
@@ -27,20 +29,21 @@ class Photographs:
 
     Args:
         config: says how coarse they are, and where they are kept.
+        views: those to train on.
         device: where they are compared.
         with_alpha: whether they bring their transparency along.
     """
 
-    def __init__(self, config: TrainConfig, device: torch.device, with_alpha: bool):
+    def __init__(self, config: TrainConfig, views: Sequence[View], device: torch.device, with_alpha: bool):
         self.config, self.device, self.with_alpha = config, device, with_alpha
+        self.shares = shares_of_size(config.learn, views)
         self.kept: dict[View, Photograph] = {}
         self._shrink = 1  # of those that are kept
 
     def at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
         """Camera and photograph of ``view`` at the size of this iteration, the photograph on the device."""
         learn = self.config.learn
-        doublings = (learn.coarse.bit_length() - 1) * iteration // learn.coarse_until_iter
-        shrink = max(learn.coarse >> doublings, 1)
+        shrink = shrink_at(learn, self.shares, iteration)
         if shrink != self._shrink:
             self._shrink = shrink
             self.kept.clear()

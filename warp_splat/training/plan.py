@@ -17,6 +17,7 @@ from scipy.optimize import nnls
 
 from warp_splat.flags import flags_of
 from warp_splat.training.options import TrainConfig, schedule_of
+from warp_splat.training.sizes import shrink_at
 
 COOLDOWN = 0.2  # share of the steps, where the shape has none: the end needs a beginning
 SHORTEST, LONGEST = 1e-4, 1e4  # times the shape
@@ -56,14 +57,14 @@ class Task(NamedTuple):
     pixels: int  # of a photograph at its full size
     start: int  # Gaussians at the start
     most: int  # Gaussians that the shape is made for
+    shares: tuple[float, ...]  # of --coarse_until_iter, where sizes end
 
 
 def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:
     """What a training takes by the costs of its steps; Gaussians are added evenly until the cooldown."""
     learn = config.learn
     steps = (np.arange(SAMPLES) + 0.5) * learn.iterations / SAMPLES
-    doublings = (learn.coarse.bit_length() - 1) * steps // learn.coarse_until_iter
-    sides = np.minimum(2.0**doublings / learn.coarse, 1.0)
+    sides = 1.0 / np.array([shrink_at(learn, task.shares, step) for step in steps])
     grown = np.minimum(steps / max(learn.iterations - learn.cooldown, 1), 1.0)
     most = max(config.grow.max_gaussians or task.most, task.start)
     gaussians = task.start + grown * (most - task.start)
@@ -101,7 +102,8 @@ def as_flags(config: TrainConfig) -> str:
     if not config.learn.settle_from_iter:
         idle.add("settle_from_iter")
     shown = {name: value for name, value in schedule_of(config).items() if name not in idle}
-    shown |= {"coarse": config.learn.coarse, "max_gaussians": config.grow.max_gaussians}
+    shown |= {name: getattr(config.learn, name) for name in ("coarse", "coarse_by")}
+    shown |= {"max_gaussians": config.grow.max_gaussians}
     preset = f"--preset {config.data.preset} " if config.data.preset else ""
     return preset + " ".join(f"--{name} {value}" for name, value in shown.items())
 

@@ -105,7 +105,7 @@ class Trainer:
         self.degree = 0
         self._views_random = random.Random(seed)
         self._deck: list[View] = []
-        self.photographs = Photographs(config, self.device, any(having(self.parts, "reads_alpha")))
+        self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
         self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
 
     def differentiate(self, iteration: int) -> torch.Tensor:
