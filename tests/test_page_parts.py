@@ -1,4 +1,4 @@
-"""The page of a large model: parts in the order of importance, a first picture from the first of them, fewer in motion.
+"""The page of a large model: Gaussians that stand for many, of which the first picture is made, and those in motion.
 
 The browser's tests are skipped where there is none; see browser.py.
 """
@@ -9,25 +9,26 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
-from splat_files import some_splats
+from splat_files import covariances, some_splats
 from test_page import OPTIONS, Blocks, browser, export, model, open_page, photographed, pixels, unpacked  # noqa: F401
 
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html import command, pack
 from warp_splat.export_html.command import make_page
-from warp_splat.formats.splats import SplatArrays, sizes
+from warp_splat.export_html.merge import groups, importance, merged
+from warp_splat.formats.splats import SplatArrays
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import orbit_cameras
 from warp_splat.rendering.command import make_picture
 
 CAMERAS = [("one", orbit_cameras(np.zeros(3), np.array([0, -1.0, 0]), np.array([0, 0, -9.0]), 1)[0])]
-PARTS = ["gaussians0", "gaussians1", "gaussians2", "harmonics0", "harmonics1", "harmonics2"]
+PARTS = ["gaussians0", "gaussians1", "gaussians2", "gaussians3", "harmonics1", "harmonics2", "harmonics3"]
 
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    """10,000 Gaussians are three parts, of which one is drawn while moving."""
+    """10,000 Gaussians are three parts, after one of 4,096 that stand for them."""
     monkeypatch.setattr(pack, "CHUNK", 4096)
     monkeypatch.setattr(command, "MOST_MOVING", 4096)
 
@@ -38,25 +39,76 @@ def many_splats():
     return splats
 
 
-def test_the_largest_come_first_and_neighbors_stay_neighbors(small_chunks):
-    splats = many_splats()
-    kept = pack.shown(splats)
-    size = sizes(kept)
-    for first in (4096, 8192):
-        assert size[:first].min() >= size[first:].max()
-    where = {tuple(mean): row for row, mean in enumerate(splats.means)}
-    rows = np.array([where[tuple(mean)] for mean in kept.means])
-    for first in (0, 4096, 8192):
-        assert (np.diff(rows[first : first + 4096]) > 0).all()
-    few = some_splats(4096)
-    few.opacities[:] = 0.0
-    np.testing.assert_array_equal(pack.shown(few).means, few.means)  # in one part, as they were
+@pytest.mark.parametrize(("total", "count"), [(1, 1), (7, 7), (1000, 1), (1000, 37), (1000, 768)])
+def test_groups_are_so_many_and_hold_each_point_once(total, count):
+    rng = np.random.default_rng(0)
+    points, important = rng.normal(size=(total, 3)), rng.exponential(size=total) ** 4
+    points[: total // 3] = 1.0  # many at one place
+    order, starts = groups(points, important, count)
+    np.testing.assert_array_equal(np.sort(order), np.arange(total))
+    assert len(starts) == count and starts[0] == 0 and (np.diff([*starts, total]) > 0).all()
+
+
+def test_groups_are_neighbors_and_smaller_where_it_is_important():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4000, 3))
+    order, starts = groups(points, np.where(points[:, 0] > 0, 1.0, 1e-4), 100)
+    clouds = np.split(points[order], starts[1:])
+    important = [cloud for cloud in clouds if cloud[:, 0].mean() > 0]
+    assert len(important) > 80
+    assert np.mean([cloud.std(axis=0).max() for cloud in important]) < 0.4
+
+
+def test_groups_of_one_are_what_they_were(small_chunks):
+    splats = pack.shown(some_splats(300))
+    same, alone, _ = merged(splats, len(splats.means), [CAMERAS[0][1]])
+    np.testing.assert_allclose(alone.means, same.means, atol=1e-5)
+    np.testing.assert_allclose(alone.sh, same.sh[:, :1], atol=1e-5)
+    np.testing.assert_allclose(alone.opacities, same.opacities, atol=1e-3, rtol=1e-4)
+    np.testing.assert_allclose(covariances(alone), covariances(same), atol=1e-5, rtol=1e-3)
+
+
+def test_a_group_has_the_mean_the_covariance_and_the_cover_of_its_members():
+    """Against points drawn from the mixture."""
+    rng = np.random.default_rng(0)
+    splats = some_splats(5)
+    splats.opacities[:] = [-3.0, -2.0, -3.0, -4.0, -2.0]
+    _, matched, _ = merged(splats, 1, [])
+    deviations = np.exp(splats.scales.astype(float))
+    cover = deviations[:, [0, 0, 1]] * deviations[:, [1, 2, 2]]
+    weights = cover.mean(axis=1) / (1 + np.exp(-splats.opacities.astype(float)))
+    members = rng.choice(5, 400_000, p=weights / weights.sum())
+    drawn = np.einsum("nij,nj->ni", np.linalg.cholesky(covariances(splats))[members], rng.normal(size=(400_000, 3)))
+    drawn += splats.means[members]
+    size = np.sqrt(np.trace(covariances(matched)[0]))
+    np.testing.assert_allclose(matched.means[0], drawn.mean(axis=0), atol=0.01 * size)
+    np.testing.assert_allclose(covariances(matched)[0], np.cov(drawn.T), atol=0.01 * size**2)
+    np.testing.assert_allclose(matched.sh[0, 0], splats.sh[members, 0].mean(axis=0), atol=0.01)
+    deviations = np.exp(matched.scales[0].astype(float))
+    cover = (deviations[[0, 0, 1]] * deviations[[1, 2, 2]]).mean() / (1 + np.exp(-float(matched.opacities[0])))
+    assert cover == pytest.approx(weights.sum(), rel=1e-4)
+
+
+def test_merged_ones_look_more_like_a_surface_than_its_most_important_ones_do():
+    rng = np.random.default_rng(0)
+    splats, camera = some_splats(10_000, 1), CAMERAS[0][1].resized(280, 156)
+    splats.means[:, 2] = 0.1 * splats.means[:, 2] + np.sin(splats.means[:, 0])
+    splats.sh[:, 0] = np.sin(splats.means) + 0.2 * rng.normal(size=(10_000, 3))
+    splats.scales[:] = rng.normal(-2.5, 0.5, (10_000, 3))
+
+    def picture(chosen):
+        return make_picture(GaussianModel.from_splats(chosen), False, RasterOptions())(camera)
+
+    everything, few = picture(splats), picture(pack.shown(splats, 1000))
+    assert psnr(picture(merged(splats, 1000, [camera])[1]), everything) > 3 + psnr(few, everything)
 
 
 def test_parts_decode_to_all_gaussians(small_chunks):
-    splats = pack.shown(many_splats())
-    blocks = pack.parts(splats, np.zeros(3))
+    splats, coarse, _ = merged(pack.shown(many_splats()), 4096, [CAMERAS[0][1]])
+    blocks = pack.parts(splats, np.zeros(3), coarse)
     assert list(blocks) == PARTS
+    first = {"gaussians0": blocks.pop("gaussians0")}
+    np.testing.assert_allclose(unpacked(first, 4096, 1).means, coarse.means, rtol=2**-18 * 1.01, atol=0)
     found = unpacked(blocks, len(splats.means), 16)
     np.testing.assert_allclose(found.means, splats.means, rtol=2**-18 * 1.01, atol=0)
     np.testing.assert_allclose(found.sh[:, 1:], splats.sh[:, 1:], atol=1.01 / 256, rtol=0)
@@ -66,16 +118,15 @@ def test_cameras_say_what_is_important(small_chunks):
     """What they see comes first; of that, what is near."""
     splats = some_splats(3000)
     splats.scales[:], splats.opacities[:] = -3.0, 0.0
-    order = pack.importance(splats, [CAMERAS[0][1]])
+    order = importance(splats, [CAMERAS[0][1]])
     depths = splats.means.astype(float) @ CAMERAS[0][1].rotation[2] + CAMERAS[0][1].translation[2]
     seen = order > 0
     assert 100 < seen.sum() < 2900
     np.testing.assert_array_equal(np.argsort(-order[seen]), np.argsort(depths[seen]))
     assert (depths[seen] > 0).all()
-    kept = pack.shown(splats, int(seen.sum()), [CAMERAS[0][1]])
-    np.testing.assert_array_equal(kept.means, splats.means[seen])
 
 
+@pytest.mark.slow
 def test_what_comes_before_the_program_is_bounded():
     """Random numbers, which do not compress: the most bytes that a first picture can need, whatever follows."""
     rng = np.random.default_rng(0)
@@ -84,7 +135,7 @@ def test_what_comes_before_the_program_is_bounded():
     page = make_page("large", SplatArrays(*numbers), CAMERAS, OPTIONS)
     assert page.index("})();</script>") < 4.5e6 < len(page)
     ids = [id for id in Blocks(page).found if re.fullmatch(r"(gaussians|harmonics)\d|program", str(id))]
-    assert ids == ["gaussians0", "program", "gaussians1", "harmonics0", "harmonics1"]
+    assert ids == ["gaussians0", "program", "gaussians1", "gaussians2", "harmonics1", "harmonics2"]
     ids = list(Blocks(make_page("small", some_splats(100), CAMERAS, OPTIONS)).found)
     assert ids[ids.index("gaussians0") :][:3] == ["gaussians0", "harmonics0", "program"]
 
@@ -128,7 +179,7 @@ MOVING = """async () => {
 
 @pytest.mark.slow
 def test_the_first_picture_comes_before_the_rest(small_chunks, browser, slow_server, tmp_path):  # noqa: F811
-    """Of what came so far; the rest follows; in motion, only the first part is drawn; at rest, all."""
+    """Of those that stand for many, as are pictures in motion; the rest follows; at rest, all are drawn."""
     splats = many_splats()
     folder, picture, cameras = model(tmp_path, splats)
     export(folder)
@@ -138,12 +189,11 @@ def test_the_first_picture_comes_before_the_rest(small_chunks, browser, slow_ser
     errors.clear()
     page.goto(f"http://127.0.0.1:{slow_server.server_port}/", wait_until="commit")
     page.wait_for_selector("#message:not(:has-text('Loading'))", state="attached", timeout=20_000)
-    assert page.inner_text("#count").startswith("4,096 of ")
+    assert page.inner_text("#count").startswith("4,096 for ")
     before = photographed(page, tmp_path)[: int(page.locator("#bar").bounding_box()["y"])]
-    first = pack.shown(splats, 4096, cameras)
-    enlarged = np.float32(np.log(len(pack.shown(splats).means) / 4096) / 8)
-    ours = GaussianModel.from_splats(first._replace(sh=first.sh[:, :1], scales=first.scales + enlarged))
-    assert psnr(before, make_picture(ours, False, RasterOptions())(cameras[0])[: len(before)]) > 45
+    _, coarse, _ = merged(pack.shown(splats), 4096, cameras)
+    ours = make_picture(GaussianModel.from_splats(coarse), False, RasterOptions())
+    assert psnr(before, ours(cameras[0])[: len(before)]) > 45
     assert page.evaluate("document.readyState") == "loading"
     slow_server.more.set()
     for index, camera in enumerate(cameras):

@@ -212,7 +212,7 @@ class ExportHtmlConfig:
 
     model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
     page: str = argument("the page to write, *.html")
-    max_gaussians: int = flag(0, "keep only this many, the most important ones; 0: all that can be seen")
+    max_gaussians: int = flag(0, "keep only this many, by opacity and size; 0: all that can be seen")
 
 
 @dataclass

@@ -18,6 +18,7 @@ from warp_splat.color import TOE
 from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.export_html import pack
+from warp_splat.export_html.merge import merged
 from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_text
@@ -29,7 +30,7 @@ HARMONICS = ("C0", "C1", "C2A", "C2B", "C2C", "C3A", "C3B", "C3C", "C3D", "C3E")
 STEPS = ("LOG_STEPS", "ROTATION_STEPS", "COLOR_STEPS", "HARMONIC_STEPS")
 SCRIPTS = ("camera.js", "renderer.js", "viewer.js")
 LONGEST = 2**29  # characters of Gaussians in a page: none larger was ever tried
-MOST_MOVING = 2 * pack.CHUNK  # Gaussians drawn while the camera moves
+MOST_MOVING = 3 * pack.CHUNK  # Gaussians drawn as they are while the camera moves
 LARGE = 100  # MB: a page above it is called large
 START_SIZE, START_FOV = (1200, 800), 0.9  # of the view of a file that comes without cameras: px, rad (vertical)
 
@@ -46,7 +47,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     check_numbers(config)
     iteration, (splats, _), trained = model_folder.open_model(config.model)
     cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
-    kept = pack.shown(splats, config.max_gaussians, [camera for _, camera in cameras])
+    kept = pack.shown(splats, config.max_gaussians)
     options = {
         "ANTIALIASED": bool(trained.get("antialiasing")),
         "ELLIPSOID": trained.get("projection") == "ellipsoid",
@@ -95,19 +96,25 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         InputError: if there are more Gaussians than browsers take.
     """
     origin = np.median(splats.means, axis=0).astype(np.float64) if len(splats.means) else np.zeros(3)
-    parts = {id: base64.b64encode(data).decode() for id, data in pack.parts(splats, origin).items()}
+    count, coarse, starts = len(splats.means), None, np.arange(0)
+    if count > pack.CHUNK:
+        splats, coarse, starts = merged(splats, pack.CHUNK, [camera for _, camera in cameras])
+    parts = {id: base64.b64encode(data).decode() for id, data in pack.parts(splats, origin, coarse).items()}
     size = sum(map(len, parts.values()))
     if size > LONGEST:
         raise InputError(
-            f"{name}: {len(splats.means)} Gaussians make a page of {size / 1e6:.0f} MB, expected at most "
+            f"{name}: {count} Gaussians make a page of {size / 1e6:.0f} MB, expected at most "
             f"{LONGEST / 1e6:.0f} MB, which browsers can read; use --max_gaussians."
         )
-    before = 1 if len(splats.means) > pack.CHUNK else len(parts)
+    before = len(parts) if coarse is None else 1
     texels = pack.texels(splats.sh.shape[1])
     up = -np.mean([camera.rotation[1] for _, camera in cameras], axis=0)
     scene = {
-        "count": len(splats.means),
+        "count": count,
         "chunk": pack.CHUNK,
+        "coarse": len(starts),
+        # of those, how many are replaced once so many parts of the others are there
+        "replaced": np.searchsorted(starts, [*range(0, count, pack.CHUNK), count]).tolist(),
         "moving": MOST_MOVING,
         "harmonics": texels,
         "parts": list(parts),

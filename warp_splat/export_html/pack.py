@@ -9,19 +9,18 @@
 
 and in a table of their own, five more SH coefficients a texel, RGB each: int8 in steps of 2^e / 128, and e, uint8.
 
-Both are cut into parts of CHUNK Gaussians. An attribute's bytes lie together in a part, first bytes first, before gzip:
+Both are cut into parts of CHUNK Gaussians, of which a large model's first is of Gaussians that stand for many
+(merge.py). An attribute's bytes lie together in a part, first bytes first, before gzip:
 so they compress. Half a step is the largest error.
 """
 
 from __future__ import annotations
 
 import gzip
-from collections.abc import Sequence
 
 import numpy as np
 
-from warp_splat.camera import Camera
-from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
+from warp_splat.config import ALPHA_MIN
 from warp_splat.formats.splats import SplatArrays, sigmoid, sizes, unit_quats
 
 ROUNDED_BITS = 6  # of the 23 of a position's mantissa
@@ -31,8 +30,6 @@ COLOR_STEPS = 256  # of SH coefficients of degree 0
 HARMONIC_STEPS = 128  # of the others, where none of five is larger than 127 steps
 LARGEST = 127.0  # SH coefficients beyond it are moved there
 TEXEL = 16  # bytes
-MOST_CAMERAS = 16  # that are asked what is important
-REACH = 0.5 * (1 + FRUSTUM_MARGIN)  # of an image, from its middle: what is just outside reaches into it
 CHUNK = 24 * 4096  # Gaussians in a part: whole rows of textures as wide as this or any smaller power of two
 IN_TEXEL = 5  # SH coefficients of a degree above 0
 
@@ -41,37 +38,18 @@ CORE = np.dtype(
 )
 
 
-def shown(splats: SplatArrays, most: int = 0, cameras: Sequence[Camera] = ()) -> SplatArrays:
-    """The Gaussians that can be seen at all, the most important ones in the first CHUNK, and so on.
-
-    Within one they stay as they were: neighbors compress, and are found in caches.
+def shown(splats: SplatArrays, most: int = 0) -> SplatArrays:
+    """The Gaussians that can be seen at all; of these the ``most`` opaque and large ones, if it is not 0.
 
     Args:
         splats: finite Gaussians.
-        most: the largest number to keep, by importance; 0 keeps all.
-        cameras: see :func:`importance`.
+        most: the largest number to keep, by opacity times the area of the largest section; 0 keeps all.
     """
     opacities = sigmoid(splats.opacities)
     rows = np.flatnonzero((opacities >= ALPHA_MIN) & splats.quats.any(axis=1))
-    order = np.lexsort((-sizes(splats)[rows], -importance(splats, cameras)[rows]))  # by size what no camera sees
-    rows = rows[order[: most or None]]
-    chunks = [np.sort(rows[first : first + CHUNK]) for first in range(0, len(rows), CHUNK)]
-    return SplatArrays(*(array[np.concatenate([rows[:0], *chunks])] for array in splats))
-
-
-def importance(splats: SplatArrays, cameras: Sequence[Camera]) -> np.ndarray:
-    """Opacity times the area of the largest section [N]: in the images of some ``cameras``, summed.
-
-    Without cameras, in world units.
-    """
-    total = np.zeros(len(splats.means))
-    for camera in cameras[:: -(-len(cameras) // MOST_CAMERAS) or 1]:
-        x, y, z = camera.rotation @ splats.means.T + camera.translation[:, None]
-        z = np.maximum(z, NEAR)
-        across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
-        inside = (z > NEAR) & (np.abs(across - 0.5) < REACH) & (np.abs(down - 0.5) < REACH)
-        total += np.where(inside, camera.fx * camera.fy / z**2, 0.0)
-    return sizes(splats) * (total if cameras else 1.0)
+    if 0 < most < len(rows):
+        rows = np.sort(rows[np.argsort(-sizes(splats)[rows], kind="stable")[:most]])
+    return SplatArrays(*(array[rows] for array in splats))
 
 
 def texels(coefficients: int) -> int:
@@ -79,18 +57,22 @@ def texels(coefficients: int) -> int:
     return -(-(coefficients - 1) // IN_TEXEL)
 
 
-def parts(splats: SplatArrays, origin: np.ndarray) -> dict[str, bytes]:
+def parts(splats: SplatArrays, origin: np.ndarray, coarse: SplatArrays | None = None) -> dict[str, bytes]:
     """The Gaussians, compressed, in the order of the page: all without harmonics, "gaussians0" and on, then those.
 
     Args:
-        splats: finite Gaussians, the most important first.
+        splats: finite Gaussians.
         origin: the point [3] that positions are relative to, world units.
+        coarse: CHUNK others of degree 0, which become the first part.
     """
     starts = range(0, max(1, len(splats.means)), CHUNK)
     chunks = [SplatArrays(*(array[start : start + CHUNK] for array in splats)) for start in starts]
+    if coarse is not None:
+        chunks = [coarse, *chunks]
     found = {f"gaussians{index}": _compressed(_core(chunk, origin)) for index, chunk in enumerate(chunks)}
-    if splats.sh.shape[1] > 1:
-        found |= {f"harmonics{index}": _compressed(_harmonics(chunk.sh[:, 1:])) for index, chunk in enumerate(chunks)}
+    for index, chunk in enumerate(chunks):
+        if chunk.sh.shape[1] > 1:
+            found[f"harmonics{index}"] = _compressed(_harmonics(chunk.sh[:, 1:]))
     return found
 
 

@@ -1,7 +1,6 @@
 // From 3D Gaussians to 2D ones, a pixel for each: the mathematics of warp_splat/kernels/project/.
 uniform highp usampler2D gaussians, harmonics; // 2 and HARMONICS texels each, as warp_splat/export_html/pack.py has them
-uniform int count;
-uniform float enlarged; // what a share of the Gaussians stands in for all
+uniform int end; // of those to project
 uniform mat3 rotation; // camera from world
 uniform vec3 center; // of the camera, from the origin of the positions
 uniform vec2 focal, principal, size; // px
@@ -70,7 +69,7 @@ void main() {
   meanAndRoot = uvec4(0);
   rootAndColor = uvec4(0);
   int index = int(gl_FragCoord.y) * WIDTH + int(gl_FragCoord.x);
-  if (index >= count) return;
+  if (index >= end) return;
   uvec4 t = texel(gaussians, 2 * index), u = texel(gaussians, 2 * index + 1);
   vec3 offset = uintBitsToFloat(t.xyz) - center;
   vec3 p = rotation * offset;
@@ -81,7 +80,7 @@ void main() {
     vec2 margin = FRUSTUM_MARGIN * 0.5 * size / focal;
     bounded = clamp(slope, -principal / focal - margin, (size - principal) / focal + margin);
   }
-  vec3 scale = enlarged * exp(vec3(low(t.w), high(t.w), low(u.x)) / LOG_STEPS);
+  vec3 scale = exp(vec3(low(t.w), high(t.w), low(u.x)) / LOG_STEPS);
   mat3 axes = rotation * rotationMatrix(vec3(low(u.y), high(u.y), low(u.z)) / ROTATION_STEPS);
   mat3 rows = transpose(axes);
   vec3 a1 = focal.x / p.z * scale * (rows[0] - bounded.x * rows[2]);

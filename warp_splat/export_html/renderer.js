@@ -3,7 +3,6 @@
 const source = (name) => document.getElementById(name).textContent;
 
 const LEAST_DETAIL = 0.2;
-const ENLARGED = 1 / 8; // power of the share: a tenth of the Gaussians are drawn by a third larger
 const BATCH = 1 << 16; // Gaussians drawn by one call
 
 class Renderer {
@@ -11,9 +10,8 @@ class Renderer {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks or has switched off.");
     this.gl = gl;
-    this.total = scene.count;
     this.width = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));
-    const rows = (texels) => Math.max(1, Math.ceil((scene.count * texels) / this.width));
+    const rows = (texels) => Math.max(1, Math.ceil(((scene.coarse + scene.count) * texels) / this.width));
     if (rows(Math.max(2, scene.harmonics)) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
       throw new Error(`${scene.count} Gaussians are more than this graphics card takes; export fewer.`);
     }
@@ -27,12 +25,13 @@ class Renderer {
       resolve: this.program("screen.glsl", "resolve.glsl"),
     };
     this.order = this.texture(gl.R32UI, this.width, rows(1));
-    [this.count, this.visible] = [0, 0];
+    [this.range, this.visible] = [[0, 0], 0];
     const corners = new Uint32Array(6 * BATCH); // two triangles of each four vertices
     for (let i = 0; i < corners.length; i++) corners[i] = 4 * Math.floor(i / 6) + [0, 1, 2, 1, 3, 2][i % 6];
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     [this.detail, this.drawn, this.frameTime, this.fence] = [1, 0, 0, null];
+    this.pace = 0; // ms for a Gaussian, at rest
     // blended in float32 where the card can (software renderers need half the time of float16), in float16, which costs
     // 4 dB, or in the last resort in 8 bits, which costs 20
     this.imageFormat = gl.getExtension("EXT_color_buffer_float")
@@ -96,14 +95,18 @@ class Renderer {
     this.fill(this[table], (first * texels) / this.width, this.gl.RGBA_INTEGER, numbers);
   }
 
-  // The Gaussians to draw, of the first `count`, nearest first: the first `visible` of `order`, which fills rows.
-  setOrder(order, visible, count) {
+  // The Gaussians to draw, of those in `range`, nearest first: the first `visible` of `order`, which fills rows.
+  setOrder(order, visible, range) {
     this.fill(this.order, 0, this.gl.RED_INTEGER, order);
-    [this.visible, this.count] = [visible, count];
+    [this.visible, this.range] = [visible, range];
   }
 
-  // Draws what `camera` sees; its size is that of the canvas times `detail`.
-  draw(camera, detail) {
+  get count() {
+    return this.range[1] - this.range[0];
+  }
+
+  // Draws what `camera` sees, which moves or is at rest; its size is that of the canvas times `detail`.
+  draw(camera, detail, atRest) {
     const size = [camera.width, camera.height];
     if (this.size?.[0] !== this.gl.canvas.width || this.size?.[1] !== this.gl.canvas.height) {
       this.resize(this.gl.canvas.width, this.gl.canvas.height);
@@ -111,18 +114,19 @@ class Renderer {
     this.project(camera, size);
     this.blend(size);
     this.resolve(detail);
-    [this.detail, this.drawn] = [detail, this.count];
+    [this.detail, this.drawn, this.atRest] = [detail, this.count, atRest];
     this.started = performance.now();
     this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     this.gl.flush();
   }
 
-  // Whether the last frame is done; then `frameTime` says how long it took.
+  // Whether the last frame is done; then `frameTime` says how long it took, if somebody looks in time.
   get ready() {
     const { gl } = this;
     if (!this.fence) return true;
     if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost()) return false;
     this.frameTime = performance.now() - this.started;
+    if (this.atRest) this.pace = this.frameTime / Math.max(1, this.drawn);
     gl.deleteSync(this.fence);
     this.fence = null;
     return true;
@@ -137,12 +141,12 @@ class Renderer {
   project(camera, size) {
     const { gl } = this, { handle, at } = this.programs.project;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projectTarget);
-    gl.viewport(0, 0, this.width, Math.ceil(this.count / this.width));
+    const [row, end] = [Math.floor(this.range[0] / this.width), Math.ceil(this.range[1] / this.width)];
+    gl.viewport(0, row, this.width, end - row);
     gl.disable(gl.BLEND);
     gl.useProgram(handle);
     this.bind([this.gaussians, this.harmonics], handle, ["gaussians", "harmonics"]);
-    gl.uniform1i(at("count"), this.count);
-    gl.uniform1f(at("enlarged"), (this.total / Math.max(1, this.count)) ** ENLARGED);
+    gl.uniform1i(at("end"), this.range[1]);
     gl.uniformMatrix3fv(at("rotation"), false, camera.rotation.flat());
     gl.uniform3fv(at("center"), camera.position);
     gl.uniform2f(at("focal"), camera.fx, camera.fy);

@@ -4,9 +4,10 @@
 let means, depths, bits, near, width;
 const starts = new Uint32Array(1 << 16);
 
-function sort([x, y, z], [fx, fy, fz], count) {
+// Those from `begin` to `end`.
+function sort([x, y, z], [fx, fy, fz], begin, end) {
   let least = Infinity, most = 0, seen = 0;
-  for (let i = 0; i < count; i++) {
+  for (let i = begin; i < end; i++) {
     depths[i] = (means[3 * i] - x) * fx + (means[3 * i + 1] - y) * fy + (means[3 * i + 2] - z) * fz;
     const depth = depths[i];
     if (depth > near) {
@@ -18,14 +19,14 @@ function sort([x, y, z], [fx, fy, fz], count) {
   const [low, high] = new Uint32Array(new Float32Array([least, most]).buffer);
   const shift = Math.max(0, 16 - Math.clz32(high - low));
   starts.fill(0);
-  for (let i = 0; i < count; i++) if (depths[i] > near) starts[(bits[i] - low) >>> shift]++;
+  for (let i = begin; i < end; i++) if (depths[i] > near) starts[(bits[i] - low) >>> shift]++;
   for (let key = 0, sum = 0; key < starts.length; key++) {
     const size = starts[key];
     starts[key] = sum;
     sum += size;
   }
-  const order = new Uint32Array(width * Math.ceil(count / width)); // whole rows of a texture
-  for (let i = 0; i < count; i++) if (depths[i] > near) order[starts[(bits[i] - low) >>> shift]++] = i;
+  const order = new Uint32Array(width * Math.ceil(seen / width)); // whole rows of a texture
+  for (let i = begin; i < end; i++) if (depths[i] > near) order[starts[(bits[i] - low) >>> shift]++] = i;
   return [order, seen];
 }
 
@@ -38,8 +39,8 @@ onmessage = ({ data }) => {
   } else if (data.means) {
     means.set(data.means, 3 * data.first);
   } else {
-    const start = performance.now(), { version, count } = data;
-    const [order, visible] = sort(data.position, data.forward, count);
-    postMessage({ order, visible, version, count, milliseconds: performance.now() - start }, [order.buffer]);
+    const start = performance.now(), { version, range } = data;
+    const [order, visible] = sort(data.position, data.forward, ...range);
+    postMessage({ order, visible, version, range, milliseconds: performance.now() - start }, [order.buffer]);
   }
 };

@@ -50,12 +50,12 @@ class Viewer {
     this.renderer = new Renderer(this.canvas, scene);
     this.canvas.addEventListener("webglcontextlost", () => say("The graphics card was reset: load this page again."));
     this.worker = new Worker(URL.createObjectURL(new Blob([source("sort.js")], { type: "text/javascript" })));
-    this.worker.postMessage({ total: scene.count, near: scene.near, width: this.renderer.width });
+    this.worker.postMessage({ total: scene.coarse + scene.count, near: scene.near, width: this.renderer.width });
     this.worker.onmessage = ({ data }) => this.sorted(data);
     this.worker.onerror = () => say("The Gaussians could not be sorted: this browser refuses workers.");
-    this.version = this.loaded = 0; // of the camera; how many Gaussians came
+    this.version = this.loaded = 0; // of the camera; how many Gaussians came, coarse ones first
     this.missing = scene.parts.length;
-    this.sortedVersion = this.sortedCount = -1;
+    [this.sortedVersion, this.sortedRange] = [-1, [0, -1]];
     this.sorting = this.requested = false;
     this.lastInput = -Infinity;
     this.waiting = [];
@@ -74,16 +74,16 @@ class Viewer {
       this.missing--;
       this.request();
     }
-    const [loaded, all] = [this.loaded, scene.count].map((count) => count.toLocaleString("en"));
-    element("count").textContent = loaded === all ? `${all} Gaussians` : `${loaded} of ${all} Gaussians`;
+    const count = `${scene.count.toLocaleString("en")} Gaussians`;
+    element("count").textContent = this.missing ? `${scene.coarse.toLocaleString("en")} for ${count}` : count;
   }
 
   addMeans(first, numbers) {
-    this.loaded = Math.min(first + this.scene.chunk, this.scene.count);
+    this.loaded = Math.min(first + this.scene.chunk, this.scene.coarse + this.scene.count);
     const means = new Float32Array(3 * (this.loaded - first));
     for (let i = 0; i < this.loaded - first; i++) for (let k = 0; k < 3; k++) means[3 * i + k] = numbers[8 * i + k];
     this.worker.postMessage({ means, first });
-    this.means ??= means; // the most important ones: enough to find what the camera looks at
+    this.means ??= means; // enough to find what the camera looks at
   }
 
   // Shows what `camera` sees (world coordinates; see camera.js); resolves once what came is sorted and drawn in full
@@ -115,22 +115,31 @@ class Viewer {
     return this.lastInput + MOVING - performance.now();
   }
 
-  // How many Gaussians to draw, the most important ones: a bounded number while moving.
+  // Which Gaussians to draw: all; while they come, those that are there, and the coarse ones that stand for others;
+  // while the camera moves, the coarse ones, if there are many or the card is slow.
   get wanted() {
-    return this.rest > 0 ? Math.min(this.loaded, this.scene.moving) : this.loaded;
+    const { scene: { coarse, count, chunk, moving, replaced }, loaded, renderer } = this;
+    const few = !this.missing && count <= moving && count * renderer.pace <= FRAME;
+    if (!coarse || (this.rest > 0 && !few)) return [0, coarse || loaded];
+    return [replaced[Math.ceil((loaded - coarse) / chunk)], loaded];
+  }
+
+  // Whether what is sorted is what is wanted.
+  get current() {
+    return this.sortedRange.join() === this.wanted.join();
   }
 
   sort() {
-    if (this.sorting || (this.sortedVersion === this.version && this.sortedCount === this.wanted)) return;
+    if (this.sorting || (this.sortedVersion === this.version && this.current)) return;
     this.sorting = true;
     const { position } = this.camera;
-    this.worker.postMessage({ position, forward: axis(this.camera, 2), version: this.version, count: this.wanted });
+    this.worker.postMessage({ position, forward: axis(this.camera, 2), version: this.version, range: this.wanted });
   }
 
-  sorted({ order, visible, version, count, milliseconds }) {
-    this.renderer.setOrder(order, visible, count);
+  sorted({ order, visible, version, range, milliseconds }) {
+    this.renderer.setOrder(order, visible, range);
     this.sorting = false;
-    [this.sortedVersion, this.sortedCount, this.sortTime] = [version, count, milliseconds];
+    [this.sortedVersion, this.sortedRange, this.sortTime] = [version, range, milliseconds];
     this.sort();
     this.request();
   }
@@ -149,15 +158,21 @@ class Viewer {
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     const { rest } = this;
     this.sort();
-    const current = this.sortedVersion === this.version && (this.missing || this.sortedCount === this.loaded);
-    if (rest > 0 ? this.sortedCount > this.scene.moving : !current) return; // the sort's end draws it
+    const right = rest > 0 ? this.current : this.sortedVersion === this.version && (this.missing || this.current);
+    if (!right) return; // the sort's end draws it
     if (rest > 0) {
       clearTimeout(this.sharpen);
       this.sharpen = setTimeout(() => this.request(), rest + 1);
     }
     const detail = rest > 0 ? this.renderer.detailFor(FRAME) : 1;
-    this.renderer.draw(fitted(this.camera, Math.ceil(width * detail), Math.ceil(height * detail)), detail);
+    this.renderer.draw(fitted(this.camera, Math.ceil(width * detail), Math.ceil(height * detail)), detail, rest <= 0);
+    this.watch();
     if (rest <= 0) for (const resolve of this.waiting.splice(0)) resolve();
+  }
+
+  // Sees when the frame is done, whether or not another follows.
+  watch() {
+    if (!this.renderer.ready) requestAnimationFrame(() => this.watch());
   }
 
   // Of the last sort and of the last frame [ms], the share of the canvas's pixels in a row that it had, and how many
