@@ -21,9 +21,9 @@ from common import write_table
 from warp_splat.config import ADJOINTS, STRONGEST_MOST
 from warp_splat.kernels import sh_colors, tiles
 from warp_splat.kernels.activation import make_activate, make_adj_activate
-from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
 from warp_splat.kernels.cuda import channels
+from warp_splat.kernels.cuda.adam_by_number import make_adam_by_number
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.comparison import compare_block
@@ -71,7 +71,8 @@ def modules() -> dict[str, wp.Module]:
         "adjoint of activate": make_adj_activate(1).module,
         "observe": make_observe(1).module,
         "loss": compare_block.module,
-        "adam": make_adam(1, True).module,
+        "adam": make_adam_by_number(False).module,
+        "adam, sparse": make_adam_by_number(True).module,
         "map of colors": make_map_colors(1).module,
         "adjoint of the map": make_adj_map_colors(1).module,
         "environment": make_put_behind(1).module,

@@ -17,7 +17,7 @@ from common import write_table
 from preset import run
 
 from warp_splat.runtime import launch
-from warp_splat.training.optimizer import HALF, move
+from warp_splat.training.adam_step import HALF, move
 
 SEEDS = (0, 1, 2)
 FLAGS = ["--preset", "fast", "--iterations", "600", "--max_gaussians", "15000"]

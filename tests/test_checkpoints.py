@@ -276,7 +276,8 @@ def test_resume_on(device, scene, tmp_path):
     other, continued = begin(scene, tmp_path, device=device)
     restore(other, continued, load_checkpoint(tmp_path))
     assert all(leaf.device.type == device for leaf in other.model.parameters.values())
-    assert all(table.device.type == device for state in other.optimizer.adam.state.values() for table in state.values())
+    moments = [state[name] for state in other.optimizer.adam.state.values() for name in ("exp_avg", "exp_avg_sq")]
+    assert moments and all(moment.device.type == device for moment in moments)
     steps(trainer, run, STOP + 2)
     steps(other, continued, STOP + 2)
     assert [float(loss) for loss in continued.losses] == pytest.approx([float(loss) for loss in run.losses], rel=1e-3)

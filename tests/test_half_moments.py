@@ -6,7 +6,9 @@ import torch
 
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime import pool
-from warp_splat.training.optimizer import BETAS, HALF, move
+from warp_splat.training import adam_step
+from warp_splat.training.adam_step import HALF, move
+from warp_splat.training.optimizer import BETAS
 
 RATE, EPS = 0.01, 1e-15
 WIDTHS = (3, 45)
@@ -63,13 +65,16 @@ def test_the_mean_is_kept_and_what_fits_stays():
 
 
 @pytest.mark.parametrize("sparse", [False, True])
-def test_the_same_bytes_on_any_driver_and_number_of_threads(sparse):
+@pytest.mark.parametrize("kind", [HALF, torch.float32])
+def test_the_same_bytes_on_any_driver_and_number_of_threads(sparse, kind, monkeypatch):
+    """And however many numbers a GPU takes in a launch."""
     found, threads = set(), pool.get_threads()
     radii = torch.arange(2603, dtype=torch.int32) % 3 if sparse else None
     try:
-        for driver, count in ((CPU, 1), (CPU, 3), (CUDA, 1)):
+        for driver, count, most in ((CPU, 1, None), (CPU, 3, None), (CUDA, 1, adam_step.MOST), (CUDA, 1, 50_000)):
             pool.set_threads(count)
-            tables = tables_of(2603, HALF)
+            monkeypatch.setattr(adam_step, "MOST", most)
+            tables = tables_of(2603, kind)
             with using(driver):
                 steps(tables, 3, radii)
             found.add(bytes_of(tables))

@@ -134,12 +134,6 @@ def launch_in_lanes(
             launch(make(size), runs, *arguments(TYPES[size], rows), bounds=bounds, device=device)
 
 
-def there(values: Sequence, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    """Numbers of the host on a device; through page-locked memory, so that the host need not wait for a GPU."""
-    here = torch.tensor(values, dtype=dtype, pin_memory=device.type == "cuda", device="cpu")
-    return here.to(device, non_blocking=True)
-
-
 def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     """With rows of zeros up to so many; the tensor itself, if it has them."""
     if len(tensor) == rows:

@@ -7,28 +7,19 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from decimal import Decimal
-from functools import partial
 
 import numpy as np
 import torch
-import warp as wp
-from torch.optim.adam import adam
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
-from warp_splat.kernels.adam import make_adam
-from warp_splat.kernels.simd import Types
-from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch_in_lanes, load, there, view
+from warp_splat.training.adam_step import HALF, load_adam, move
 from warp_splat.training.options import LearnOptions
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # the reference's: gradients of single Gaussians are tiny
 MOMENTS = ("exp_avg", "exp_avg_sq")
-HALF = torch.bfloat16
-KEY = 0x9E3779B1  # odd: what differs stays different times it
-SETTINGS = {"fused": True, "amsgrad": False, "weight_decay": 0.0, "maximize": False}
 
 
 def power(base: float, steps: float, of: int = 1) -> float:
@@ -39,42 +30,6 @@ def power(base: float, steps: float, of: int = 1) -> float:
 @functools.cache
 def _root(base: float, degree: int) -> Decimal:
     return Decimal(base) ** (Decimal(1) / degree)
-
-
-def move(
-    tables: list[list[torch.Tensor]], numbers: list, count: int, radii: torch.Tensor | None, iteration: int
-) -> None:
-    """Launch the kernel of :mod:`warp_splat.kernels.adam` on tables of ``count`` rows.
-
-    A core follows few streams of memory at a time: all tables together take twice as long. A GPU takes them together.
-    """
-    keys = [KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))]
-    together = list(zip(tables, numbers, keys, strict=True))
-    apart = [[one] for one in together] if driver_of(tables[0][0].device).lanes > 1 else [together]
-    for some in apart:
-        _launch(*map(list, zip(*some, strict=True)), count, radii)
-
-
-def _launch(tables: list, numbers: list, numbered: list[int], count: int, radii: torch.Tensor | None) -> None:
-    """All of them in one kernel; ``numbered``: keys for rounding at random."""
-    device = tables[0][0].device
-    sizes = [table[0].numel() // count for table in tables]
-    widths, keys = (there(values, torch.int32, device) for values in (sizes, numbered))
-    of_tables = there(numbers, torch.float32, device)
-
-    def arguments(_types: Types, rows: slice) -> tuple[list, list]:
-        places = [
-            [t.data_ptr() + t.element_size() * size * rows.start for t in table]
-            for table, size in zip(tables, sizes, strict=True)
-        ]
-        addresses = there(places, torch.int64, device)
-        shown = widths if radii is None else radii[rows]
-        inputs = [rows.start, view(widths, wp.int32), view(keys, wp.int32), view(of_tables, wp.float32)]
-        inputs.append(view(shown, wp.int32))
-        return inputs, [view(addresses, wp.uint64)]
-
-    make = partial(make_adam, sparse=radii is not None, halves=tables[0][-1].dtype == HALF)
-    launch_in_lanes(make, driver_of(device).lanes, count, arguments, device)
 
 
 class Tables:
@@ -166,36 +121,24 @@ class Optimizer:
 
     def load(self) -> None:
         """Compile and load what :meth:`step` launches."""
-        device, halves = self.model.device, self.options.half_moments
-        sparse, lanes = self.options.optimizer_type == "sparse_adam", driver_of(device).lanes
-        kinds = [(sparse, halves)] * (lanes > 1 or sparse or halves)  # else torch's
-        kinds += [(False, False)] * (lanes > 1 and bool(self.parts))
-        for kind in kinds:
-            for size in {lanes, 1}:
-                load(make_adam(size, *kind), device)
+        sparse, halves = self.options.optimizer_type == "sparse_adam", self.options.half_moments
+        for kind in [(sparse, halves)] + [(False, False)] * bool(self.parts):
+            load_adam(self.model.device, *kind)
 
     def _step(self, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
         """Adam on tables of ``rows`` rows.
 
-        With ``radii`` only on rows that are drawn, and without bias correction, as the reference's sparse_adam. Without
-        them, a GPU takes torch's, whose threads read what lies side by side.
+        With ``radii`` only on rows that are drawn, and without bias correction, as the reference's sparse_adam.
         """
-        tables, numbers, lanes = [], [], driver_of(groups[0]["params"][0].device).lanes
+        tables, numbers = [], []
         for group in groups:
             parameter, (beta1, beta2), biases = group["params"][0], group["betas"], (1.0, 1.0)
             state, grad = self._state(parameter), parameter.grad
-            known = grad is not None and parameter.numel() > 0  # degree 0: zeros would change nothing but the count
-            of_torch = known and lanes == 1 and radii is None and state[MOMENTS[0]].dtype == parameter.dtype
-            if of_torch:
-                lists = ([tensor] for tensor in (parameter.detach(), grad, *(state[name] for name in MOMENTS)))
-                adam(
-                    *lists, [], [state["step"]], lr=group["lr"], beta1=beta1, beta2=beta2, eps=group["eps"], **SETTINGS
-                )
-            elif radii is None:
+            if radii is None:
                 state["step"] += 1
-            if known and not of_torch:
+            if grad is not None and parameter.numel() > 0:  # degree 0: zeros would change nothing but the count
                 if radii is None:
-                    biases = [1.0 - power(beta, state["step"].item()) for beta in (beta1, beta2)]
+                    biases = [1.0 - power(beta, state["step"]) for beta in (beta1, beta2)]
                 tables.append([parameter.detach(), grad.contiguous(), *(state[name] for name in MOMENTS)])
                 rates = [group["lr"] / biases[0], group["eps"], 1.0 / math.sqrt(biases[1])]
                 numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])
@@ -203,12 +146,11 @@ class Optimizer:
             move(tables, numbers, rows, radii, self.iteration)
 
     def _state(self, parameter: torch.Tensor) -> dict:
-        """Moments and number of steps, as torch's Adam keeps them."""
+        """Moments and number of steps, as torch's Adam keeps them, but for the latter, which is a plain number."""
         state = self.adam.state[parameter]
         if not state:
-            step = torch.zeros((), dtype=torch.float32, device=parameter.device)
             zeros = {name: torch.zeros_like(parameter, dtype=self._kept_as(parameter)) for name in MOMENTS}
-            state.update(zeros, step=step)
+            state.update(zeros, step=0.0)
         return state
 
     def _kept_as(self, parameter: torch.Tensor) -> torch.dtype:
@@ -251,7 +193,7 @@ class Optimizer:
                 found[f"gradients.{name}"] = leaf.grad
             if state := self.adam.state.get(leaf):
                 found |= {f"{moment}.{name}": state[moment].to(leaf) for moment in MOMENTS}
-                found[f"images.{name}"] = state["step"].double() * self.batch
+                found[f"images.{name}"] = torch.tensor(state["step"] * self.batch, dtype=torch.float64)
         return found
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -277,9 +219,8 @@ class Optimizer:
             leaf.grad = tables.get("gradients")
             if moments:
                 images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
-                step = torch.tensor(float(images / self.batch), dtype=torch.float32, device=leaf.device)
                 self.adam.state[leaf] = {
-                    "step": step,
+                    "step": float(np.float32(images / self.batch)),
                     **{moment: tables[moment].to(self._kept_as(leaf)) for moment in MOMENTS},
                 }
 
