@@ -89,6 +89,14 @@ def test_a_group_has_the_mean_the_covariance_and_the_cover_of_its_members():
     assert cover == pytest.approx(weights.sum(), rel=1e-4)
 
 
+def test_numbers_out_of_range_give_finite_ones():
+    splats = some_splats(100)
+    splats.scales[::3], splats.scales[1::3] = 400.0, -400.0
+    splats.means[:10], splats.sh[20:30], splats.quats[5] = 1e30, 3e38, 0.0
+    found = merged(splats, 20, [CAMERAS[0][1]])[1]
+    assert all(np.isfinite(array).all() for array in found)
+
+
 def test_merged_ones_look_more_like_a_surface_than_its_most_important_ones_do():
     rng = np.random.default_rng(0)
     splats, camera = some_splats(10_000, 1), CAMERAS[0][1].resized(280, 156)
@@ -208,10 +216,21 @@ def test_the_first_picture_comes_before_the_rest(small_chunks, browser, slow_ser
     assert not errors
 
 
-def test_a_page_that_ends_too_early_says_so(small_chunks, browser, tmp_path):  # noqa: F811
-    folder, _, _ = model(tmp_path, many_splats())
+def test_a_page_that_ends_too_early_says_so_and_shows_what_came(small_chunks, browser, tmp_path):  # noqa: F811
+    """The first 4,096 in place of those that stood for them, and the others that stand for the rest."""
+    splats = many_splats()
+    folder, _, cameras = model(tmp_path, splats)
     export(folder)
     text = (folder / "page.html").read_text()
-    (folder / "page.html").write_text(text[: text.index('id="harmonics1"') + 1000])
+    (folder / "page.html").write_text(text[: text.index('id="gaussians2"') + 1000])
     page = open_page(browser, (folder / "page.html").as_uri())
     page.wait_for_selector("#message:has-text('ends too early')", timeout=20_000)
+    page.evaluate("document.getElementById('message').hidden = true")
+    page.wait_for_timeout(500)
+    found = photographed(page, tmp_path)[: int(page.locator("#bar").bounding_box()["y"])]
+    fine, coarse, starts = merged(pack.shown(splats), 4096, cameras)
+    rest = np.count_nonzero(starts < 4096)
+    fine = fine._replace(sh=fine.sh[:, :1])
+    came = [np.concatenate([few[rest:], many[:4096]]) for few, many in zip(coarse, fine, strict=True)]
+    ours = make_picture(GaussianModel.from_splats(SplatArrays(*came)), False, RasterOptions())(cameras[0])
+    assert psnr(found, ours[: len(found)]) > 45
