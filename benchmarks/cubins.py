@@ -19,10 +19,10 @@ import warp as wp
 from common import write_table
 
 from warp_splat.config import ADJOINTS, STRONGEST_MOST
-from warp_splat.kernels import sh_colors, tiles
+from warp_splat.kernels import sh_colors
 from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
-from warp_splat.kernels.cuda import channels
+from warp_splat.kernels.cuda import channels, lists
 from warp_splat.kernels.cuda.adam_by_number import make_adam_by_number
 from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
 from warp_splat.kernels.cuda.blend import make_blend_block
@@ -77,8 +77,11 @@ def modules() -> dict[str, wp.Module]:
         "adjoint of the map": make_adj_map_colors(1).module,
         "environment": make_put_behind(1).module,
         "adjoint of environment": make_adj_put_behind(1).module,
-        "pack": tiles.make_pack().module,
-        "tiles": tiles.list_tiles.module,
+        "count tiles": lists.make_count_tiles().module,
+        "list tiles": lists.make_list_tiles(True).module,
+        "list tiles, many": lists.make_list_tiles(False).module,
+        "gather tiles": lists.make_gather_tiles(True).module,
+        "gather tiles, many": lists.make_gather_tiles(False).module,
     }
     for name in ("OPENCV", "OPENCV_FISHEYE"):
         family = MODELS[name][0]

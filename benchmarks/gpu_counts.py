@@ -58,9 +58,10 @@ class Operations(TorchDispatchMode):
         found, name = func(*args, **(kwargs or {})), str(func)
         indices = args[1] if name.startswith("aten.index") and len(args) > 1 else ()
         masked = any(isinstance(index, torch.Tensor) and index.dtype == torch.bool for index in tree_leaves(indices))
+        empty = isinstance(found, torch.Tensor) and found.numel() == 0
         if WAIT.match(name) or masked:
             self.counts[WAITS] += 1
-        elif not NO_LAUNCH.match(name):
+        elif not NO_LAUNCH.match(name) and not empty:  # on no numbers torch launches nothing
             self.counts[OPERATIONS] += 1
         return found
 

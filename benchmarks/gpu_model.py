@@ -77,8 +77,8 @@ def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
     n, drawn, pixels, m, walked = scene.gaussians, scene.drawn, scene.pixels, scene.instances, scene.walked
     code = instructions(arch)
     each = lambda *kernels: -(-n // 32) * sum(code[kernel] for kernel in kernels)  # noqa: E731
-    by_depth = 8 * 12 * n + 32 * n  # four passes over keys and indices; keys and their order
-    by_tile = 90 * m  # two passes over keys of 16 bits and indices of 64, then instances and places from these
+    by_depth = 8 * 12 * n + 32 * n  # four passes over keys and indices; the order, counts and their scan
+    by_tile = 76 * m  # two passes over keys of 16 bits and indices of 64, then instances and places from these
     passes = code["manual", "adj_blend"] - 8 * BLOCK  # of a tile instance, whatever it touches
     rows = 8 * (BAND + 2 * RADIUS) / BAND * 3 * pixels / STRIP  # of warps, in strips of three colors a pixel
     return {
@@ -87,7 +87,10 @@ def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
             32 * n + (SHAPE + 2 * GRADIENT) * n + (SH + 24) * drawn,
             each(("activate", "activate"), ("project", "project"), ("shade", "shade")),
         ),
-        "bin": (by_depth + 2 * SPLAT * drawn + 40 * n + by_tile, each(("pack", "pack"))),
+        "bin": (
+            by_depth + 2 * SPLAT * drawn + 40 * n + by_tile,
+            each(("count tiles", "count_tiles"), ("list tiles", "list_tiles")),
+        ),
         "blend": (
             (PLACE + SPLAT) * walked + 24 * pixels,
             8 * PASSED * walked + code["blend", "blend"] * scene.blocks,

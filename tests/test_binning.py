@@ -58,8 +58,8 @@ def test_every_tile_lists_what_its_pixels_see_nearest_first(seed):
 def test_places_are_those_of_each_splat():
     camera, projected = project()
     for bins in counted_and_sorted(camera, projected):
-        begins = bins.place_begins.numpy()
-        splats = np.repeat(np.arange(len(begins)), np.diff(begins, append=len(bins.places)))
+        begins = np.append(bins.place_begins.numpy()[: len(bins.gaussians)], len(bins.places))
+        splats = np.repeat(np.arange(len(bins.gaussians)), np.diff(begins))
         assert (bins.instances.numpy()[bins.places.numpy()] == splats).all() and len(splats) > 300
         assert sorted(bins.places.numpy()) == list(range(len(splats)))
 
@@ -127,7 +127,7 @@ def crowded(count, width):
     counts = np.where(np.arange(count) % 7, random.integers(0, 20, count), random.integers(60, 400, count))
     total, order = int(counts.sum()), random.permutation(count).astype(np.int32)
     places = torch.from_numpy(random.permutation(total).astype(np.int32))
-    begins = torch.from_numpy((counts.cumsum() - counts).astype(np.int32))
+    begins = torch.from_numpy(np.append(0, counts.cumsum()).astype(np.int32))
     rows = torch.from_numpy(random.standard_normal((total, width), np.float32))
     nothing = torch.empty(0, dtype=torch.int32)
     gaussians = wp.array(order, dtype=int, device="cpu")
@@ -178,8 +178,9 @@ def listed(bins):
 
 
 def by_gaussian(bins, drawn):
-    """The splats of the Gaussians drawn, as bytes, by Gaussian."""
-    return bins.splats.numpy()[:drawn][np.argsort(bins.gaussians.numpy()[:drawn])].tobytes()
+    """The splats of the Gaussians ``drawn``, as bytes, by Gaussian."""
+    splats, gaussians = bins.splats.numpy(), bins.gaussians.numpy()
+    return splats[np.argsort(gaussians)][np.isin(np.sort(gaussians), drawn)].tobytes()
 
 
 @pytest.mark.parametrize("options", [PLAIN, RasterOptions(extent="square"), RasterOptions(alpha_min=0.0)], ids=str)
@@ -189,25 +190,30 @@ def test_sorting_gives_the_lists_that_counting_gives(count, stretch, size, optio
     """What a GPU does, on the CPU: the same Gaussians by tile, their places in the same order, and the same splats."""
     camera, projected = project(count, 4, size, stretch, options)
     counted, by_sorting = counted_and_sorted(camera, projected, options)
-    drawn = len(counted.gaussians)
+    drawn = counted.gaussians.numpy()
     assert (listed(by_sorting) == listed(counted)).all() and torch.equal(by_sorting.ranges, counted.ranges)
     assert by_sorting.instances.dtype == by_sorting.ranges.dtype == torch.int32
     assert by_gaussian(by_sorting, drawn) == by_gaussian(counted, drawn)
-    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.place_begins) == count
-    assert (by_sorting.place_begins.numpy()[drawn:] == len(counted.instances)).all()
+    assert len(by_sorting.gaussians) == len(by_sorting.splats) == len(by_sorting.place_begins) - 1 == count
+    assert by_sorting.place_begins[-1] == len(counted.instances)
     assert int(by_sorting.invalid) == counted.invalid
 
 
-@pytest.mark.parametrize("miscounted", [-1, 1])
-def test_lists_stay_within_the_places_that_were_counted(miscounted):
-    """Even where the two runs of a GPU found another number of tiles."""
+@pytest.mark.parametrize("miscounted", [-1, 0, 1])
+@pytest.mark.parametrize("spare", [-100, 0, 100])
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32])
+def test_lists_stay_within_the_places_that_were_counted(dtype, spare, miscounted):
+    """Even where the two runs of a GPU found another number of tiles, or there is more or less room than needed."""
     camera, projected = project(300, 4)
-    *_, counts, list_tiles = bin._start_sorting(projected, camera, PLAIN)
+    _, splats, counts = bin._count_tiles(projected, camera, PLAIN)
     ends = torch.cumsum((counts + miscounted).clamp(min=0), 0)
-    listed, ranks = torch.full((2, int(ends[-1]) + 64), -7, dtype=torch.int32)
-    list_tiles(ends, counts[:0], listed, ranks)
-    assert (listed[int(ends[-1]) :] == -7).all() and (ranks[int(ends[-1]) :] == -7).all()
-    for rank, (begin, end) in enumerate(zip([0, *ends.tolist()], ends.tolist(), strict=False)):
+    room = int(ends[-1]) + spare
+    memory = torch.full((room + 64,), -7, dtype=dtype)
+    begins, ranks = bin._list_tiles(splats, ends, memory[:room], counts[:0].int(), camera, PLAIN)
+    listed, ends = memory[:room], ends.clamp(max=room).tolist()
+    assert (memory[room:] == -7).all() and (listed[ends[-1] :] == 20).all()  # no tile
+    assert begins.tolist() == [0, *ends]
+    for rank, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
         assert (ranks[begin:end] == rank).all() and (listed[begin:end] >= 0).all() and (listed[begin:end] < 20).all()
 
 

@@ -1,13 +1,8 @@
-"""Which tiles a splat touches, and a GPU's lists of them, in depth order. Forward only.
+"""Which tiles a splat touches. Forward only.
 
 Splats are the Gaussians that are drawn. A splat's tiles are found once, in floating point, as one span per row of
 tiles. All that follows is integer work, so no two kernels can round differently. What the CPU makes of them is in
-``kernels/cpu/lists.py``.
-
-A GPU stores splats by depth and sorts the instances. There one kernel runs twice, first to count a splat's tiles and
-then to write them. A compiler makes several copies of its body, so none may fuse a multiplication with an addition
-where another does not (``SPELLED_OUT``). Were they to differ nevertheless, nothing is written beyond the places that
-were counted; the self-test compares both runs.
+``kernels/cpu/lists.py``, a GPU in ``kernels/cuda/lists.py``.
 """
 
 import functools
@@ -51,8 +46,33 @@ def square_of(extent: wp.vec2, conic: wp.vec3, reach: float):
 
 
 @functools.cache
+def make_packed(reach_of: wp.Function) -> wp.Function:
+    """A splat, as the blends read it; ``reach_of`` says where its falloff ends."""
+
+    @wp.func
+    def packed(splats2d: Splats2DView, i: int, alpha_min: float, square: int):
+        splat = Splat2D()
+        splat.mean = splats2d.means2d[i]
+        splat.extent = splats2d.extents[i]
+        conic = splats2d.conics[i]
+        # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
+        scale = wp.sqrt(0.5 * LOG2_E * conic[0])
+        splat.opacity = splats2d.opacities[i]
+        reach = reach_of(splat.opacity, alpha_min)
+        splat.root = wp.vec3(scale, 0.5 * LOG2_E * conic[1] / scale, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
+        if square != 0:
+            splat.extent = square_of(splat.extent, conic, reach)
+        splat.color = splats2d.colors[i]
+        splat.depth = splats2d.depths[i]
+        return splat
+
+    return packed
+
+
+@functools.cache
 def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
-    """Splats, as the blends read them; ``reach_of`` says where their falloff ends."""
+    """Splats by :func:`make_packed`, and how many rows of tiles each has."""
+    packed = make_packed(reach_of)
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def pack(
@@ -67,20 +87,7 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
         rows_out: wp.array[int],  # [V] rows of tiles that the box touches
     ):
         v = first + wp.tid()
-        i = gaussians[v]
-        splat = Splat2D()
-        splat.mean = splats2d.means2d[i]
-        splat.extent = splats2d.extents[i]
-        conic = splats2d.conics[i]
-        # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
-        scale = wp.sqrt(0.5 * LOG2_E * conic[0])
-        splat.opacity = splats2d.opacities[i]
-        reach = reach_of(splat.opacity, alpha_min)
-        splat.root = wp.vec3(scale, 0.5 * LOG2_E * conic[1] / scale, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
-        if square != 0:
-            splat.extent = square_of(splat.extent, conic, reach)
-        splat.color = splats2d.colors[i]
-        splat.depth = splats2d.depths[i]
+        splat = packed(splats2d, gaussians[v], alpha_min, square)
         splats_out[v] = splat
         top, bottom = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
         rows_out[v] = wp.max(bottom // TILE - top // TILE + 1, 0)
@@ -120,56 +127,3 @@ def cut(
         left = -x_extent
     first, last = pixels(x + left, x + right, width)
     return first, last
-
-
-@wp.func
-def begin_of(ends: wp.array[wp.int64], i: int):
-    """Where what belongs to ``i`` begins, from the inclusive scan of the counts."""
-    begin = int(0)
-    if i > 0:
-        begin = int(ends[i - 1])
-    return begin
-
-
-@wp.kernel
-def list_tiles(
-    first: int,
-    order: wp.array[int],  # [N] Gaussian, nearest first, those that are not drawn last
-    radii: wp.array[int],  # [N]
-    splats: wp.array[Splat2D],  # [N] by rank; undefined where not drawn
-    width: int,
-    height: int,
-    tiles_x: int,
-    square: int,
-    place_ends: wp.array[wp.int64],  # [N] inclusive scan of what the first run counted; [0] in that run
-    # out
-    counts_out: wp.array[wp.int64],  # [N] tiles in all; or [0]
-    tiles_out: wp.array[int],  # [M] by rank, in the second run
-    ranks_out: wp.array[int],  # [M]
-):
-    rank = first + wp.tid()
-    writes = place_ends.shape[0] > 0
-    begin = int(0)
-    room = int(0)
-    if writes:
-        begin = begin_of(place_ends, rank)
-        room = int(place_ends[rank]) - begin
-    found = int(0)
-    if radii[order[rank]] > 0:
-        splat = splats[rank]
-        x, y = splat.mean[0], splat.mean[1]
-        x_extent, y_extent = splat.extent[0], splat.extent[1]
-        slope, half, turn = outline(x_extent, y_extent, splat.root[0], splat.root[1], splat.root[2])
-        top, bottom = pixels(y - y_extent, y + y_extent, height)
-        for row in range(top // TILE, bottom // TILE + 1):
-            left, right = cut(x, y, x_extent, y_extent, slope, half, turn, float(row), width, square)
-            count = wp.max(right // TILE - left // TILE + 1, 0)
-            for column in range(wp.min(count, room - found)):
-                tiles_out[begin + found + column] = row * tiles_x + left // TILE + column
-                ranks_out[begin + found + column] = rank
-            found += count
-    for place in range(found, room):  # none, if both runs round alike; else some tile, which hardly shows the splat
-        tiles_out[begin + place] = 0
-        ranks_out[begin + place] = rank
-    if counts_out.shape[0] > 0:
-        counts_out[rank] = wp.int64(found)

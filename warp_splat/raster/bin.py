@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels import tiles
 from warp_splat.kernels.cpu import lists
+from warp_splat.kernels.cuda.lists import make_count_tiles, make_gather_tiles, make_list_tiles
 from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D, falloff_of
@@ -63,56 +64,63 @@ def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -
 
     Where these are so many that one tile might hold too many, it waits for the longest list as well.
     """
-    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     device, total = splats2d.radii.device, len(splats2d.radii)
-    order, splats, counts, list_tiles = _start_sorting(splats2d, camera, options)
-    place_ends = torch.cumsum(counts, 0)
-    count = int(place_ends[-1]) if total else 0
+    gaussians, splats, counts = _count_tiles(splats2d, camera, options)
+    ends = torch.cumsum(counts, 0)
+    count = int(ends[-1]) if total else 0
     _check_count(count, camera, total, device)
-    listed, ranks = torch.empty(2, count, dtype=torch.int32, device=device)
-    list_tiles(place_ends, counts[:0], listed, ranks)
-    # the fewer bits, the fewer passes of the sort
-    narrow = torch.int16 if tiles_x * tiles_y < 2**15 else torch.int32
-    listed, numbers = torch.sort(listed.to(narrow), stable=True)
-    instances, places = ranks[numbers], torch.empty_like(ranks)
-    places[numbers] = torch.arange(count, dtype=torch.int32, device=device)
-    bounds = torch.searchsorted(listed, torch.arange(tiles_x * tiles_y + 1, dtype=narrow, device=device)).int()
-    ranges = torch.stack([bounds[:-1], bounds[1:]], 1)
+    tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
+    narrow = tiles_x * tiles_y < 2**15  # the fewer bits, the fewer passes of the sort
+    listed = torch.empty(count, dtype=torch.int16 if narrow else torch.int32, device=device)
+    begins, ranks = _list_tiles(splats, ends, listed, torch.empty(0, dtype=torch.int32, device=device), camera, options)
+    listed, numbers = torch.sort(listed, stable=True)
+    new = partial(torch.empty, dtype=torch.int32, device=device)
+    instances, places, ranges = new(count), new(count), new(tiles_x * tiles_y, 2)
+    inputs = [_listed(listed), view(numbers, wp.int64), view(ranks, wp.int32)]
+    outputs = [view(numbers, wp.int32) for numbers in (instances, places, ranges)]
+    launch(make_gather_tiles(narrow), count + 1, inputs, outputs, device=device)
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
-        _check_longest(int(bounds.diff().max()))
+        _check_longest(int((ranges[:, 1] - ranges[:, 0]).max()))
     invalid = torch.count_nonzero(splats2d.radii < 0)
-    lists = (instances, places, (place_ends - counts).int(), ranges)
-    return Bins(total, order, splats, *lists, [], tiles_x, invalid)
+    return Bins(total, gaussians, splats, instances, places, begins, ranges, [], tiles_x, invalid)
 
 
-def _start_sorting(
-    splats2d: Splats2D, camera: Camera, options: RasterOptions
-) -> tuple[wp.array, wp.array, torch.Tensor, Callable[..., None]]:
-    """Gaussians nearest first, their splats, the number of their tiles, and what lists these (see the kernel)."""
-    radii, device, total = splats2d.radii, splats2d.radii.device, len(splats2d.radii)
-    keys = torch.where(radii > 0, splats2d.depths.detach(), torch.inf)
-    order = wp.from_torch(torch.sort(keys, stable=True).indices.int())
-    splats, counts = empty(total, Splat2D, device), torch.empty(total, dtype=torch.int64, device=device)
-    rows = torch.empty(total, dtype=torch.int32, device=device)  # of tiles, which only a CPU needs
-    square = int(options.extent == "square")
-    inputs = [order, splats2d.view(), camera.height, options.alpha_min, square]
-    pack = tiles.make_pack(falloff_of(options).reach_of)
-    launch(pack, total, inputs, [splats, view(rows, wp.int32)], device=device)
-    inputs = [order, view(radii, wp.int32), splats, camera.width, camera.height, -(-camera.width // TILE), square]
+def _count_tiles(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> tuple[wp.array, wp.array, torch.Tensor]:
+    """Gaussians nearest first, their splats, and the number of their tiles, [N] each."""
+    device, total = splats2d.radii.device, len(splats2d.radii)
+    order = torch.sort(splats2d.depths.detach(), stable=True).indices
+    gaussians, splats = empty(total, int, device), empty(total, Splat2D, device)
+    counts = torch.empty(total, dtype=torch.int64, device=device)
+    inputs = [view(order, wp.int64), splats2d.view(), camera.width, camera.height, options.alpha_min]
+    inputs.append(int(options.extent == "square"))
+    kernel = make_count_tiles(falloff_of(options).reach_of)
+    launch(kernel, total, inputs, [gaussians, splats, view(counts, wp.int64)], device=device)
+    return gaussians, splats, counts
 
-    def list_tiles(place_ends: torch.Tensor, counts: torch.Tensor, *lists: torch.Tensor) -> None:
-        outputs = [view(counts, wp.int64), *(view(numbers, wp.int32) for numbers in lists)]
-        launch(tiles.list_tiles, total, [*inputs, view(place_ends, wp.int64)], outputs, device=device)
 
-    list_tiles(counts[:0], counts, *torch.empty(2, 0, dtype=torch.int32, device=device))
-    return order, splats, counts, list_tiles
+def _list_tiles(
+    splats: wp.array, ends: torch.Tensor, listed: torch.Tensor, counts: torch.Tensor, camera, options
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the instances of each splat begin [N + 1], and their ranks [M]; their tiles are written into ``listed``.
+
+    ``counts`` [N], or [0], are counted anew.
+    """
+    begins, ranks = (torch.empty(size, dtype=torch.int32, device=ends.device) for size in (len(ends) + 1, len(listed)))
+    inputs = [splats, camera.width, camera.height, int(options.extent == "square"), view(ends, wp.int64)]
+    outputs = [view(begins, wp.int32), _listed(listed), view(ranks, wp.int32), view(counts, wp.int32)]
+    launch(make_list_tiles(listed.dtype == torch.int16), len(begins), inputs, outputs, device=ends.device)
+    return begins, ranks
+
+
+def _listed(tiles: torch.Tensor):
+    return view(tiles, wp.int16 if tiles.dtype == torch.int16 else wp.int32)
 
 
 def count_twice(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> tuple[torch.Tensor, torch.Tensor]:
     """The number of tiles of each splat [N], as :func:`bin_by_sorting` finds it to count, and to write."""
-    *_, counts, list_tiles = _start_sorting(splats2d, camera, options)
-    again, ends = torch.empty_like(counts), torch.cumsum(counts, 0)
-    list_tiles(ends, again, *torch.empty(2, int(ends[-1]), dtype=torch.int32, device=ends.device))
+    _, splats, counts = _count_tiles(splats2d, camera, options)
+    again, ends = counts.int(), torch.cumsum(counts, 0)
+    _list_tiles(splats, ends, torch.empty(int(ends[-1]), dtype=torch.int32, device=ends.device), again, camera, options)
     return counts, again
 
 

@@ -88,7 +88,7 @@ def gather(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = N
     filled = [*tables, *[slots.new_empty(0, 0)] * (len(GradientsView.vars) - len(tables))]
     tables_out = pack_struct(GradientsView, **dict(zip(GradientsView.vars, filled, strict=True)))
     inputs = [bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32), _float(slots)]
-    kernel, warps = make_gather(tuple(table.shape[1] for table in tables)), -(-len(bins.place_begins) // WARP)
+    kernel, warps = make_gather(tuple(table.shape[1] for table in tables)), -(-len(bins.gaussians) // WARP)
     launch_blocks(kernel, warps, inputs, [tables_out], slots.device)
     return [grad.squeeze(1) for grad in grads]
 

@@ -51,14 +51,14 @@ class Splats2D(NamedTuple):
 
 @dataclass
 class Bins:
-    """Tile lists. Splats are the Gaussians drawn, packed for the blend; on a GPU all, those not drawn behind."""
+    """Tile lists. Splats are the Gaussians drawn, packed for the blend; on a GPU all: those not drawn have no tile."""
 
     gaussian_count: int  # N
     gaussians: wp.array  # [V] Gaussian of each splat: ascending; on a GPU, nearest first
     splats: wp.array  # [V] Splat2D
     instances: torch.Tensor  # [M] int32, splats, by tile, nearest first
     places: torch.Tensor  # [M] int32, where in ``instances`` a splat stands, splat by splat
-    place_begins: torch.Tensor  # [V] int32, where in ``places`` those of each splat begin
+    place_begins: torch.Tensor  # [V] int32, where in ``places`` those of each splat begin; on a GPU also the end
     ranges: torch.Tensor  # [T, 2] int32, first and last instance
     slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU; on a GPU empty
     tiles_x: int

@@ -210,6 +210,7 @@ class Project(torch.autograd.Function):
         ctx.save_for_backward(*gaussians, *splats, *learned)
         ctx.camera, ctx.cam, ctx.kernel, ctx.bend, ctx.driver, ctx.dropped = camera, cam, kernel, bend, driver, dropped
         ctx.mark_non_differentiable(splats.extents, splats.radii)
+        ctx.set_materialize_grads(False)  # of these two, which no one reads, nor of what has no influence
         return tuple(splats)
 
     @staticmethod
@@ -221,7 +222,11 @@ class Project(torch.autograd.Function):
             twist, intrinsics, last_twist, coefficients = ctx.saved_tensors[-4:]
             wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
             wants_pose = wants_twist or wants_last
-            adj_splats = Splats2D(*(adj.contiguous() for adj in adj_outputs[:5]), splats.extents, splats.radii)
+            adj_splats = [
+                torch.zeros_like(found) if adj is None else adj.contiguous()
+                for found, adj in zip(splats[:5], adj_outputs[:5], strict=True)
+            ]
+            adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)
             lanes, count, device = ctx.driver.lanes, len(given.means), given.means.device
             seen, rest = view(splats.radii, wp.int32), given.sh_rest
             adj_means, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))

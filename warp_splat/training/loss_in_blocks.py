@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
@@ -23,12 +25,13 @@ class LossInBlocks(torch.autograd.Function):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
             image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
             ctx.pictures = (image, target, centers(image, target), limits)
-            ctx.weights = wp.vec2((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel())
+            shares = ((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel(), lambda_dssim)
+            ctx.weights = wp.vec3(*shares)
             ctx.blocks = -(-height // int(BAND)) * -(-length // int(STRIP))
             sums, ctx.slopes = image.new_empty(ctx.blocks), image.new_empty(SLOPES, height, length)
             outputs = [view(sums, wp.float32), view(ctx.slopes, wp.float32)]
             launch_blocks(compare_block, ctx.blocks, [_view(*ctx.pictures), ctx.weights], outputs, image.device)
-            return sums.sum() + lambda_dssim
+            return sums.sum()
 
     @staticmethod
     @once_differentiable
@@ -44,9 +47,14 @@ class LossInBlocks(torch.autograd.Function):
 def centers(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """What to subtract from the two images, [2], as on a CPU, but found where these are."""
     if target.dtype == torch.uint8:
-        return torch.full((2,), 0.5, device=image.device)
+        return _halves(image.device)
     own, other = _middle(image), _middle(target)
     return torch.stack([torch.where((own - other).abs() > FAR_APART, own, other), other])
+
+
+@functools.cache
+def _halves(device: torch.device) -> torch.Tensor:
+    return torch.full((2,), 0.5, device=device)
 
 
 def _middle(image: torch.Tensor) -> torch.Tensor:

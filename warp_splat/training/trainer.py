@@ -106,6 +106,7 @@ class Trainer:
         self._views_random = random.Random(seed)
         self._deck: list[View] = []
         self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
+        self._one = torch.ones((), device=self.device)
         self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
 
     def differentiate(self, iteration: int) -> torch.Tensor:
@@ -135,7 +136,7 @@ class Trainer:
         for compare in having(growing, "compare"):
             compare(image, target, photograph.mask, out, step)
         loss = self._through("loss", loss, out, step)
-        loss.backward()
+        loss.backward(self._one)
         with stage("densify"):
             for observe in having(growing, "observe"):
                 observe(out, step)

@@ -74,7 +74,7 @@ def lender(thread: int, tap: int):
 @wp.kernel
 def compare_block(
     pictures: PicturesView,
-    weights: wp.vec2,  # of |x - y| and of SSIM in the loss
+    weights: wp.vec3,  # of |x - y|, of SSIM, and of 1 in the loss
     # out
     sums_out: wp.array[float],  # [blocks] part of the loss
     slopes_out: wp.array3d[float],  # [SLOPES, H, L]
@@ -119,6 +119,8 @@ def compare_block(
             slopes_out[0, row, place] = mean
             slopes_out[1, row, place] = square
             slopes_out[2, row, place] = product
+    if tile == 0 and thread == 0:
+        loss += weights[2]
     total = wp.tile_sum(wp.tile(loss))[0]
     if thread == 0:
         sums_out[tile] = total
@@ -127,7 +129,7 @@ def compare_block(
 @wp.kernel
 def adj_compare_block(
     pictures: PicturesView,
-    weights: wp.vec2,
+    weights: wp.vec3,
     slopes: wp.array3d[float],  # [SLOPES, H, L]
     adj_loss: wp.array[float],  # [1]
     # out

@@ -55,7 +55,7 @@ def make_gather(widths: tuple[int, ...]) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=dict(WARP_OPTIONS))
     def gather(
         gaussians: wp.array[int],  # [V] of each splat
-        begins: wp.array[int],  # [V] where in `places` those of each splat begin
+        begins: wp.array[int],  # [V + 1] where in `places` those of each splat begin; last, where all end
         places: wp.array[int],  # [M]
         rows: wp.array2d[float],  # [M, width]
         # out
@@ -67,9 +67,7 @@ def make_gather(widths: tuple[int, ...]) -> wp.Kernel:
         end = int(0)
         if v < gaussians.shape[0]:
             begin = begins[v]
-            end = places.shape[0]
-            if v + 1 < gaussians.shape[0]:
-                end = begins[v + 1]
+            end = begins[v + 1]
         many = end - begin >= MANY
         most = wp.tile_max(wp.tile(end - begin))[0]
         column = column_of(lane, AT_ONCE)
