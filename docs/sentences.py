@@ -50,17 +50,13 @@ def adjoint_times() -> str:
 #: By row of benchmarks/recipes.py: the paper, what it claims, and what became of it here.
 INGREDIENTS = {
     "--growth budget": (
-        "Mallick et al. 2024 (scores, a budget), Deng et al. 2025 (long axis)",
+        "Mallick et al. 2024 (a budget), Deng et al. 2025 (long axis)",
         "the quality of four to five times the time and size; more, with fewer Gaussians",
-        "yes: `--growth budget`",
+        "yes, in `--preset fast`",
     ),
-    "budget, score: gradient alone": ("Kerbl et al. 2023", "", "no: a little worse, and a little faster"),
-    "budget, score: error alone": ("Rota Bulo et al. 2024", "better than by the gradient", "no"),
-    "budget, halves of 0.6 the opacity": ("Deng et al. 2025", "", "no: no difference beyond scatter"),
-    "budget, a look in every 8th step": ("", "", "no: every tenth, for the same quality within scatter"),
-    "budget, three quarters of the steps": ("", "", "no: steps are worth their time"),
-    "budget, full size from step 2400": ("Chen et al. 2025 (size by frequencies)", "45.7 % less time", "no"),
-    "budget, none relocated": ("Kheradmand et al. 2024", "", "relocated, where the budget is the number of points"),
+    "--coarse_by detail": ("Chen et al. 2025", "45.7 % less time", "yes, in `--preset fast`"),
+    "--preset fast": ("both", "", "yes"),
+    "harmonics of higher degree in every 4th step": ("Mallick et al. 2024 (every 16th)", "", "no: SEE"),
     "--growth mcmc": (
         "Kheradmand et al. 2024",
         "better, and robust to where it starts",

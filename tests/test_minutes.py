@@ -28,9 +28,10 @@ from warp_splat.training.plan import (
     seconds_of,
 )
 from warp_splat.training.record import keep, restore
+from warp_splat.training.sizes import shrink_at
 
-TASK, COST = Task(500_000, 10_000, 200_000, (0.5, 1.0)), Cost(0.004, 3e-7, 5e-8)
 FAST = parse(["train", "-s", "x", "--preset", "fast"])
+TASK, COST = Task(500_000, 10_000, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.004, 3e-7, 5e-8)
 
 
 def test_costs_are_found_again():
@@ -47,7 +48,7 @@ def test_seconds_are_those_of_the_steps_added_up(factor):
     config = of_length(FAST, factor, TASK)
     learn, expected = config.learn, 0.0
     for step in range(1, learn.iterations + 1):
-        side = [4, 2, 1][min(2 * step // learn.coarse_until_iter, 2)]
+        side = [4, 2, 1][sum(step >= learn.coarse_until_iter * share for share in TASK.shares)]
         share = min(step / (learn.iterations - learn.cooldown), 1.0)
         gaussians = TASK.start + share * (config.grow.max_gaussians - TASK.start)
         expected += COST.step + COST.gaussian * gaussians + COST.pixel * TASK.pixels / side**2
@@ -110,7 +111,8 @@ def test_the_package_compares_with_what_was_measured():
 
 def taken(learn: LearnOptions, pace, spent: float = 0.0) -> tuple[float, int, int]:
     """Seconds at the end, the step before the cooldown and its length, where step k takes pace(k) seconds."""
-    deadline, iteration, end, settled = Deadline(learn), 0, np.inf, (0, 0)
+    full_size = learn.coarse_until_iter * TASK.shares[-1]
+    deadline, iteration, end, settled = Deadline(learn, full_size), 0, np.inf, (0, 0)
     while iteration < end:
         iteration += 1
         spent += pace(iteration)
@@ -121,13 +123,21 @@ def taken(learn: LearnOptions, pace, spent: float = 0.0) -> tuple[float, int, in
 
 
 LEARN = plan_for(FAST, COST, 60.0, TASK).changed(minutes=1.0).learn
+COSTS = np.array([0.1 + shrink_at(LEARN, TASK.shares, step) ** -2.0 for step in range(LEARN.iterations)])
+
+
+def planned(step):
+    """Seconds of a step: a part of its own, and one of each pixel."""
+    return 60.0 / COSTS.sum() * COSTS[min(step, LEARN.iterations - 1)]
+
+
 PACES = {
-    "as planned": lambda k: 60.0 / LEARN.iterations,
-    "twice as fast": lambda k: 30.0 / LEARN.iterations,
-    "half as fast": lambda k: 120.0 / LEARN.iterations,
-    "slower as it grows": lambda k: 60.0 / LEARN.iterations * min(0.5 + 1.5 * k / LEARN.iterations, 1.5),
-    "half as fast from the middle": lambda k: 60.0 / LEARN.iterations * (1 + (k > LEARN.iterations / 2)),
-    "noisy": lambda k: 60.0 / LEARN.iterations * (0.5 + (k * 7919 % 101) / 100),
+    "as planned": planned,
+    "twice as fast": lambda k: 0.5 * planned(k),
+    "half as fast": lambda k: 2.0 * planned(k),
+    "slower as it grows": lambda k: planned(k) * min(0.5 + 1.5 * k / LEARN.iterations, 1.5),
+    "half as fast from the middle": lambda k: planned(k) * (1 + (k > LEARN.iterations / 2)),
+    "noisy": lambda k: planned(k) * (0.5 + (k * 7919 % 101) / 100),
 }
 
 
@@ -135,7 +145,7 @@ PACES = {
 def test_trainings_end_in_time(name):
     seconds, begun, cooldown = taken(LEARN, PACES[name])
     assert abs(seconds - 60) < 0.05 * 60
-    assert begun >= LEARN.coarse_until_iter and LEARN.cooldown // 4 <= cooldown <= LEARN.cooldown
+    assert begun >= LEARN.coarse_until_iter * TASK.shares[-1] and LEARN.cooldown // 4 <= cooldown <= LEARN.cooldown
     if name in ("as planned", "twice as fast", "noisy"):
         assert cooldown > 0.95 * LEARN.cooldown
 
@@ -143,7 +153,7 @@ def test_trainings_end_in_time(name):
 def test_the_full_size_and_a_cooldown_come_even_where_time_is_up():
     seconds, begun, cooldown = taken(LEARN, lambda k: 600.0 / LEARN.iterations)
     assert seconds > 60 and cooldown == LEARN.cooldown // 4
-    assert LEARN.coarse_until_iter <= begun <= LEARN.coarse_until_iter + 20
+    assert 0 <= begun - LEARN.coarse_until_iter * TASK.shares[-1] <= 20
 
 
 def test_the_first_process_decides():

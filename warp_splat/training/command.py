@@ -182,7 +182,7 @@ def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingVi
     learn, report, processes = trainer.config.learn, trainer.config.report, trainer.processes
     checks = {learn.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
     profiled, before_profile = max(learn.end - report.profile, run.iteration), run.seconds
-    deadline = Deadline(learn, processes.count)
+    deadline = Deadline(learn, trainer.photographs.full_size_from, processes.count)
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     often = {"mininterval": pause, "maxinterval": pause, "miniters": 0}
     bar = tqdm(total=learn.end_or_plan, initial=run.iteration, disable=report.quiet, unit="it", **often)

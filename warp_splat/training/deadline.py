@@ -35,12 +35,13 @@ class Deadline:
 
     Args:
         learn: as planned.
+        full_size: the step from which photographs have it.
         count: images in a step.
     """
 
-    def __init__(self, learn: LearnOptions, count: int = 1):
+    def __init__(self, learn: LearnOptions, full_size: float = 0.0, count: int = 1):
         self.seconds, self.cooldown = 60.0 * learn.minutes, learn.cooldown
-        self.full_size = learn.coarse_until_iter if learn.coarse > 1 else 0
+        self.full_size = full_size
         self.past: deque[tuple[int, float]] = deque(maxlen=max(learn.iterations // (WINDOW * count), FEWEST))
         self.near = math.inf  # the step since which the end is near by each pace that was seen
 

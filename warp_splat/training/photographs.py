@@ -40,6 +40,11 @@ class Photographs:
         self.kept: dict[View, Photograph] = {}
         self._shrink = 1  # of those that are kept
 
+    @property
+    def full_size_from(self) -> float:
+        """The step from which photographs have their full size."""
+        return self.config.learn.coarse_until_iter * self.shares[-1] if self.shares else 0.0
+
     def at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
         """Camera and photograph of ``view`` at the size of this iteration, the photograph on the device."""
         learn = self.config.learn

@@ -132,13 +132,10 @@ class Trainer:
             image, target = (LOSS_CURVES[self.config.data.loss_space](picture) for picture in (image, target))
         # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
         loss = image_loss(image, target, learn.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
-        growing = [self.growth] if learn.grows_at(iteration) else []
-        for compare in having(growing, "compare"):
-            compare(image, target, photograph.mask, out, step)
         loss = self._through("loss", loss, out, step)
         loss.backward(self._one)
         with stage("densify"):
-            for observe in having(growing, "observe"):
+            for observe in having([self.growth] if learn.grows_at(iteration) else [], "observe"):
                 observe(out, step)
         self.quarantine.pixels += out.dropped.pixel_count
         self.quarantine.gradients += out.dropped.gaussian_count
