@@ -68,11 +68,11 @@ AT_REST = """async (index) => {
 }"""
 MOVE = """async (frames) => {
   const canvas = document.getElementById("canvas"), found = [];
-  for (window.moving = true; found.length < frames && moving;) {
+  for ([window.moving, window.moved] = [true, 0]; found.length < frames && moving;) {
     canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 0, cancelable: true })); // moves by nothing
     await frame();
     const { times } = warpSplat;
-    if (times.frame !== found.at(-1)?.frame) found.push(times);
+    if (times.frame !== found.at(-1)?.frame) window.moved = found.push(times);
   }
   return found;
 }"""
@@ -117,7 +117,8 @@ def measure(name: str, model: Path, folder: Path) -> tuple:
         still = screen(page, folder)
         motion = page.evaluate(MOVE, 25)[-10:]
         page.evaluate(f"void ({MOVE})(Infinity)")
-        page.wait_for_timeout(3000)
+        while page.evaluate("moved") < 5:
+            page.wait_for_timeout(200)
         moving = screen(page, folder)
         page.evaluate("moving = false")
         begin = screen_of_first(page, path, folder)

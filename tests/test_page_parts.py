@@ -185,6 +185,11 @@ MOVING = """async () => {
 }"""
 
 
+UNTIL = """async (drawn) => {
+  while (warpSplat.times.drawn !== drawn) await new Promise(requestAnimationFrame);
+}"""
+
+
 @pytest.mark.slow
 def test_the_first_picture_comes_before_the_rest(small_chunks, browser, slow_server, tmp_path):  # noqa: F811
     """Of those that stand for many, as are pictures in motion; the rest follows; at rest, all are drawn."""
@@ -223,13 +228,13 @@ def test_a_page_that_ends_too_early_says_so_and_shows_what_came(small_chunks, br
     export(folder)
     text = (folder / "page.html").read_text()
     (folder / "page.html").write_text(text[: text.index('id="gaussians2"') + 1000])
+    fine, coarse, starts = merged(pack.shown(splats), 4096, cameras)
+    rest = np.count_nonzero(starts < 4096)
     page = open_page(browser, (folder / "page.html").as_uri())
     page.wait_for_selector("#message:has-text('ends too early')", timeout=20_000)
     page.evaluate("document.getElementById('message').hidden = true")
-    page.wait_for_timeout(500)
+    page.evaluate(UNTIL, int(8192 - rest))
     found = photographed(page, tmp_path)[: int(page.locator("#bar").bounding_box()["y"])]
-    fine, coarse, starts = merged(pack.shown(splats), 4096, cameras)
-    rest = np.count_nonzero(starts < 4096)
     fine = fine._replace(sh=fine.sh[:, :1])
     came = [np.concatenate([few[rest:], many[:4096]]) for few, many in zip(coarse, fine, strict=True)]
     ours = make_picture(GaussianModel.from_splats(SplatArrays(*came)), False, RasterOptions())(cameras[0])

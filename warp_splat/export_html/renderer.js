@@ -31,7 +31,7 @@ class Renderer {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     [this.detail, this.drawn, this.frameTime, this.fence] = [1, 0, 0, null];
-    this.pace = 0; // ms for a Gaussian, at rest
+    [this.started, this.pace] = [-Infinity, 0]; // when the last frame was; ms for a Gaussian, at rest
     // blended in float32 where the card can (software renderers need half the time of float16), in float16, which costs
     // 4 dB, or in the last resort in 8 bits, which costs 20
     this.imageFormat = gl.getExtension("EXT_color_buffer_float")

@@ -3,6 +3,7 @@
 
 const MOVING = 200; // ms after the last input until the image is drawn in full detail
 const FRAME = 50; // ms that a frame should take while moving; its detail is chosen so
+const PATIENCE = 5; // times of a frame between pictures while the page loads: a slow card must not hold that up
 const element = (id) => document.getElementById(id);
 const say = (text) => { element("message").textContent = text; };
 
@@ -53,7 +54,7 @@ class Viewer {
     this.worker.postMessage({ total: scene.coarse + scene.count, near: scene.near, width: this.renderer.width });
     this.worker.onmessage = ({ data }) => this.sorted(data);
     this.worker.onerror = () => say("The Gaussians could not be sorted: this browser refuses workers.");
-    this.version = this.loaded = 0; // of the camera; how many Gaussians came, coarse ones first
+    this.version = this.loaded = this.shown = 0; // of the camera; how many Gaussians came and are to be drawn
     this.missing = scene.parts.length;
     [this.sortedVersion, this.sortedRange] = [-1, [0, -1]];
     this.sorting = this.requested = false;
@@ -72,10 +73,22 @@ class Viewer {
       renderer.add(table, first, texels, numbers);
       if (table === "gaussians") this.addMeans(first, new Float32Array(numbers.buffer));
       this.missing--;
-      this.request();
+      this.show();
     }
     const count = `${scene.count.toLocaleString("en")} Gaussians`;
     element("count").textContent = this.missing ? `${scene.coarse.toLocaleString("en")} for ${count}` : count;
+  }
+
+  // Draws what came; while more is to come, in a while, if the card is slow.
+  show() {
+    clearTimeout(this.showing);
+    const wait = this.missing ? this.renderer.started + PATIENCE * this.renderer.frameTime - performance.now() : 0;
+    if (wait > 0) {
+      this.showing = setTimeout(() => this.show(), wait);
+      return;
+    }
+    this.shown = this.loaded;
+    this.request();
   }
 
   addMeans(first, numbers) {
@@ -118,10 +131,10 @@ class Viewer {
   // Which Gaussians to draw: all; while they come, those that are there, and the coarse ones that stand for others;
   // while the camera moves, the coarse ones, if there are many or the card is slow.
   get wanted() {
-    const { scene: { coarse, count, chunk, moving, replaced }, loaded, renderer } = this;
+    const { scene: { coarse, count, chunk, moving, replaced }, shown, renderer } = this;
     const few = !this.missing && count <= moving && count * renderer.pace <= FRAME;
-    if (!coarse || (this.rest > 0 && !few)) return [0, coarse || loaded];
-    return [replaced[Math.ceil((loaded - coarse) / chunk)], loaded];
+    if (!coarse || (this.rest > 0 && !few)) return [0, coarse || shown];
+    return [replaced[Math.ceil((shown - coarse) / chunk)], shown];
   }
 
   // Whether what is sorted is what is wanted.
