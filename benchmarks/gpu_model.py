@@ -78,7 +78,8 @@ def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
     code = instructions(arch)
     each = lambda *kernels: -(-n // 32) * sum(code[kernel] for kernel in kernels)  # noqa: E731
     by_depth = 8 * 12 * n + 32 * n  # four passes over keys and indices; the order, counts and their scan
-    by_tile = 76 * m  # two passes over keys of 16 bits and indices of 64, then instances and places from these
+    # with room for more: two passes over keys of 16 bits and indices of 64, then instances and places from these
+    by_tile = 76 * 1.25 * m
     passes = code["manual", "adj_blend"] - 8 * BLOCK  # of a tile instance, whatever it touches
     rows = 8 * (BAND + 2 * RADIUS) / BAND * 3 * pixels / STRIP  # of warps, in strips of three colors a pixel
     return {

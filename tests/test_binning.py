@@ -10,7 +10,7 @@ import warp as wp
 from warp_splat import Camera, InputError, RasterOptions, set_threads
 from warp_splat.raster import api, bin, depth_order
 from warp_splat.raster import project as projection
-from warp_splat.raster.data import Bins, Gaussians
+from warp_splat.raster.data import Bins, Gaussians, Room
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.runtime.pool import get_threads
 
@@ -215,6 +215,24 @@ def test_lists_stay_within_the_places_that_were_counted(dtype, spare, miscounted
     assert begins.tolist() == [0, *ends]
     for rank, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
         assert (ranks[begin:end] == rank).all() and (listed[begin:end] >= 0).all() and (listed[begin:end] < 20).all()
+
+
+@pytest.mark.parametrize("spare", [-100, 0, 5000])
+def test_lists_in_a_room(spare):
+    """The same lists, if they fit; otherwise it is told, and the next view is waited for."""
+    camera, projected = project(300, 4)
+    expected = bin.bin_by_sorting(projected, camera, PLAIN)
+    count = len(expected.instances)
+    room = Room(count + spare)
+    bins = bin.bin_by_sorting(projected, camera, PLAIN, room)
+    assert len(bins.instances) == count + spare
+    assert room.overflowed() == (spare < 0) and not room.overflowed() and (room.instances == 0) == (spare < 0)
+    if spare < 0:
+        bins = bin.bin_by_sorting(projected, camera, PLAIN, room)
+        assert len(bins.instances) == count < room.instances
+    for name in ("instances", "places", "place_begins", "ranges"):
+        found = getattr(bins, name)
+        assert torch.equal(found[:count] if name in ("instances", "places") else found, getattr(expected, name)), name
 
 
 def test_sorting_breaks_ties_by_index_and_leaves_out_what_is_invalid():

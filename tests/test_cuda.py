@@ -12,6 +12,7 @@ from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cuda import warps
 from warp_splat.raster import api
+from warp_splat.raster.data import Gaussians, Room
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.runtime.launch import launch_blocks, view
 
@@ -93,3 +94,31 @@ def test_loop_cap():
     with using(CUDA):
         image = run("dense_tile", "cpu", options)[0].image
     assert (image - run("dense_tile", "cpu", options)[0].image).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("adjoint", ["manual", "reversible"])
+def test_the_room_for_instances_changes_no_byte(adjoint, blocks):
+    """Unknown, too small, just enough or ample; where it was too small, the view is rendered again."""
+    scene = truth("degree1", PLAIN).scene
+    found, rooms = [], [Room(instances) for instances in (0, 1, 10**5, 0)]
+    rooms[3].learn(10**4)
+    for room in [None, *rooms, rooms[0]]:  # the first also knows, the second time
+        given = scene.parameters()
+        leaves = [tensor.clone().requires_grad_() for tensor in (*given[:4], given[4][:, :1], given[4][:, 1:])]
+        out = api.render(Gaussians(*leaves), scene.camera, scene.background, PLAIN, adjoint, room=room)
+        grads = torch.autograd.grad((out.image * out.image.detach()).sum() + out.alpha.sum(), leaves)
+        found.append([out.image, out.alpha, *grads])
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(other, found[0], strict=True))
+    assert rooms[0].instances == rooms[1].instances > 1 and rooms[2].instances == 10**5
+
+
+def test_room_grows_before_it_is_needed():
+    room = Room()
+    sizes = set()
+    for count in range(1000, 200_000, 100):
+        room.learn(count)
+        assert 1.25 * count <= room.instances <= 1.25 * count * 9 / 8 + 1024
+        sizes.add(room.instances)
+    assert len(sizes) < 70  # or there would be new memory for each
+    room.learn(5)
+    assert room.instances == max(sizes)

@@ -65,8 +65,8 @@ def test_measured_stages_stand_beside_the_model(tmp_path):
 
 @pytest.mark.slow
 def test_step():
-    """Every launch of a step is in one of its stages, and the host waits but for the number of tile instances."""
+    """Every launch of a step is in one of its stages, and the host waits for nothing."""
     counts = gpu_counts.count_step()
     assert set(counts) == {*gpu_model.STAGES, REST}
-    assert [stage for stage, here in counts.items() if here[WAITS]] == ["bin"] and counts["bin"][WAITS] == 1
+    assert not any(here[WAITS] for here in counts.values())
     assert all(counts[stage][LAUNCHES] for stage in gpu_model.STAGES)

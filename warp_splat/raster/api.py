@@ -27,7 +27,7 @@ from warp_splat.raster.checks import (
     explain_invalid,
     own_explained,
 )
-from warp_splat.raster.data import Dropped, Gaussians, Walk
+from warp_splat.raster.data import Dropped, Gaussians, Room, Walk
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing
@@ -180,10 +180,12 @@ def render(
     options: RasterOptions,
     adjoint: str = "manual",
     features: torch.Tensor | None = None,
+    room: Room | None = None,
 ) -> RenderOutput:
     """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted.
 
-    The background may be harmonics [16, 3], too: see :func:`put_behind`.
+    The background may be harmonics [16, 3], too: see :func:`put_behind`. With ``room`` for tile instances, a GPU need
+    not stop for their number; if there is too little, the view is rendered again.
     """
     driver, dropped, walk = driver_of(gaussians.means.device), Dropped(), Walk()
     with stage("project"):
@@ -192,7 +194,8 @@ def render(
     with stage("bin"):
         crossing = find_crossing(splats, seen)
         drawn = around(splats, seen, crossing)
-        bins = driver.bin(drawn, seen, options)
+        # 'stored' keeps 1 KiB of each instance: too much for some that there are not
+        bins = driver.bin(drawn, seen, options, None if adjoint == "stored" else room)
     with stage("blend"):
         color = background if background.dim() == 1 else background.new_zeros(3)
         image, alpha, depth = blend(drawn, bins, color, seen, options, adjoint, driver, dropped, walk)
@@ -203,6 +206,8 @@ def render(
         with stage("channels"):
             blended = Blended(bins, walk, seen, options, adjoint, driver, dropped)
             more = blend_beside(features, gaussians, drawn, camera, blended, crossing)
+    if room and room.overflowed():
+        return render(gaussians, camera, background, options, adjoint, features, room)
     all_valid = isinstance(bins.invalid, int) and not bins.invalid  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,

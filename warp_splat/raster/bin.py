@@ -16,9 +16,9 @@ from warp_splat.kernels.cpu import lists
 from warp_splat.kernels.cuda.lists import make_count_tiles, make_gather_tiles, make_list_tiles
 from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.raster.data import MAX_INSTANCES, Bins, Splats2D, falloff_of
+from warp_splat.raster.data import MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.raster.depth_order import begins_of, in_place, order_by_depth
-from warp_splat.runtime.launch import available_memory, empty, launch, view
+from warp_splat.runtime.launch import available_memory, empty, launch, read_later, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, get_threads, in_slices, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
@@ -27,8 +27,10 @@ MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 
 
-def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> Bins:
+def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, room: Room | None = None) -> Bins:
     """The Gaussians of each tile by depth (ties by index) on the CPU: a counting sort by tile, a band per thread.
+
+    A CPU knows their number in time, and needs no ``room``.
 
     Raises:
         InputError: if the tile instances are more than the kernels can number, or than fit.
@@ -59,16 +61,22 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions) 
     return Bins(len(splats2d.radii), gaussians, splats, *found, balanced_slices(ends), tiles_x, invalid)
 
 
-def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> Bins:
-    """:func:`bin_by_counting` for a GPU: the host waits for the number of tile instances.
+def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions, room: Room | None = None) -> Bins:
+    """:func:`bin_by_counting` for a GPU: the host waits for the number of tile instances, unless there is ``room``.
 
-    Where these are so many that one tile might hold too many, it waits for the longest list as well.
+    Lists and gradients are the same whatever the room. Where instances are so many that one tile might hold too many,
+    the host waits, and for the longest list as well.
     """
     device, total = splats2d.radii.device, len(splats2d.radii)
     gaussians, splats, counts = _count_tiles(splats2d, camera, options)
     ends = torch.cumsum(counts, 0)
-    count = int(ends[-1]) if total else 0
-    _check_count(count, camera, total, device)
+    if room and total and 0 < room.instances <= MAX_TILE:
+        count, room.counted = room.instances, read_later(ends[-1:])
+    else:
+        count = int(ends[-1]) if total else 0
+        _check_count(count, camera, total, device)
+        if room:
+            room.learn(count)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     narrow = tiles_x * tiles_y < 2**15  # the fewer bits, the fewer passes of the sort
     listed = torch.empty(count, dtype=torch.int16 if narrow else torch.int32, device=device)

@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D, Walk
+from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D, Walk, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.timers import stage
 
@@ -80,6 +80,6 @@ class Blend(torch.autograd.Function):
             slots, adj_background, dropped = ctx.driver.adjoint(
                 ctx.adjoint, ctx.bins, ctx.options, background, saved, adj_pixels
             )
-            ctx.dropped.pixel_count += dropped.sum()
+            ctx.dropped.pixel_count = plus(ctx.dropped.pixel_count, dropped.sum())
             grads = ctx.driver.gather(ctx.bins, slots)
         return *grads, adj_background, *[None] * 7

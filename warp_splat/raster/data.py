@@ -5,6 +5,7 @@ N Gaussians, V splats, M tile instances (a splat in the list of a tile), T tiles
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -83,6 +84,37 @@ class Bins:
         return grads
 
 
+@dataclass
+class Room:
+    """For how many tile instances a GPU makes room before it knows their number; kept from one view to the next.
+
+    It is a quarter more than there were in any view so far. As long as none is known, the host waits for the number.
+    The number of a view is on its way to the host while the view is rendered; see :meth:`overflowed`.
+    """
+
+    instances: int = 0  # 0: not known
+    counted: Callable[[], list] | None = None  # tile instances of the last view
+
+    def learn(self, count: int) -> None:
+        """Make room for ``count`` and some more, in steps of an eighth at most: memory of the same size is at hand."""
+        wanted = count + count // 4
+        step = 1 << max(wanted.bit_length() - 4, 10)
+        self.instances = max(self.instances, -(-wanted // step) * step)
+
+    def overflowed(self) -> bool:
+        """Whether the last view had more than there was room for: what it shows is wrong. The next one is waited for.
+
+        To be asked once the view has been launched: only its instances need have been counted by then.
+        """
+        if self.counted is None:
+            return False
+        (count,), room, self.counted = self.counted(), self.instances, None
+        self.learn(count)
+        if count > room:
+            self.instances = 0
+        return count > room
+
+
 class Pixels(NamedTuple):
     """An image, or the upstream gradient of one."""
 
@@ -115,6 +147,11 @@ class Walk:
     def steps(self) -> torch.Tensor:
         """Instances of each tile that a pixel blends, [T] int32."""
         return self.count.flatten(1).amax(1).int()
+
+
+def plus(counted: int | torch.Tensor, more: torch.Tensor) -> torch.Tensor:
+    """Their sum; no operation, where nothing was counted so far."""
+    return more if isinstance(counted, int) and not counted else counted + more
 
 
 @dataclass

@@ -19,7 +19,7 @@ from warp_splat.kernels.cuda import strongest as blocks_strongest
 from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster import bin, cpu, cuda
-from warp_splat.raster.data import Bins, Pixels, Splats2D, Walk
+from warp_splat.raster.data import Bins, Pixels, Walk
 
 
 class ChannelKernels(NamedTuple):
@@ -40,7 +40,7 @@ class Driver:
 
     lanes: int  # Gaussians, or pixels, that a kernel takes at once
     peeks: bool  # whether to look at a result between two kernels: on a GPU the host would have to wait for it
-    bin: Callable[[Splats2D, Camera, RasterOptions], Bins]
+    bin: Callable[..., Bins]
     blend: Callable[[Bins, Camera, torch.Tensor, RasterOptions, bool], tuple[Pixels, Saved]]
     adjoint: Callable[[str, Bins, RasterOptions, torch.Tensor, Saved, Pixels], tuple[torch.Tensor, ...]]
     gather: Callable[..., list[torch.Tensor]]

@@ -26,7 +26,7 @@ from warp_splat.kernels.simd import TYPES, vec16
 from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, pose_gradient, twist_gradient
-from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of
+from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.raster.lens_gradient import bent_groups, coefficients_gradient
 from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
@@ -265,7 +265,7 @@ class Project(torch.autograd.Function):
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
                 launch(quarantine, count, [seen], outputs, device=device)
-                ctx.dropped.gaussian_count += torch.count_nonzero(bad)
+                ctx.dropped.gaussian_count = plus(ctx.dropped.gaussian_count, torch.count_nonzero(bad))
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
         learned = adj_twist, adj_intrinsics, adj_last, adj_coefficients
         return *(tensor if wants else None for tensor, wants in wanted), *learned, *[None] * 6

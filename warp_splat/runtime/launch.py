@@ -134,6 +134,25 @@ def launch_in_lanes(
             launch(make(size), runs, *arguments(TYPES[size], rows), bounds=bounds, device=device)
 
 
+def read_later(values: torch.Tensor) -> Callable[[], list]:
+    """What returns ``values``, which are on their way to the host: it waits for what was launched so far, no longer.
+
+    So the GPU works on meanwhile, if more has been launched since.
+    """
+    on_gpu = values.device.type == "cuda"
+    here = torch.empty_like(values, device="cpu", pin_memory=on_gpu).copy_(values, non_blocking=True)
+    if not on_gpu:
+        return here.tolist
+    arrived = torch.cuda.Event()
+    arrived.record(torch.cuda.current_stream(values.device))
+
+    def read() -> list:
+        arrived.synchronize()
+        return here.tolist()
+
+    return read
+
+
 def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     """With rows of zeros up to so many; the tensor itself, if it has them."""
     if len(tensor) == rows:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,6 +23,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.data import Room
 from warp_splat.rendering.photographed import as_photographed
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
@@ -35,27 +36,11 @@ from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS, choose
 from warp_splat.training.photographs import Photographs
+from warp_splat.training.quarantined import Quarantine
 from warp_splat.training.seams import Setting, Step, having
 
 T = TypeVar("T")
 LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
-
-
-@dataclass
-class Quarantine:
-    """What was kept from spreading, counted over the run on the device."""
-
-    pixels: int | torch.Tensor = 0  # with an upstream gradient that was not finite
-    gradients: int | torch.Tensor = 0  # of Gaussians, not finite: no update in that step
-    gaussians: int | torch.Tensor = 0  # left out of an image because a parameter was not finite (once per image)
-    prunings: int = 0  # refused, because they would have emptied the scene
-
-    def read(self, processes: Processes = ALONE) -> dict[str, int]:
-        """The counts by name, over all processes."""
-        counts = torch.tensor([int(self.pixels), int(self.gradients), int(self.gaussians)])
-        processes.sum(counts)  # but a refused pruning is the same one everywhere
-        names = (item.name for item in fields(self))
-        return dict(zip(names, [*counts.tolist(), self.prunings], strict=True))
 
 
 class Trainer:
@@ -106,6 +91,7 @@ class Trainer:
         self._views_random = random.Random(seed)
         self._deck: list[View] = []
         self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
+        self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
         self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
 
@@ -123,7 +109,7 @@ class Trainer:
         camera, photograph = self.photographs.at_size(step.view, iteration)
         options = self._through("asks", self.options, step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
-        out = self._render(camera, background, options)
+        out = self._render(camera, background, options, self.room)
         out.means2d.retain_grad()
         image = self._through("image", out.image, out, step)
         photograph = self._through("photograph", photograph, step)
@@ -252,11 +238,16 @@ class Trainer:
         return dealt[self.processes.rank]
 
     def _render(
-        self, camera: Camera | CameraParameters, background: torch.Tensor, options: RasterOptions
+        self,
+        camera: Camera | CameraParameters,
+        background: torch.Tensor,
+        options: RasterOptions,
+        room: Room | None = None,
     ) -> RenderOutput:
         with stage("project"):
             gaussians = self.model.activated(self.degree)
-        return render(gaussians, camera, background, replace(options, sh_degree=self.degree), self.config.model.adjoint)
+        options = replace(options, sh_degree=self.degree)
+        return render(gaussians, camera, background, options, self.config.model.adjoint, room=room)
 
     @property
     def behind(self) -> torch.Tensor:
