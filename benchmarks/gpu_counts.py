@@ -22,6 +22,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import ALPHA_MIN, TILE, RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.cuda.blend import EACH
 from warp_splat.kernels.cuda.warps import PIXELS, blocks_of
 from warp_splat.kernels.falloff import LOG2_E, reach_of
 from warp_splat.kernels.splat import exponent
@@ -110,7 +111,7 @@ def count_walked(
     stops: wp.array2d[float],  # [T, TILE TILE] instances walked before a pixel stopped, line by line
     alpha_min: float,
     # out
-    found_out: wp.array2d[wp.int64],  # [T, 3] instances walked, blocks of 8 x 4 touched, warps of 16 x 2 that blend
+    found_out: wp.array2d[wp.int64],  # [T, 4] instances walked, blocks of 8 x 4 and halves touched, warps that blend
 ):
     tile = first + wp.tid()
     start = bins.ranges[tile][0]
@@ -120,6 +121,7 @@ def count_walked(
     for pixel in range(TILE * TILE):
         steps = wp.max(steps, stops[tile, pixel])
     touched = int(0)
+    halves = int(0)
     blending = int(0)
     for step in range(int(steps)):
         splat = bins.splats[bins.instances[start + step]]
@@ -127,6 +129,9 @@ def count_walked(
         blocks = blocks_of(splat, 0.5 * LOG2_E * reach, left, top)
         for block in range(PIXELS):
             touched += (blocks >> block) & 1
+        for half in range(PIXELS // EACH):
+            if ((blocks >> (half * EACH)) & ((1 << EACH) - 1)) != 0:
+                halves += 1
         for warp in range(WARPS):
             hit = int(0)
             for pixel in range(32):
@@ -139,7 +144,8 @@ def count_walked(
             blending += hit
     found_out[tile, 0] = wp.int64(steps)
     found_out[tile, 1] = wp.int64(touched)
-    found_out[tile, 2] = wp.int64(blending)
+    found_out[tile, 2] = wp.int64(halves)
+    found_out[tile, 3] = wp.int64(blending)
 
 
 @dataclass(frozen=True)
@@ -153,6 +159,7 @@ class Scene:
     instances: int  # Gaussians in tiles
     walked: int  # of them, before every pixel of the tile has stopped
     blocks: int  # of 8 x 4 pixels that these touch, eight in a tile
+    halves: int  # of a tile that they touch
     warps: int  # of 16 x 2 pixels in which one blends it, eight in a tile
     pairs: int  # Gaussians in pixels, blended
 
@@ -165,12 +172,12 @@ def count_scene(model: GaussianModel, camera: Camera) -> Scene:
         bins = CPU.bin(project(gaussians, camera, options), camera, options)
         _, (_, stopped, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
         stops = in_lines(stopped)
-        found = torch.empty(len(bins.ranges), 3, dtype=torch.int64)
+        found = torch.empty(len(bins.ranges), 4, dtype=torch.int64)
         launch(count_walked, len(found), [bins.view(), view(stops, wp.float32), ALPHA_MIN], [view(found, wp.int64)])
-    work, (walked, blocks, warps) = count(gaussians, camera, options), found.sum(0).tolist()
+    work, (walked, blocks, halves, warps) = count(gaussians, camera, options), found.sum(0).tolist()
     return Scene(
         *(len(gaussians.means), len(bins.gaussians), camera.width * camera.height, len(bins.ranges)),
-        *(len(bins.instances), walked, blocks, warps, int(work.pairs)),
+        *(len(bins.instances), walked, blocks, halves, warps, int(work.pairs)),
     )
 
 

@@ -22,6 +22,7 @@ from made_up import cameras, make_crowd, make_gaussians
 from warp_splat.evaluation.report import machine
 from warp_splat.formats.atomic import write_json
 from warp_splat.kernels.cuda.adam_by_number import AT_ONCE
+from warp_splat.kernels.cuda.blend import EACH
 from warp_splat.kernels.cuda.comparison import BAND, STRIP
 from warp_splat.kernels.window import RADIUS
 from warp_splat.runtime import launch
@@ -56,13 +57,14 @@ SCENES = {
 SHAPE, SH, SPLAT, RADII = 44, 192, 48, 4  # bytes of a Gaussian, its harmonics, projected, and the radius of that
 GRADIENT, ROW, PLACE = 40, 36, 4  # of a projected Gaussian, of a tile instance, of an index
 PARAMETERS = (SHAPE + SH) // 4
-BLOCK = 48  # instructions of the adjoint for one of the eight blocks of a tile instance (docs/cuda.md)
+#: Instructions of a warp for one of the blocks of a tile instance, of the blend and of its adjoint; and of both for an
+#: instance that is staged (docs/cuda.md).
+BLENDED, BLOCK, STAGED = 23, 42, 13
 CARD_HEADERS = (
     *("card", "code", "SMs", "MHz", "GB/s"),
     *(f"{name}: {what} ms" for name in SCENES for what in ("blend", "its adjoint", "step")),
 )
 ADJOINT_HEADERS = ("scene", "adjoint", "found", "instructions", "shuffles", "barriers", "atomic additions")
-PASSED = 3  # instructions of the blend's warp for an instance that misses it: its bit, and the votes
 ADD_ROW = 24  # of gather for a row: nine loads, nine additions, its place, the loop
 
 
@@ -80,7 +82,7 @@ def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
     by_depth = 8 * 12 * n + 32 * n  # four passes over keys and indices; the order, counts and their scan
     # with room for more: two passes over keys of 16 bits and indices of 64, then instances and places from these
     by_tile = 76 * 1.25 * m
-    passes = code["manual", "adj_blend"] - 8 * BLOCK  # of a tile instance, whatever it touches
+    passes = STAGED + code["manual", "adj_blend"] - 8 * BLOCK  # of a tile instance, whatever it touches
     rows = 8 * (BAND + 2 * RADIUS) / BAND * 3 * pixels / STRIP  # of warps, in strips of three colors a pixel
     return {
         # activated; filled with zeros and projected; colors of those drawn
@@ -94,7 +96,7 @@ def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
         ),
         "blend": (
             (PLACE + SPLAT) * walked + 24 * pixels,
-            8 * PASSED * walked + code["blend", "blend"] * scene.blocks,
+            STAGED * walked + (code["blend", "blend"] - EACH * BLENDED) * scene.halves + BLENDED * scene.blocks,
         ),
         # image and photograph in bytes; slopes of three colors
         "loss": ((12 + 3 + 36) * pixels, rows * code["loss", "compare_block"]),
@@ -159,7 +161,7 @@ def adjoint_rows(scenes: dict[str, Scene]) -> list[list]:
     code, rows = instructions(90)["manual", "adj_blend"], []
     for name, scene in scenes.items():
         blocks, warps, pairs = (value / scene.walked for value in (scene.blocks, scene.warps, scene.pairs))
-        ours = code - 8 * BLOCK + BLOCK * blocks
+        ours = STAGED + code - 8 * BLOCK + BLOCK * blocks
         rows += [
             [name, "manual: a warp for a tile", "counted", f"{ours:.0f}", "12", "0", "0"],
             [name, "a block of 256, before", "counted", "2046", "400", "4", "0"],

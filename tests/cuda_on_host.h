@@ -345,6 +345,13 @@ inline bool __any_sync(unsigned mask, bool predicate) { return host::ballot(mask
 inline int atomicAdd(int* where, int value) { return __atomic_fetch_add(where, value, __ATOMIC_RELAXED); }
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(unsigned bits) { return __builtin_ffs(bits); }
-inline float __fdividef(float a, float b) { return a / b; }
+inline int __clz(unsigned bits) { return bits ? __builtin_clz(bits) : 32; }
+inline unsigned __brev(unsigned bits)
+{
+    unsigned turned = 0;
+    for (int place = 0; place < 32; ++place)
+        turned |= (bits >> place & 1) << (31 - place);
+    return turned;
+}
 inline void __trap() { abort(); }
 struct alignas(16) float4 { float x, y, z, w; };

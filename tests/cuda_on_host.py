@@ -30,8 +30,11 @@ REPLACED = (
     (r"__shared__ (alignas\(\w+\))", r"\1 __shared__"),
     (r"extern __shared__ char dynamic_smem_base\[\]", "static char dynamic_smem_base[HOST_SHARED]"),
 )
-#: A GPU's instruction, and what an exponential without it returns.
-INSTRUCTION = (r'asm\("ex2\.approx.*?;"[^;]*;', "found = known;")
+#: A GPU's instructions, and what they are without one.
+INSTRUCTIONS = (
+    (r'asm\("ex2\.approx.*?;"[^;]*;', "found = known;"),
+    (r'asm\("rcp\.approx.*?;"[^;]*;', "inverse = 1.0f / left;"),
+)
 PROGRAM = """#include "cuda_on_host.h"
 #define HOST_CUDA 900
 #define HOST_SHARED {shared}
@@ -112,7 +115,8 @@ def build(launch: Launch, sanitizer: str, folder: Path) -> Path:
     )
     copy_headers(folder / "native")
     source = re.sub(REPLACED[0][0], REPLACED[0][1], source.replace("#define WP_NO_CRT\n", ""))
-    source = re.sub(*INSTRUCTION, source)
+    for instruction, code in INSTRUCTIONS:
+        source = re.sub(instruction, code, source)
     shared = max(sizes[f"{name}_smem_bytes"], 1)
     (folder / "program.cpp").write_text(PROGRAM.format(shared=shared, source=source, kernel=name))
     flags = [

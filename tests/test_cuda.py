@@ -3,6 +3,7 @@
 The driver alone is another one; all else is the renderer as users call it.
 """
 
+import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -11,6 +12,7 @@ from test_rasterize import check_gradients, check_image, relative_error, run, tr
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cuda import warps
+from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster import api
 from warp_splat.raster.data import Gaussians, Room
 from warp_splat.raster.drivers import CUDA, using
@@ -122,3 +124,38 @@ def test_room_grows_before_it_is_needed():
     assert len(sizes) < 70  # or there would be new memory for each
     room.learn(5)
     assert room.instances == max(sizes)
+
+
+@pytest.mark.slow
+def test_ellipses_touch_the_blocks_of_the_pixels_that_they_hold():
+    """Against float64, every pixel tried; needles, specks and what is farther off than it reaches."""
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def look(splats: wp.array[Splat2D], z_most: wp.array[float], touched_out: wp.array[int]):
+        i = wp.tid()
+        touched_out[i] = warps.blocks_of(splats[i], z_most[i], 0.5, 0.5)
+
+    random, count = np.random.default_rng(0), 3000
+    angle, z_most = random.uniform(0, np.pi, count), random.uniform(0.01, 8, count)
+    sides = 10 ** random.uniform(-0.3, 2.5, (count, 2))
+    mean = random.uniform(0, 16, (count, 2)) + random.normal(size=(count, 2)) * sides.max(1, keepdims=True)
+    turn = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], -1).reshape(-1, 2, 2)
+    conic = turn.swapaxes(1, 2) @ (turn / sides[:, :, None] ** 2)
+    root = np.linalg.cholesky(conic).swapaxes(1, 2)
+    splats = np.zeros(count, Splat2D.numpy_dtype())
+    splats["mean"], splats["root"] = mean, np.stack([root[:, 0, 0], root[:, 0, 1], root[:, 1, 1]], -1)
+    found = wp.empty(count, dtype=int, device="cpu")
+    given = [wp.array(splats, dtype=Splat2D, device="cpu"), wp.array(z_most, dtype=float, device="cpu")]
+    wp.launch(look, count, given, [found], device="cpu")
+    here = (found.numpy()[:, None] >> np.arange(8) & 1).astype(bool)
+
+    def held(fine, z_most):
+        """Which blocks hold a place where z is that at most, of a grid of ``fine`` places a pixel."""
+        x, y = np.meshgrid(np.arange(7 * fine + 1) / fine, np.arange(3 * fine + 1) / fine)
+        places = np.stack([x.ravel(), y.ravel()], -1) + [[[8 * (b % 2) + 0.5, 4 * (b // 2) + 0.5]] for b in range(8)]
+        offsets = places[None] - mean[:, None, None]
+        z = ((offsets @ root.swapaxes(1, 2)[:, None]) ** 2).sum(-1)
+        return (z <= z_most[:, None, None]).any(-1)
+
+    assert not (held(1, z_most) & ~here).any() and 0.1 < here.mean() < 0.9
+    assert (here & ~held(4, 1.1 * z_most + 0.1)).mean() < 2e-3  # of needles, between the places

@@ -41,11 +41,12 @@ def test_scene():
     assert scene.tiles == 15 and scene.pixels == 80 * 48 and scene.gaussians == 2000
     assert 0 < scene.walked <= scene.instances and scene.warps <= scene.pairs <= 32 * scene.warps
     assert scene.warps <= 8 * scene.walked and scene.blocks <= 8 * scene.walked
-    assert scene.pairs <= 32 * scene.blocks  # the box holds every pixel that is blended into
+    assert scene.pairs <= 32 * scene.blocks  # they hold every pixel that is blended into
+    assert scene.halves <= min(2 * scene.walked, scene.blocks) and scene.blocks <= 4 * scene.halves
 
 
 def test_a_card_of_twice_the_rates_takes_half_the_time():
-    scene = gpu_counts.Scene(1000, 900, 5000, 20, 3000, 2500, 9000, 8000, 40_000)
+    scene = gpu_counts.Scene(1000, 900, 5000, 20, 3000, 2500, 9000, 3500, 8000, 40_000)
     card = gpu_model.CARDS["H200"]
     twice = card._replace(clock=2 * card.clock, bandwidth=2 * card.bandwidth)
     slow, fast = (gpu_model.times(scene, one) for one in (card, twice))
@@ -55,7 +56,8 @@ def test_a_card_of_twice_the_rates_takes_half_the_time():
 
 
 def test_measured_stages_stand_beside_the_model(tmp_path):
-    scene = gpu_counts.Scene(1_000_000, 900_000, 534_100, 2170, 1_300_000, 1_300_000, 3_000_000, 3_000_000, 40_000_000)
+    listed, blocks = [1_300_000] * 2, (3_000_000, 1_600_000)
+    scene = gpu_counts.Scene(1_000_000, 900_000, 534_100, 2170, *listed, *blocks, 3_000_000, 40_000_000)
     row = {f"{stage} ms": "2.0" for stage in gpu_model.STAGES} | {"size": "980 x 545", "Gaussians": 1_000_000}
     (tmp_path / "gpu.json").write_text(json.dumps({"tables": {"Training step": [row, row | {"Gaussians": 5}]}}))
     rows = gpu_model.measured_rows(tmp_path / "gpu.json", gpu_model.CARDS["H200"], {"ball": scene})

@@ -145,6 +145,17 @@ def fma(a: vec16, b: float, c: vec16):
 
 
 @wp.func
+def negative(x: float):
+    """-x, which the code for a GPU has as a part of what reads it; Warp's is 0 - x."""
+    return x * -1.0
+
+
+@wp.func
+def negative(x: vec16):
+    return -x
+
+
+@wp.func
 def over(a: float, b: float):
     return a / b
 

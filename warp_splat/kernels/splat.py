@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
-from warp_splat.kernels.simd import fill, fma, over, times, vec16, where_less
+from warp_splat.kernels.simd import fill, fma, negative, over, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL
 
 wp.set_module_options(FORWARD_ONLY)
@@ -84,8 +84,8 @@ def advance(t: Any, alpha: Any, t_min: float):
 
     A pixel stops at the Gaussian that would take T below ``t_min``: it keeps its T with the sign flipped, from then on.
     """
-    after = fma(-alpha, t, t)
-    return where_less(after, fill(t_min, t), wp.min(t, -t), after)
+    after = fma(negative(alpha), t, t)
+    return where_less(after, fill(t_min, t), wp.min(t, negative(t)), after)
 
 
 @wp.func
@@ -97,12 +97,15 @@ def weight(t: Any, alpha: Any, behind: Any):
 @wp.func
 def adj_alpha_blend(t: Any, odds: Any, behind: Any, here: Any):
     """dL/dalpha_k from T_k, alpha_k / (1 - alpha_k), behind_k and color_k . u (module docstring)."""
-    return fma(t, here, -fma(behind, odds, behind))
+    return fma(t, here, negative(fma(behind, odds, behind)))
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)  // a reciprocal and a step of Newton's: a division has twice the instructions, and a branch
-    const float left = 1.0f - alpha, inverse = __fdividef(1.0f, left), odds = alpha * inverse;
+    const float left = 1.0f - alpha;
+    float inverse;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(inverse) : "f"(left));
+    const float odds = alpha * inverse;
     return fmaf(fmaf(-left, odds, alpha), inverse, odds);
 #else
     return alpha / (1.0f - alpha);

@@ -1,1 +1,1 @@
-"""The blend and its adjoints in blocks: a thread for each pixel of a tile."""
+"""The blend and its adjoints in blocks: a warp, two, or a thread for each pixel, for a tile."""

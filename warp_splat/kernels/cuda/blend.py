@@ -1,8 +1,8 @@
-"""The CUDA driver of the blend: one block of 256 threads per 16 x 16 tile, one pixel per thread.
+"""The CUDA driver of the blend: a block of two warps per 16 x 16 tile, four pixels a lane.
 
-Each thread stages one Gaussian of a batch of 256 in shared memory, and which warps its box touches; these blend it; the
-block votes whether every pixel has stopped. A warp has 8 x 4 pixels, as blocks of the adjoint. The mathematics is that
-of the CPU's lanes (:mod:`warp_splat.kernels.splat`), for one pixel.
+A warp has four blocks of 8 x 4 pixels: half a tile. Each thread stages one Gaussian of a batch of 64 in shared memory,
+and which blocks its ellipse touches; the warps blend those that touch one of theirs. They vote whether every pixel has
+stopped. The mathematics is that of the CPU's lanes (:mod:`warp_splat.kernels.splat`), for one pixel.
 """
 
 import functools
@@ -10,16 +10,31 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.cuda.warps import PIXELS, WARP, across_of, ballot, blocks_of, down_of, lowest, vec10
+from warp_splat.kernels.cuda.warps import (
+    COLUMNS,
+    WARP,
+    across_of,
+    ballot,
+    blocks_of,
+    down_of,
+    lowest,
+    vec10,
+)
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
 
-THREADS = wp.constant(TILE * TILE)  # per block
+THREADS = wp.constant(TILE * TILE)  # of a block of other kernels: one per pixel
+EACH = wp.constant(4)  # pixels of a lane of the blend, each in a block of 8 x 4
+BATCH = wp.constant(TILE * TILE // 4)  # Gaussians that the blend stages at once, and its threads
+TOUCHED = wp.constant(10)  # which blocks: behind a slot's columns, of what is staged
+vec12 = wp.types.vector(length=12, dtype=float)
+vec_each = wp.types.vector(length=4, dtype=float)
 
 #: Of modules whose kernels run in blocks. No regrouping of sums: it would change what CPU fibers check.
 BLOCK_OPTIONS = {"enable_backward": False, "block_dim": TILE * TILE}
+BLEND_OPTIONS = {**BLOCK_OPTIONS, "block_dim": TILE * TILE // 4}
 
 
 @wp.func
@@ -31,13 +46,36 @@ def staged_of(splat: Splat2D):
     )  # fmt: skip
 
 
+@wp.func
+def with_blocks(row: vec10, touched: int):
+    """What loops read of a Gaussian, and which blocks it touches.
+
+    Shared memory takes and gives twelve numbers by four, without conflicts of banks.
+    """
+    staged = vec12()
+    for column in range(COLUMNS):
+        staged[column] = row[column]
+    staged[TOUCHED] = wp.cast(touched, float)
+    return staged
+
+
+@wp.func
+def going_of(ts: vec_each, thread: int):
+    """Blocks of the warp in which a pixel has not stopped, a bit for each."""
+    going = int(0)
+    for p in range(EACH):
+        if ballot(ts[p] >= 0.0, thread) != 0:
+            going |= 1 << p
+    return going
+
+
 @functools.cache
 def make_blend_block(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     falloff, CHANNELS = make_falloff(variant.falloff), variant.channels
     fall_at, reach_of = falloff.value, falloff.reach_of
 
-    @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
+    @wp.kernel(module="unique", module_options=dict(BLEND_OPTIONS))
     def blend(
         bins: BinsView,
         alphas: wp.vec2,
@@ -51,74 +89,86 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         kept_out: wp.array2d[float],  # [M, THREADS] transmittance in front of each Gaussian
     ):
         tile, thread = wp.tid()
-        warp = thread // WARP
-        across = across_of(thread % WARP, warp)
-        down = down_of(thread % WARP, warp)
-        place = down * TILE + across
-        column = (tile % bins.tiles_x) * TILE + across
-        line = (tile // bins.tiles_x) * TILE + down
-        x = float(column) + 0.5
-        y = float(line) + 0.5
-        left = float((tile % bins.tiles_x) * TILE) + 0.5
-        top = float((tile // bins.tiles_x) * TILE) + 0.5
+        lane = thread % WARP
+        half = (thread // WARP) * EACH  # the first of the warp's blocks
+        column = (tile % bins.tiles_x) * TILE
+        line = (tile // bins.tiles_x) * TILE
+        left = float(column) + 0.5
+        top = float(line) + 0.5
         start = bins.ranges[tile][0]
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
-        inside = line < pixels_out.image.shape[0] and column < pixels_out.image.shape[1]
-        t = float(1.0)
-        if not inside:
-            t = -1.0  # stopped from the beginning
-        count = int(0)
-        color = wp.vec3(0.0)
-        far = float(0.0)
-        for batch in range((length + THREADS - 1) // THREADS):
-            first = batch * THREADS
-            mine = vec10(0.0)
-            touched = int(0)
+        ts = vec_each(1.0)
+        counts = vec_each(float(length))
+        reds = vec_each(0.0)
+        greens = vec_each(0.0)
+        blues = vec_each(0.0)
+        fars = vec_each(0.0)
+        for p in range(EACH):
+            y = line + down_of(lane, half + p)
+            x = column + across_of(lane, half + p)
+            if y >= pixels_out.image.shape[0] or x >= pixels_out.image.shape[1]:
+                ts[p] = -1.0  # stopped from the beginning
+                counts[p] = 0.0
+        going = going_of(ts, thread)
+        for batch in range((length + BATCH - 1) // BATCH):
+            first = batch * BATCH
+            mine = vec12(0.0)
             if first + thread < length:
                 splat = bins.splats[bins.instances[start + first + thread]]
-                mine = staged_of(splat)
-                if wp.static(variant.keep):
-                    touched = -1  # every T is kept
-                else:
-                    touched = blocks_of(splat, 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0]), left, top)
-            staged = wp.tile(mine, preserve_type=True)
-            word = int(0)  # of a warp's lane: which of the warp's Gaussians touch the block of that number
-            for block in range(PIXELS):
-                touching = ballot((touched & (1 << block)) != 0, thread)
-                if thread % WARP == block:
-                    word = touching
-            words = wp.tile(word)
-            for group in range((wp.min(THREADS, length - first) + WARP - 1) // WARP):
-                left_over = words[group * WARP + warp]
+                touched = int(-1)  # every T is kept
                 if wp.static(not variant.keep):
-                    if ballot(t >= 0.0, thread) == 0:
-                        left_over = 0
+                    touched = blocks_of(splat, 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0]), left, top)
+                mine = with_blocks(staged_of(splat), touched)
+            staged = wp.tile(mine, preserve_type=True)
+            for group in range(wp.static(int(BATCH) // int(WARP))):
+                looked_at = going
+                if wp.static(variant.keep):
+                    looked_at = -1
+                listed = staged[group * WARP + lane]
+                left_over = ballot(((wp.cast(listed[TOUCHED], int) >> half) & looked_at) != 0, thread)
                 while left_over != 0:
                     j = group * WARP + lowest(left_over)
                     left_over = left_over & (left_over - 1)
                     g = staged[j]
-                    fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
-                    alpha = alpha_of(fall * g[OPACITY], alphas)
-                    behind = advance(t, alpha, t_min)
-                    w = weight(t, alpha, behind)
-                    if wp.static(variant.keep):
-                        kept_out[start + first + j, place] = t
-                    color += wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2]) * w
-                    if wp.static(CHANNELS > 3):
-                        far += g[CHANNEL + 3] * w
-                    t = behind
-                    if behind >= 0.0:
-                        count = first + j + 1
-            if wp.tile_max(wp.tile(t))[0] < 0.0:
+                    touched = (wp.cast(g[TOUCHED], int) >> half) & looked_at
+                    here = float(first + j)
+                    for p in range(EACH):
+                        if (touched & (1 << p)) != 0:  # the same for all lanes
+                            dx = g[MEAN_X] - (left + float(across_of(lane, half + p)))
+                            dy = g[MEAN_Y] - (top + float(down_of(lane, half + p)))
+                            fall = fall_at(exponent(dx, dy, g[XX], g[XY], g[YY]))
+                            alpha = alpha_of(fall * g[OPACITY], alphas)
+                            behind = advance(ts[p], alpha, t_min)
+                            if behind < 0.0:
+                                counts[p] = wp.min(counts[p], here)
+                            w = weight(ts[p], alpha, behind)
+                            if wp.static(variant.keep):
+                                place = down_of(lane, half + p) * TILE + across_of(lane, half + p)
+                                kept_out[start + first + j, place] = ts[p]
+                            reds[p] += g[CHANNEL] * w
+                            greens[p] += g[CHANNEL + 1] * w
+                            blues[p] += g[CHANNEL + 2] * w
+                            if wp.static(CHANNELS > 3):
+                                fars[p] += g[CHANNEL + 3] * w
+                            ts[p] = behind
+                going = going_of(ts, thread)
+            votes = wp.tile(going)
+            if (votes[0] | votes[WARP]) == 0:
                 break
-        t = wp.abs(t)
-        final_out[tile, place] = t
-        count_out[tile, place] = count
-        if inside:
-            for channel in range(3):
-                pixels_out.image[line, column, channel] = color[channel] + t * background[channel]
-            pixels_out.alpha[line, column] = 1.0 - t
-            if wp.static(CHANNELS > 3):
-                pixels_out.depth[line, column] = far
+        for p in range(EACH):
+            across = across_of(lane, half + p)
+            down = down_of(lane, half + p)
+            t = wp.abs(ts[p])
+            final_out[tile, down * TILE + across] = t
+            count_out[tile, down * TILE + across] = int(counts[p])
+            y = line + down
+            x = column + across
+            if y < pixels_out.image.shape[0] and x < pixels_out.image.shape[1]:
+                pixels_out.image[y, x, 0] = reds[p] + t * background[0]
+                pixels_out.image[y, x, 1] = greens[p] + t * background[1]
+                pixels_out.image[y, x, 2] = blues[p] + t * background[2]
+                pixels_out.alpha[y, x] = 1.0 - t
+                if wp.static(CHANNELS > 3):
+                    pixels_out.depth[y, x] = fars[p]
 
     return blend

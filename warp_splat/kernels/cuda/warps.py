@@ -1,7 +1,7 @@
 """Sums and votes of the lanes of a warp; and a warp for a whole tile, of which a lane takes eight pixels.
 
 These lie in blocks of 8 x 4, of which a Gaussian reaches fewer than of pairs of lines: in a million Gaussians on
-980 x 545 px, 32 % instead of 39.
+980 x 545 px, the boxes 32 % instead of 39, the ellipses 28 %.
 """
 
 from typing import Any
@@ -85,13 +85,13 @@ def ballot(vote: bool, thread: int) -> int:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __ffs(bits) - 1;
+    return __clz(__brev(bits));  // never negative, as the compiler knows
 #else
-    return __builtin_ffs(bits) - 1;
+    return __builtin_ctz(bits);
 #endif
 """)
 def lowest(bits: int) -> int:
-    """The place of the lowest bit that is set; -1 if there is none."""
+    """The place of the lowest bit that is set, of one at least."""
     ...
 
 
@@ -139,18 +139,33 @@ def down_of(lane: int, pixel: int):
 
 @wp.func
 def blocks_of(splat: Splat2D, z_most: float, left: float, top: float):
-    """Which of a lane's pixels, the blocks, the box around the ellipse z <= ``z_most`` touches: a bit for each.
+    """Which of a lane's pixels, the blocks, the ellipse z <= ``z_most`` touches: a bit for each.
 
-    Farther out alpha is below its least value. The margins are far more than what rounding adds.
+    Farther out alpha is below its least value. In lines of four the ellipse is widest where its widest line is, or
+    nearest to that; a block is missed by what is not as wide there. With u and v as of :func:`.splat.exponent`, z is
+    their squares' sum, and u at the edge of a block a slope times v more than at v = 0. The margins are far more than
+    what rounding adds.
     """
     r = splat.root
-    size = wp.sqrt(wp.max(z_most, 0.0) + 1.0e-2) * (1.0 + 1.0e-4) / r[2]
-    half_x = size * wp.length(wp.vec2(r[1], r[2])) / r[0]
+    slope = r[1] / r[2]
+    turned = wp.sqrt(1.0 + slope * slope)
+    reach = wp.sqrt(wp.max(z_most, 0.0) + 1.0e-2) * (1.0 + 1.0e-4)  # of v
+    margin = 1.0e-6 * reach * turned
+    widest = reach * slope / turned
+    most = reach * reach
     touched = int(0)
-    for p in range(PIXELS):
-        dx = splat.mean[0] - left - float(p % 2) * float(ACROSS)
-        dy = splat.mean[1] - top - float(p // 2) * float(DOWN)
-        missed = wp.max(-dx, dx - float(ACROSS - 1)) > half_x or wp.max(-dy, dy - float(DOWN - 1)) > size
-        if not missed:  # what is not finite misses nothing
-            touched |= 1 << p
+    for band in range(PIXELS // 2):
+        first = (top + float(band * DOWN) - splat.mean[1]) * r[2]
+        low = wp.max(first, -reach)
+        high = wp.min(first + float(DOWN - 1) * r[2], reach)
+        right = wp.clamp(-widest, low, high)
+        left_most = wp.clamp(widest, low, high)
+        for side in range(2):
+            begin = (left + float(side * ACROSS) - splat.mean[0]) * r[0]
+            end = begin + float(ACROSS - 1) * r[0]
+            near = wp.max(begin + slope * right - margin, 0.0)
+            far = wp.min(end + slope * left_most + margin, 0.0)
+            outside = near * near + right * right > most or far * far + left_most * left_most > most
+            if not (low > high or outside):  # what is not finite misses nothing
+                touched |= 1 << (2 * band + side)
     return touched
