@@ -57,7 +57,11 @@ INGREDIENTS = {
     "--coarse_by detail": ("Chen et al. 2025", "45.7 % less time", "yes, in `--preset fast`"),
     "--preset fast": ("both", "", "yes"),
     "three quarters of all steps": ("", "", "no: for those who have less time, `--minutes`"),
-    "harmonics of higher degree in every 4th step": ("Mallick et al. 2024 (every 16th)", "", "no: 3 % of the time, and 0.1 dB less than with the growth alone"),
+    "harmonics of higher degree in every 4th step": (
+        "Mallick et al. 2024 (every 16th)",
+        "",
+        "no: 3 % of the time, and 0.1 dB less than with the growth alone",
+    ),
     "--growth mcmc": (
         "Kheradmand et al. 2024",
         "better, and robust to where it starts",

@@ -17,9 +17,7 @@ from warp_splat.config import FRUSTUM_MARGIN, NEAR
 from warp_splat.formats.splats import LOG_SCALES, SplatArrays, logit, sigmoid, sizes, unit_quats
 
 POWER = 0.4  # of a Gaussian's importance: its weight where sets are cut in halves; measured: 0.25 and 0.5 are alike
-ALONE = (
-    10  # of so many groups, one is of a single one of the largest, which would swallow their neighbors: up to 0.9 dB
-)
+ALONE = 10  # one group of so many is a single one of the largest, which would swallow its neighbors: up to 0.9 dB
 MOST_CAMERAS = 16  # that are asked what is important
 REACH = 0.5 * (1 + FRUSTUM_MARGIN)  # of an image, from its middle: what is just outside reaches into it
 FLATTEST = 1e-37  # least variance, world units squared
