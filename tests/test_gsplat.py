@@ -2,15 +2,18 @@
 
 import contextlib
 import inspect
+import math
 
+import numpy as np
 import pytest
 import torch
 from scenes import SCENES
 from test_rasterize import IMAGE_MAX, relative_error
 
+import warp_splat.gsplat
 from warp_splat import InputError
 from warp_splat.compare import oracle
-from warp_splat.gsplat import harmonics_torch, rasterization
+from warp_splat.gsplat import rasterization
 from warp_splat.raster.drivers import CUDA, using
 
 gsplat = pytest.importorskip("gsplat")
@@ -89,10 +92,73 @@ def test_projection_and_its_gradients(model, mode):
 
 @pytest.mark.parametrize("degree", range(5))
 def test_harmonics(degree):
-    rays = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=1).requires_grad_()
-    found = torch.stack(harmonics_torch._basis(*rays.unbind(1), degree), 1)
-    expected = theirs._eval_sh_bases_fast((degree + 1) ** 2, rays)
+    rays, coefficients = torch.randn(50, 3).double(), torch.randn(50, 25, 3).double()
+    found = warp_splat.gsplat.spherical_harmonics(degree, rays, coefficients, rays[:, 0] > 0)
+    expected = theirs._spherical_harmonics(degree, rays, coefficients) * (rays[:, :1] > 0)
     assert torch.allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("triu", [False, True])
+def test_covariances_and_their_inverses(triu):
+    quats, scales = torch.randn(50, 4).double(), torch.randn(50, 3).double()
+    found = warp_splat.gsplat.quat_scale_to_covar_preci(quats, scales, triu=triu)
+    expected = theirs._quat_scale_to_covar_preci(quats, scales, triu=triu)
+    for one, other in zip(found, expected, strict=True):
+        assert relative_error(one, other) < 1e-12
+    assert warp_splat.gsplat.quat_scale_to_covar_preci(quats, scales, False, False) == (None, None)
+
+
+def test_relocation():
+    """The double sum of gsplat's kernel; several that lie at one place cover as much as one."""
+    binoms = gsplat.MCMCStrategy().initialize_state()["binoms"]
+    opacities, scales, ratios = torch.tensor([0.3, 0.9, 0.99, 0.5]), torch.rand(4, 3), torch.tensor([1, 2, 51, 99])
+    found, sizes = warp_splat.gsplat.compute_relocation(opacities, scales, ratios, binoms)
+    for opacity, scale, ratio, one, size in zip(opacities, scales, [1, 2, 51, 51], found, sizes, strict=True):
+        share = 1 - (1 - opacity.double()) ** (1 / ratio)
+        parts = [
+            (-1) ** k / (k + 1) ** 0.5 * math.comb(i, k) * share ** (k + 1) for i in range(ratio) for k in range(i + 1)
+        ]
+        assert torch.allclose(one.double(), share) and torch.allclose(size, scale * (opacity / sum(parts)).float())
+
+
+def test_signs_of_scales_do_not_matter():
+    call, weights = call_of(packed=False), None
+    flipped = call | {"scales": (call["scales"].detach() * torch.tensor([1.0, -1.0, -1.0])).requires_grad_()}
+    found = []
+    for each in (call, flipped):
+        image = rasterization(**each)[0]
+        weights = torch.randn(image.shape) if weights is None else weights
+        found.append((image, torch.autograd.grad(image, each["scales"], weights)[0]))
+    assert torch.equal(found[0][0], found[1][0])
+    assert torch.equal(found[0][1], found[1][1] * torch.tensor([1.0, -1.0, -1.0])) and found[0][1].any()
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_covariances_in_place_of_quats_and_scales(mode):
+    call = call_of(packed=False, rasterize_mode=mode)
+    exact = [call[name].detach().double().requires_grad_() for name in ("quats", "scales")]
+    covars = warp_splat.gsplat.quat_scale_to_covar_preci(*exact)[0]
+    given = covars.detach().float().requires_grad_()
+    image, other = rasterization(**call)[0], rasterization(**call | {"quats": None, "scales": None, "covars": given})[0]
+    assert (image - other).abs().max() < 1e-4
+    upstream = torch.randn(image.shape)
+    names = ("quats", "scales", "means", "viewmats", "Ks")
+    wanted = torch.autograd.grad(image, [call[name] for name in names], upstream)
+    upper, *rest = torch.autograd.grad(other, [given, *(call[name] for name in names[2:])], upstream)
+    assert not upper.tril(-1).any()
+    through = torch.autograd.grad(covars, exact, 0.5 * (upper + upper.mT).double())
+    for name, one, two in zip(names, (*through, *rest), wanted, strict=True):
+        assert relative_error(one, two.double()) < 1e-4, name
+
+
+def test_numbers_and_options_that_gsplat_takes():
+    """Numbers of NumPy, any tiles, backgrounds of what is a depth, an opacity that is 1 but for a rounding."""
+    call = call_of(width=np.int64(50), height=np.int32(40), sh_degree=np.int64(1), render_mode="ED")
+    call["opacities"] = torch.full_like(call["opacities"], 1.0000001)
+    image = rasterization(**call, tile_size=8, backgrounds=torch.rand(2, 1))[0]
+    assert image.shape == (2, 40, 50, 1)
+    call["opacities"] = torch.ones_like(call["opacities"])
+    assert (image - rasterization(**call)[0]).abs().max() < 1e-4
 
 
 @pytest.mark.parametrize("driver", ["lanes", "blocks"])
@@ -241,14 +307,17 @@ def test_its_strategy_grows_a_model(packed, steps):
         ({"viewmats": torch.zeros(0, 4, 4)}, "viewmats: expected a tensor"),
         ({"viewmats": torch.zeros(2, 4, 4)}, "viewmats: expected matrices from world to camera"),
         ({"Ks": torch.zeros(2, 3, 3)}, "Ks: expected matrices with focal lengths fx and fy .*, got a singular one"),
-        ({"opacities": torch.full((120,), 2.0)}, "opacities: expected values in 0..1"),
-        ({"scales": torch.full((120, 3), -1.0)}, "scales: expected positive values"),
+        ({"opacities": torch.full((120,), 1.0001)}, "opacities: expected values in 0..1 .* to 1.0001"),
         ({"means": torch.zeros(120, 3).to_sparse()}, "means: expected a dense tensor"),
         ({"width": 10**6, "height": 10**6}, "width, height: expected at most 4294967296 pixels"),
         ({"sh_degree": torch.zeros(2)}, "sh_degree: expected 0 to 4 or None"),
         ({"distributed": True}, "distributed: warp_splat.gsplat does not carry it; render in each process"),
         ({"with_eval3d": True}, "with_eval3d: .* does not carry"),
-        ({"covars": torch.zeros(120, 3, 3)}, "covars: .* give quats and scales"),
+        (
+            {"covars": torch.zeros(120, 3, 3), "with_ut": True},
+            "covars: expected None where with_ut is True; give quats",
+        ),
+        ({"covars": torch.zeros(120, 6)}, r"covars: expected a tensor \[120, 3, 3\]"),
         ({"ftheta_coeffs": object()}, "ftheta_coeffs: .* undistort"),
         ({"viewmats_rs": torch.zeros(2, 4, 4)}, "viewmats_rs: expected None without a rolling_shutter"),
         ({"rolling_shutter": "ROLLING"}, "rolling_shutter: expected None or gsplat's RollingShutterType of ROLLING"),
@@ -256,7 +325,7 @@ def test_its_strategy_grows_a_model(packed, steps):
         ({"render_mode": "depth"}, "render_mode: expected one of RGB, D"),
         ({"rasterize_mode": "fast"}, "rasterize_mode: expected one of classic"),
         ({"width": 0}, "width: expected a whole number, at least 1, got 0"),
-        ({"tile_size": 8}, "tile_size: expected 16, got 8"),
+        ({"tile_size": 0}, "tile_size: expected a whole number, at least 1, got 0"),
         ({"eps2d": -1.0}, "eps2d: expected a number, at least 0"),
         ({"sh_degree": 5}, "sh_degree: expected 0 to 4 or None, got 5"),
         ({"sh_degree": 3}, "colors: expected 16 or more coefficients"),

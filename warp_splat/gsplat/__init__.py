@@ -1,5 +1,7 @@
-"""gsplat's function on this renderer, with its arguments and its results."""
+"""gsplat's function on this renderer, with its arguments and its results, and what its strategies call beside it."""
 
 from warp_splat.gsplat.call import rasterization
+from warp_splat.gsplat.harmonics_torch import spherical_harmonics
+from warp_splat.gsplat.helpers import compute_relocation, quat_scale_to_covar_preci
 
-__all__ = ["rasterization"]
+__all__ = ["compute_relocation", "quat_scale_to_covar_preci", "rasterization", "spherical_harmonics"]

@@ -8,17 +8,19 @@ from typing import Any, NamedTuple
 
 import torch
 
-from warp_splat.config import CHANNELS_MOST, TILE
+from warp_splat.config import CHANNELS_MOST
 from warp_splat.errors import InputError
 from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_range, is_one_of
 from warp_splat.raster.drivers import DRIVERS, driver_of
 
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
+CHOICES = {
+    "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
+    "camera_model": ("pinhole", "ortho", "fisheye"),
+    "rasterize_mode": ("classic", "antialiased"),
+}
 #: What gsplat has and this does not, and what to do instead.
 NOT_CARRIED = {
     "distributed": "render in each process by itself",
-    "covars": "give quats and scales",
     "with_eval3d": "leave it False: Gaussians are evaluated on the image",
     "ftheta_coeffs": "undistort the photographs",
 }
@@ -28,6 +30,8 @@ COEFFICIENTS = {
     "tangential_coeffs": {"pinhole": 2},
     "thin_prism_coeffs": {"pinhole": 4},
 }
+OPTIONAL = ("covars", "viewmats_rs", "backgrounds", *COEFFICIENTS)
+ROUNDING = 1e-5  # by which an opacity may lie above 1; alpha is clamped anyway
 #: Of rolling shutters: along which axis of the image they read, and whether from its end.
 SHUTTERS = {
     "ROLLING_TOP_TO_BOTTOM": (1, False),
@@ -44,6 +48,7 @@ class Request(NamedTuple):
     quats: torch.Tensor  # [S, N, 4]
     scales: torch.Tensor  # [S, N, 3]
     opacities: torch.Tensor  # [S, N]
+    covars: torch.Tensor | None  # [S, N, 3, 3], instead of quats and scales
     colors: torch.Tensor  # [S, C or 1, N, D], or [S, C or 1, N, K, 3]
     viewmats: torch.Tensor  # [S, C, 4, 4]
     Ks: torch.Tensor  # [S, C, 3, 3]
@@ -73,37 +78,54 @@ class Request(NamedTuple):
 def check_request(request: Request, given: dict[str, Any]) -> Request:
     """The request with flat scenes. Raises InputError for the first argument that is not as it should be."""
     shutter = _check_choices(request, given)
-    means, viewmats = request.means, request.viewmats
+    means, viewmats, colors = request.means, request.viewmats, request.colors
     if not isinstance(means, torch.Tensor) or means.dim() < 2:
         raise InputError(f"means: expected a tensor [..., N, 3], got {_found(means)}.")
     if not isinstance(viewmats, torch.Tensor) or viewmats.dim() < 3 or viewmats.shape[-3] < 1:
         raise InputError(f"viewmats: expected a tensor [..., C, 4, 4], got {_found(viewmats)}.")
     batch, count, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
-    scenes = math.prod(batch)
-    shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
-    shapes |= {"viewmats": (cameras, 4, 4), "Ks": (cameras, 3, 3)}
-    shapes |= {"viewmats_rs": (cameras, 4, 4)} if shutter else {}
-    flat = {}
+    if request.covars is not None:  # then these are ignored
+        given = given | {"quats": means.new_ones(*batch, count, 4), "scales": means.new_ones(*batch, count, 3)}
+    _check_tensor("colors", colors, None, means.device)
+    per_view = _check_colors(request, batch, count, cameras)
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "covars": (count, 3, 3),
+        "opacities": (count,),
+        "viewmats": (cameras, 4, 4),
+        "viewmats_rs": (cameras, 4, 4),
+        "Ks": (cameras, 3, 3),
+        "backgrounds": (cameras, colors.shape[-1]),
+        **{name: (cameras, counts.get(request.camera_model, 0)) for name, counts in COEFFICIENTS.items()},
+    }
+    flat: dict[str, Any] = {}
+    if request.render_mode in ("D", "ED"):
+        flat["backgrounds"] = None  # they are of the colors
     for name, shape in shapes.items():
-        _check_tensor(name, given[name], (*batch, *shape), means.device)
-        flat[name] = given[name].reshape(scenes, *shape)
-    scales, opacities = flat["scales"].detach(), flat["opacities"].detach()
-    check_range("scales", scales, bool((scales < 0).any()), "positive values (activated, not their logarithm)")
-    outside = bool(((opacities < 0) | (opacities > 1)).any())
+        if name not in flat and (given[name] is not None or name not in OPTIONAL):
+            _check_tensor(name, given[name], (*batch, *shape), means.device)
+            flat[name] = given[name].reshape(math.prod(batch), *shape)
+    opacities = flat["opacities"].detach()
+    outside = bool(((opacities < 0) | (opacities > 1 + ROUNDING)).any())
     check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
-    for name in ("viewmats", *(["viewmats_rs"] if shutter else [])):
-        if not bool(torch.linalg.det(given[name].detach()).all()):
+    for name in ("viewmats", "viewmats_rs"):
+        if name in flat and not bool(torch.linalg.det(flat[name].detach()).all()):
             raise InputError(f"{name}: expected matrices from world to camera, got one that has no inverse.")
     if not bool(flat["Ks"].detach()[..., (0, 1), (0, 1)].all()):
         raise InputError("Ks: expected matrices with focal lengths fx and fy [px], got a singular one; correct it.")
+    flat["colors"] = colors.reshape(math.prod(batch), -1 if per_view else 1, *colors.shape[len(batch) + per_view :])
+    flat |= {name: int(given[name]) for name in ("width", "height")}
+    return request._replace(**flat, rolling_shutter=shutter, batch=batch)
+
+
+def _check_colors(request: Request, batch: tuple[int, ...], count: int, cameras: int) -> bool:
+    """Whether each camera has its own."""
     colors = request.colors
-    _check_tensor("colors", colors, None, means.device)
     tail = 1 if request.sh_degree is None else 2
-    for shape in ((*batch, count), (*batch, cameras, count)):
-        if tuple(colors.shape[:-tail]) == shape:
-            per_view = cameras if len(shape) > len(batch) + 1 else 1
-            break
-    else:
+    per_view = tuple(colors.shape[:-tail]) == (*batch, cameras, count)
+    if not per_view and tuple(colors.shape[:-tail]) != (*batch, count):
         wanted = "[..., N, D] or [..., C, N, D]" if tail == 1 else "[..., N, K, 3] or [..., C, N, K, 3]"
         raise InputError(f"colors: expected shape {wanted}, got {list(colors.shape)}.")
     least = ((request.sh_degree or 0) + 1) ** 2
@@ -111,20 +133,10 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
         raise InputError(f"colors: expected {least} or more coefficients of 3 colors, got {list(colors.shape[-2:])}.")
     if tail == 1 and not 1 <= colors.shape[-1] <= CHANNELS_MOST:
         raise InputError(f"colors: expected 1 to {CHANNELS_MOST} channels, got {colors.shape[-1]}.")
-    most = driver_of(means.device).channels.at_once - 2  # the depth and alpha are two more
+    most = driver_of(colors.device).channels.at_once - 2  # the depth and alpha are two more
     if request.absgrad and colors.shape[-1] > most:
         raise InputError(f"absgrad: expected at most {most} channels in colors with it, got {colors.shape[-1]}.")
-    flat["colors"] = colors.reshape(scenes, per_view, count, *colors.shape[-tail:])
-    if request.backgrounds is not None:
-        shape = (cameras, colors.shape[-1])
-        _check_tensor("backgrounds", request.backgrounds, (*batch, *shape), means.device)
-        flat["backgrounds"] = request.backgrounds.reshape(scenes, *shape)
-    for name, counts in COEFFICIENTS.items():
-        if given[name] is not None:
-            shape = (cameras, counts[request.camera_model])
-            _check_tensor(name, given[name], (*batch, *shape), means.device)
-            flat[name] = given[name].reshape(scenes, *shape)
-    return request._replace(**flat, rolling_shutter=shutter, batch=batch)
+    return per_view
 
 
 def _check_choices(request: Request, given: dict[str, Any]) -> str:
@@ -140,31 +152,28 @@ def _check_choices(request: Request, given: dict[str, Any]) -> str:
         raise InputError("viewmats_rs: expected None without a rolling_shutter, got some.")
     if shutter != "GLOBAL" and not (given["with_ut"] and given["viewmats_rs"] is not None):
         raise InputError(f"rolling_shutter: expected with_ut=True and viewmats_rs with {shutter}; give both.")
-    choices = {"render_mode": RENDER_MODES, "camera_model": CAMERA_MODELS}
-    choices["rasterize_mode"] = ("classic", "antialiased")
-    for name, values in choices.items():
+    for name, values in CHOICES.items():
         if given[name] not in values:
             raise InputError(f"{name}: expected one of {', '.join(values)}, got {given[name]!r:.60}.")
+    if given["with_ut"] and given["covars"] is not None:
+        raise InputError("covars: expected None where with_ut is True; give quats and scales.")
     if given["with_ut"] and request.camera_model == "ortho":
         raise InputError("camera_model: expected pinhole or fisheye where with_ut is True, got 'ortho'.")
     for name, counts in COEFFICIENTS.items():
         if given[name] is not None and not (given["with_ut"] and request.camera_model in counts):
             models = " or ".join(counts)
             raise InputError(f"{name}: expected None without with_ut=True and camera_model {models}, got coefficients.")
-    for name in ("width", "height", "channel_chunk"):
+    for name in ("width", "height", "channel_chunk", "tile_size"):
         if isinstance(given[name], bool) or not isinstance(given[name], numbers.Integral) or given[name] < 1:
             raise InputError(f"{name}: expected a whole number, at least 1, got {given[name]!r:.60}.")
-    if given["width"] * given["height"] > CAMERA_PIXELS_MOST:
+    if int(given["width"]) * int(given["height"]) > CAMERA_PIXELS_MOST:
         size = f"{given['width']} x {given['height']}"
         raise InputError(f"width, height: expected at most {CAMERA_PIXELS_MOST} pixels, got {size}; render smaller.")
-    if given["tile_size"] != TILE:
-        raise InputError(f"tile_size: expected {TILE}, got {given['tile_size']!r:.60}.")
     for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
         if not isinstance(given[name], numbers.Real) or not float(given[name]) >= 0.0:
             raise InputError(f"{name}: expected a number, at least 0, got {given[name]!r:.60}.")
-    degree = request.sh_degree
-    if isinstance(degree, bool) or not is_one_of(degree, (None, *range(5))):
-        raise InputError(f"sh_degree: expected 0 to 4 or None, got {degree!r:.60}.")
+    if isinstance(request.sh_degree, bool) or not is_one_of(request.sh_degree, (None, *range(5))):
+        raise InputError(f"sh_degree: expected 0 to 4 or None, got {request.sh_degree!r:.60}.")
     return shutter.removeprefix("GLOBAL")
 
 

@@ -15,8 +15,8 @@ from warp_splat.gsplat.seen import see
 
 def rasterization(
     means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
+    quats: torch.Tensor | None,
+    scales: torch.Tensor | None,
     opacities: torch.Tensor,
     colors: torch.Tensor,
     viewmats: torch.Tensor,
@@ -57,7 +57,7 @@ def rasterization(
     Args:
         means: [..., N, 3] float32, world units, like all tensors on one device.
         quats: [..., N, 4], w first, any norm but zero.
-        scales: [..., N, 3], positive.
+        scales: [..., N, 3]; their signs do not matter.
         opacities: [..., N], 0 to 1.
         colors: [..., (C,) N, D], D from 1 to 512; or with ``sh_degree`` coefficients [..., (C,) N, K, 3].
         viewmats: world to camera, [..., C, 4, 4].
@@ -70,8 +70,8 @@ def rasterization(
         eps2d: added to both variances on the image [px^2].
         sh_degree: of the harmonics that are used, 0 to 4; None: ``colors`` are colors.
         packed: what meta holds per Gaussian are only those that are seen, [nnz, ...]; else all, [..., C, N, ...].
-        tile_size: 16.
-        backgrounds: [..., C, D].
+        tile_size: of no effect: tiles have 16 pixels, as meta says.
+        backgrounds: [..., C, D]; of no effect on a depth.
         render_mode: "RGB", "D" (sum of weight times z), "ED" (mean z), "RGB+D" or "RGB+ED".
         sparse_grad: the gradients of means, quats and scales are sparse tensors; only where ``packed``.
         absgrad: ``backward`` writes the sums of the magnitudes of the pixels' gradients to ``meta["means2d"].absgrad``
@@ -81,7 +81,8 @@ def rasterization(
         distributed: must be False.
         camera_model: "pinhole", "ortho" or "fisheye" (equidistant, if it has no coefficients).
         segmented: of no effect: it chooses how gsplat sorts.
-        covars: must be None.
+        covars: covariances [..., N, 3, 3], whose upper triangles are read, instead of ``quats`` and ``scales``, which
+            may be None then; not with ``with_ut``.
         with_ut: project by an unscented transform (Wu et al. 2025), which sees through lenses; not with "ortho".
         with_eval3d: must be False.
         radial_coeffs: OpenCV's k1 to k6, [..., C, 6], of a fisheye k1 to k4, [..., C, 4]; only with ``with_ut``, like
@@ -101,7 +102,8 @@ def rasterization(
     given = dict(locals())
     drawn: list[torch.Tensor] = []
     if sparse_grad and packed:
-        given |= {name: thin(given[name], drawn) for name in ("means", "quats", "scales")}
+        shapes = ("means", "quats", "scales", "covars")
+        given |= {name: thin(given[name], drawn) for name in shapes if given[name] is not None}
     request = check_request(Request(**{name: given[name] for name in Request._fields[:-1]}), given)
     seen = see(request)
     drawn.append(seen.drawn)

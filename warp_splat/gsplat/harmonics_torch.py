@@ -1,6 +1,8 @@
-"""Colors of Gaussians as cameras see them, in torch: differentiable in the viewing direction, hence in the camera."""
+"""Real spherical harmonics in torch: differentiable in the viewing direction, hence in the camera."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 
@@ -15,31 +17,40 @@ def colors_of(request: Request, seen: Seen) -> torch.Tensor:
     centers = torch.linalg.inv(request.viewmats)[..., :3, 3]
     if request.viewmats_rs is not None:
         centers = 0.5 * (centers + torch.linalg.inv(request.viewmats_rs)[..., :3, 3])
-    rays = torch.nn.functional.normalize(request.means[:, None] - centers[:, :, None], dim=-1)
-    basis = torch.stack(_basis(*rays.unbind(-1), request.sh_degree), -1)
-    colors = (basis[..., None] * request.colors[..., : basis.shape[-1], :]).sum(-2)
-    return torch.where(seen.drawn[..., None], (colors + 0.5).clamp_min(0.0), 0.0)
+    rays = request.means[:, None] - centers[:, :, None]
+    colors = spherical_harmonics(request.sh_degree, rays, request.colors) + 0.5
+    return torch.where(seen.drawn[..., None], colors.clamp_min(0.0), 0.0)
 
 
-def _basis(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, degree: int) -> list[torch.Tensor]:
-    """Real spherical harmonics of unit vectors (Sloan 2008, appendix A2), with the signs of the trainers' files."""
-    found = [torch.full_like(x, 0.28209479177387814)]
-    if degree > 0:
-        found += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    xx, yy, zz = x * x, y * y, z * z
-    even, odd = xx - yy, 2 * x * y  # of twice the azimuth
-    if degree > 1:
-        found += [0.5462742152960396 * odd, -1.0925484305920792 * y * z, 0.31539156525252005 * (3 * zz - 1)]
-        found += [-1.0925484305920792 * x * z, 0.5462742152960396 * even]
-    even3, odd3 = x * even - y * odd, x * odd + y * even
-    if degree > 2:
-        found += [-0.5900435899266435 * odd3, 1.445305721320277 * z * odd, -0.4570457994644658 * y * (5 * zz - 1)]
-        found += [0.3731763325901154 * z * (5 * zz - 3), -0.4570457994644658 * x * (5 * zz - 1)]
-        found += [1.445305721320277 * z * even, -0.5900435899266435 * even3]
-    if degree > 3:
-        found += [0.6258357354491763 * (x * odd3 + y * even3), -1.7701307697799304 * z * odd3]
-        found += [0.47308734787878004 * odd * (7 * zz - 1), -0.6690465435572892 * y * z * (7 * zz - 3)]
-        found += [0.10578554691520431 * (35 * zz * zz - 30 * zz + 3), -0.6690465435572892 * x * z * (7 * zz - 3)]
-        found += [0.47308734787878004 * even * (7 * zz - 1), -1.7701307697799304 * z * even3]
-        found += [0.6258357354491763 * (x * even3 - y * odd3)]
-    return found
+def spherical_harmonics(
+    degrees_to_use: int, dirs: torch.Tensor, coeffs: torch.Tensor, masks: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Sums [..., 3] of harmonics up to a degree, as gsplat's function of this name.
+
+    Args:
+        degrees_to_use: 0 or more.
+        dirs: directions [..., 3], of any length.
+        coeffs: [..., K, 3].
+        masks: where to compute [...]; elsewhere the result is 0.
+    """
+    basis = _basis(*torch.nn.functional.normalize(dirs, dim=-1).unbind(-1), degrees_to_use)
+    sums = (basis[..., None] * coeffs[..., : basis.shape[-1], :]).sum(-2)
+    return sums if masks is None else torch.where(masks[..., None], sums, 0.0)
+
+
+def _basis(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, degree: int) -> torch.Tensor:
+    """At unit vectors, [..., (degree + 1)^2]: the recurrences of Sloan (2013), with the signs of the trainers' files.
+
+    ``even`` and ``odd`` are the cosine and the sine of m times the azimuth, times the m-th power of their radius.
+    """
+    found = {}
+    even, odd, first = torch.ones_like(x), torch.zeros_like(x), 1.0
+    for m in range(degree + 1):
+        before, here = torch.zeros_like(z), torch.full_like(z, first)  # Legendre's functions, of the last two degrees
+        for band in range(m, degree + 1):
+            norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
+            scaled = norm * (math.sqrt(2) if m else 1) * here
+            found[band, m], found[band, -m] = scaled * even, scaled * odd if m else scaled
+            before, here = here, ((2 * band + 1) * z * here - (band + m) * before) / (band - m + 1)
+        even, odd, first = x * even - y * odd, x * odd + y * even, -(2 * m + 1) * first
+    return torch.stack([found[band, m] for band in range(degree + 1) for m in range(-band, band + 1)], -1)

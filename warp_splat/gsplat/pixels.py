@@ -73,7 +73,7 @@ def _draw_view(
     device, count = colors.device, len(colors)
     wanted = request.render_mode.split("+")
     colors = colors if "RGB" in wanted else colors.new_zeros(count, 0)
-    behind = colors.new_zeros(colors.shape[1]) if behind is None or "RGB" not in wanted else behind
+    behind = colors.new_zeros(colors.shape[1]) if behind is None else behind
     spare = max(3 - colors.shape[1], 0)
     first = torch.cat([colors[:, :3], colors.new_zeros(count, spare)], 1)
     background = torch.cat([behind[:3], behind.new_zeros(spare)])

@@ -37,16 +37,14 @@ def see(request: Request) -> Seen:
         points = moved(request, request.means.double()[:, None], half.double()).to(points.dtype)
     z = points[..., 2]
     ahead = (z > request.near_plane) & (z < request.far_plane) & (request.quats != 0).any(-1)[:, None]
-    axes = rotations(request.quats) * request.scales[:, :, None]
     if request.with_ut:
-        places, xx, xy, yy, sharp, seen = see_points(request, axes)
+        places, xx, xy, yy, sharp, seen = see_points(request, _axes(request))
         ahead = ahead & seen
     else:
         points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
         places, to_x, to_y = _LENSES[request.camera_model](request, points)
-        a, b = (rows_turned(rows_turned(row, turn[:, :, None]), axes[:, None]) for row in (to_x, to_y))
-        xx, xy, yy = (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1)
-        sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
+        rows = [rows_turned(row, turn[:, :, None]) for row in (to_x, to_y)]
+        xx, xy, yy, sharp = _variances(request, *rows)
     wide = sharp + request.eps2d * (xx + yy) + request.eps2d**2
     xx, yy = xx + request.eps2d, yy + request.eps2d
     opacities = request.opacities[:, None].expand_as(z)
@@ -74,6 +72,25 @@ def see(request: Request) -> Seen:
         radii,
         drawn,
     )
+
+
+def _axes(request: Request) -> torch.Tensor:
+    """R S, [S, N, 3, 3]."""
+    return rotations(request.quats) * request.scales[:, :, None]
+
+
+def _variances(request: Request, to_x: torch.Tensor, to_y: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """xx, xy, yy on the image [S, C, N] px^2 and their determinant, from the rows [S, C, N, 3] of J V."""
+    if request.covars is None:
+        a, b = (rows_turned(row, _axes(request)[:, None]) for row in (to_x, to_y))
+        sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
+        return (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1), sharp
+    covars = (request.covars.triu() + request.covars.triu(1).mT).double()[:, None]
+    to_x, to_y = to_x.double(), to_y.double()  # in which a flat Gaussian's determinant survives
+    across = rows_turned(to_x, covars)
+    xx, xy, yy = (across * to_x).sum(-1), (across * to_y).sum(-1), (rows_turned(to_y, covars) * to_y).sum(-1)
+    found = (xx, xy, yy, (xx * yy - xy * xy).clamp_min(0.0))
+    return tuple(part.to(request.means.dtype) for part in found)
 
 
 def _numbers(request: Request) -> tuple[torch.Tensor, ...]:

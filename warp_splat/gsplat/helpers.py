@@ -1,0 +1,53 @@
+"""What gsplat's strategies call beside its ``rasterization``, in torch, with its names and arguments."""
+
+from __future__ import annotations
+
+import torch
+
+from warp_splat.gsplat.turns import rotations, rows_turned
+
+
+def quat_scale_to_covar_preci(
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    compute_covar: bool = True,
+    compute_preci: bool = True,
+    triu: bool = False,
+) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """Covariances (R S)(R S)' and their inverses, [..., 3, 3] each, or None where not asked for.
+
+    Args:
+        quats: [..., 4], w first, any norm but zero.
+        scales: [..., 3], world units.
+        compute_covar: whether to compute the first.
+        compute_preci: whether to compute the second.
+        triu: only their upper triangles, row by row, [..., 6].
+    """
+    turns, found = rotations(quats), []
+    for asked, lengths in ((compute_covar, scales), (compute_preci, 1 / scales)):
+        axes = turns * lengths[..., None, :]
+        matrices = rows_turned(axes, axes.mT[..., None, :, :])
+        matrices = matrices[(..., *torch.triu_indices(3, 3))] if triu else matrices
+        found.append(matrices if asked else None)
+    return found[0], found[1]
+
+
+def compute_relocation(
+    opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Opacities [N] and scales [N, 3] of Gaussians of which several at one place look like one.
+
+    Equation 9 of Kheradmand et al. 2024, 3D Gaussian Splatting as Markov Chain Monte Carlo.
+
+    Args:
+        opacities: of the one, [N], activated.
+        scales: likewise, [N, 3].
+        ratios: how many there shall be, [N]; held between 1 and the size of the table.
+        binoms: binomial coefficients, [n_max, n_max], as ``MCMCStrategy`` keeps them.
+    """
+    ratios = ratios.clamp(1, len(binoms)).long()
+    shares = 1 - (1 - opacities.double()).pow(1 / ratios)  # in float64: large terms of both signs follow
+    order = torch.arange(1, len(binoms) + 1, device=binoms.device)
+    signs = 1 - 2 * ((order - 1) % 2)
+    terms = binoms.double().cumsum(0)[ratios - 1] * signs / order.sqrt() * shares[:, None] ** order
+    return shares.to(opacities), scales * (opacities / terms.sum(1)).to(scales)[:, None]
