@@ -1,6 +1,8 @@
 """The handlers of the viewer, with the place of browsers taken by a fake, and its command."""
 
+import socket
 from contextlib import contextmanager, nullcontext
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -28,6 +30,46 @@ def viewer(fake_viser):
     with server.Viewer(draw, lambda: model.parameters["means"], scene, 8080) as viewer:
         yield viewer
     assert viewer.server.stopped
+
+
+@pytest.fixture(scope="module")
+def served():
+    """The port of a server of viser's."""
+    made = server._serve(server.free_port(8080))
+    yield made.get_port()
+    made.stop()
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "open"),
+    [
+        ("127.0.0.1:{}", "http://127.0.0.1:{}", True),
+        ("localhost:9000", "http://localhost:9000", True),  # through ssh -L
+        ("192.168.0.7:{}", "https://192.168.0.7:{}", True),
+        (socket.gethostname() + ":{}", f"http://{socket.gethostname()}:{{}}", True),
+        ("127.0.0.1:{}", "http://evil.example", False),
+        ("127.0.0.1:{}", "http://127.0.0.1:1", False),  # another server on this machine
+        ("127.0.0.1:{}", "null", False),
+        ("127.0.0.1:{}", None, False),
+        ("evil.example:{}", "http://evil.example:{}", False),  # a name that was made to point here
+        ("[:{}", "http://[:{}", False),
+    ],
+)
+def test_only_its_own_page_may_connect(served, host, origin, open):
+    request = f"GET / HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    request += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    request += f"Sec-WebSocket-Protocol: viser-v{version('viser')}\r\n"
+    request += f"Origin: {origin}\r\n\r\n" if origin else "\r\n"
+    with socket.create_connection(("127.0.0.1", served)) as connection:
+        connection.sendall(request.replace("{}", str(served)).encode())
+        assert connection.recv(4096).startswith(b"HTTP/1.1 101" if open else b"HTTP/1.1 403")
+
+
+@pytest.mark.parametrize(("host", "status"), [("127.0.0.1", b"200"), ("evil.example", b"403")])
+def test_no_other_name_gets_the_page(served, host, status):
+    with socket.create_connection(("127.0.0.1", served)) as connection:
+        connection.sendall(f"GET / HTTP/1.1\r\nHost: {host}:{served}\r\n\r\n".encode())
+        assert connection.recv(4096).startswith(b"HTTP/1.1 " + status)
 
 
 def test_frames_are_quick_while_moving_and_sharp_at_rest(viewer, monkeypatch):

@@ -198,6 +198,9 @@ def _serve(port: int) -> viser.ViserServer:
     import rich  # noqa: PLC0415 - of viser, which takes half a second to load
     import viser  # noqa: PLC0415
 
+    from warp_splat.viewer.own_page import only_own_page  # noqa: PLC0415 - of viser as well
+
     rich.get_console().quiet = True
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a browser that left a moment ago
-    return viser.ViserServer(host=HOST, port=port, label="warp_splat", verbose=False)
+    with only_own_page():
+        return viser.ViserServer(host=HOST, port=port, label="warp_splat", verbose=False)
