@@ -1,5 +1,6 @@
 """Photographs and videos to scenes, against the cameras that took them."""
 
+import ctypes
 import json
 import os
 import re
@@ -75,6 +76,15 @@ def test_the_cameras_are_found(photos, scene):
     assert errors.max() < 0.01  # the camera goes along 2 units
     for view in views:
         assert abs(view.camera.fx / room.FOCAL - 1) < 0.01 and abs(view.camera.fy / room.FOCAL - 1) < 0.01
+
+
+def test_features_are_compared_without_blas(scene, monkeypatch):
+    """pycolmap's has no locks, and gives two threads the same memory now and then; else it takes one thread."""
+    library = ctypes.CDLL(sys.modules["pycolmap._core"].__file__)
+    assert ctypes.c_int.in_dll(library, "_ZN5faiss31distance_compute_blas_thresholdE").value == 2**31 - 1
+    assert stages.avoid_blas()
+    monkeypatch.setattr(stages, "FAISS_THRESHOLD", "no_such_name")
+    assert not stages.avoid_blas()
 
 
 def test_photographs_may_keep_their_lens(photos, scene, tmp_path):

@@ -6,6 +6,7 @@ model or a folder of images gets its name only when it is complete.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import sys
@@ -23,6 +24,7 @@ from warp_splat.scene.colmap_library import pycolmap
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
+FAISS_THRESHOLD = "_ZN5faiss31distance_compute_blas_thresholdE"  # queries from which on it calls BLAS
 # Pairs are matched in blocks of BLOCK x BLOCK images, and Ctrl-C is heard in between. Tried:
 # - 36 instead of 42 s for 1,225 pairs of 540 x 960 px: pycolmap's 50
 BLOCK = 10
@@ -76,9 +78,27 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
         run_watched("features", len(numbers), work, found, config.quiet)
 
 
+def avoid_blas() -> bool:
+    """Have FAISS, which compares features inside of pycolmap, do without BLAS from now on; whether it can be told so.
+
+    The OpenBLAS in pycolmap's wheels has no locks. Two threads that call it may get the same memory. It says "Bad
+    memory unallocation!", or nothing, and matches are wrong. Tried, for 1,225 pairs of 264 x 248 px on two threads:
+    - 8.3 s with BLAS, other matches than those of one thread in 3 of 14 runs
+    - 10.3 s without, always the matches of one thread, which takes 10.7 s
+    - 53.8 s by COLMAP's own comparison, which finds 1.6 % more
+    """
+    try:
+        library = ctypes.CDLL(sys.modules["pycolmap._core"].__file__)
+        ctypes.c_int.in_dll(library, FAISS_THRESHOLD).value = 2**31 - 1
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def match(database: Path, matching: str, config: SfmConfig) -> int:
     """Match all pairs of photographs or, "sequential", neighbors by name; returns how many pairs fit together."""
-    options = pycolmap.FeatureMatchingOptions(num_threads=config.threads, use_gpu=False)
+    threads = config.threads if avoid_blas() else 1
+    options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
     with opened(database) as connection:
