@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-from test_gsplat import GRADIENT, SKEWLESS, call_of
-from test_rasterize import relative_error
+from test_gsplat import call_of, check_agreement, theirs
 
 from warp_splat import InputError
 from warp_splat.gsplat import rasterization
@@ -49,11 +48,7 @@ def opencv(points, Ks, corner, radial_coeffs=None, tangential_coeffs=None, thin_
 
 def textbook(means, quats, scales, viewmats, Ks, corner, **coefficients):
     """Means and covariances of what seven points show (Wan and van der Merwe 2000)."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    matrix = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    matrix += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    matrix += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    axes = torch.stack(matrix, 1).unflatten(1, (3, 3)) * scales[:, None]
+    axes = theirs._quat_to_rotmat(quats) * scales[:, None]
     spread = ALPHA**2 * (3 + KAPPA)
     offsets = spread**0.5 * axes.mT
     points = torch.cat([means[:, None], means[:, None] + offsets, means[:, None] - offsets], 1)
@@ -78,23 +73,8 @@ def test_means_and_covariances(model, coefficients):
     blurred = sharp + BLUR * torch.eye(2, dtype=torch.float64)
     conic = torch.linalg.inv(blurred).flatten(2)[..., [0, 1, 3]]
     share = (torch.linalg.det(sharp) / torch.linalg.det(blurred)).sqrt()
-    drawn = (meta["radii"] > 0).all(-1)
-    assert drawn.sum() > 20
     truth = {"means2d": mean, "depths": depth, "conics": conic, "opacities": call["opacities"].detach() * share}
-    for name, expected in truth.items():
-        found, generator = meta[name], torch.Generator().manual_seed(1)
-        upstream = torch.randn(found.shape, generator=generator) * drawn.view(*drawn.shape, *[1] * (found.dim() - 2))
-        assert relative_error((found * upstream).detach(), (expected * upstream).detach()) < GRADIENT, name
-        one = torch.autograd.grad(found, list(leaves.values()), upstream, retain_graph=True, allow_unused=True)
-        other = torch.autograd.grad(
-            expected, list(exact.values()), upstream.double(), retain_graph=True, materialize_grads=True
-        )
-        for leaf, gradient, wanted in zip(leaves, one, other, strict=True):
-            if gradient is None or not wanted.any():
-                assert not wanted.any(), (name, leaf)
-                continue
-            kept = wanted * SKEWLESS if leaf == "Ks" else wanted
-            assert relative_error(gradient, kept) < GRADIENT, (name, leaf)
+    check_agreement(truth, meta, leaves, exact)
 
 
 def test_of_small_gaussians_it_is_the_linear_projection():

@@ -62,7 +62,6 @@ class Request(NamedTuple):
     packed: bool
     backgrounds: torch.Tensor | None  # [S, C, D]
     render_mode: str
-    sparse_grad: bool
     absgrad: bool
     rasterize_mode: str
     camera_model: str

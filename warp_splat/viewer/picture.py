@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 import torch
-from torch.nn import functional
+from PIL import Image
 
 from warp_splat.color import to_bytes
 from warp_splat.config import NEAR
@@ -75,11 +75,8 @@ def overlay(frame: np.ndarray, photograph: np.ndarray, box: Box, opacity: float)
         box: where it lies; inside of the frame.
         opacity: of the photograph, 0..1.
     """
-    planes = torch.from_numpy(photograph).permute(2, 0, 1)[None].float()
-    if planes.shape[2:] != (box.height, box.width):
-        planes = functional.interpolate(planes, (box.height, box.width), mode="bilinear", antialias=True)
-    scaled = planes[0].permute(1, 2, 0).numpy()
     result = frame.copy()
     inside = result[box.top : box.top + box.height, box.left : box.left + box.width]
-    inside[:] = np.rint((1.0 - opacity) * inside + opacity * scaled)
+    scaled = Image.fromarray(photograph).resize((box.width, box.height), Image.Resampling.BILINEAR)
+    inside[:] = Image.blend(Image.fromarray(inside), scaled, opacity)
     return result
