@@ -12,7 +12,7 @@ import torch
 from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
 from warp_splat.gsplat.arguments import Request
 from warp_splat.gsplat.shutters import moved
-from warp_splat.gsplat.sigma_points import TINY, see_points
+from warp_splat.gsplat.sigma_points import TINY, on_image, see_points
 from warp_splat.gsplat.turns import rotations, rows_turned
 
 
@@ -42,8 +42,12 @@ def see(request: Request) -> Seen:
         ahead = ahead & seen
     else:
         points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
-        places, to_x, to_y = _LENSES[request.camera_model](request, points)
-        rows = [rows_turned(row, turn[:, :, None]) for row in (to_x, to_y)]
+        u, v, *slopes = _LENSES[request.camera_model](request, *points.unbind(-1))
+        places = on_image(request, u, v)
+        rows = [
+            rows_turned(request.Ks[..., axis, axis, None, None] * torch.stack(slope, -1), turn[:, :, None])
+            for axis, slope in enumerate(slopes)
+        ]
         xx, xy, yy, sharp = _variances(request, *rows)
     wide = sharp + request.eps2d * (xx + yy) + request.eps2d**2
     xx, yy = xx + request.eps2d, yy + request.eps2d
@@ -56,8 +60,8 @@ def see(request: Request) -> Seen:
         extents = reach[..., None] * torch.stack([xx, yy], -1).sqrt()
         radii = extents.ceil().clamp_max(2**30)
         size = radii.new_tensor([request.width, request.height])
-        on_image = ((places + radii > 0) & (places - radii < size)).all(-1)
-        drawn = ahead & on_image & (wide > 0) & (opacities >= ALPHA_MIN)
+        reaching = ((places + radii > 0) & (places - radii < size)).all(-1)
+        drawn = ahead & reaching & (wide > 0) & (opacities >= ALPHA_MIN)
         drawn &= (radii > 0).all(-1) & (radii > request.radius_clip).any(-1)
         extents = torch.where(drawn[..., None], extents, 0.0)
         radii = torch.where(drawn[..., None], radii, 0.0).int()
@@ -93,47 +97,32 @@ def _variances(request: Request, to_x: torch.Tensor, to_y: torch.Tensor) -> tupl
     return tuple(part.to(request.means.dtype) for part in found)
 
 
-def _numbers(request: Request) -> tuple[torch.Tensor, ...]:
-    """Focal lengths and principal points, [S, C, 1] each."""
-    Ks = request.Ks
-    return Ks[..., 0, 0, None], Ks[..., 1, 1, None], Ks[..., 0, 2, None], Ks[..., 1, 2, None]
-
-
-def _pinhole(request: Request, points: torch.Tensor):
-    """Where points are seen, and the rows of the derivative; x/z in it stays near the image."""
-    fx, fy, cx, cy = _numbers(request)
-    x, y, z = points.unbind(-1)
+def _pinhole(request: Request, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor):
+    """Where points are seen [focal lengths], and the slopes of both; x/z in these stays near the image."""
     u, v = x / z, y / z
-    places = torch.stack([fx * u + cx, fy * v + cy], -1)
     held = []
-    for slope, focal, middle, size in ((u, fx, cx, request.width), (v, fy, cy, request.height)):
+    for axis, (place, size) in enumerate(((u, request.width), (v, request.height))):
+        focal, middle = request.Ks[..., axis, axis, None], request.Ks[..., axis, 2, None]
         margin = FRUSTUM_MARGIN * 0.5 * size
-        held.append(slope.minimum((size - middle + margin) / focal).maximum(-(middle + margin) / focal))
-    none = torch.zeros_like(z)
-    to_x = torch.stack([fx / z, none, -fx * held[0] / z], -1)
-    return places, to_x, torch.stack([none, fy / z, -fy * held[1] / z], -1)
+        held.append(place.minimum((size - middle + margin) / focal).maximum(-(middle + margin) / focal))
+    none, near = torch.zeros_like(z), 1 / z
+    return u, v, (near, none, -held[0] * near), (none, near, -held[1] * near)
 
 
-def _ortho(request: Request, points: torch.Tensor):
+def _ortho(_request: Request, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor):
     """Parallel rays; focal lengths are pixels per world unit."""
-    fx, fy, cx, cy = _numbers(request)
-    x, y, z = points.unbind(-1)
     none, one = torch.zeros_like(z), torch.ones_like(z)
-    to_x, to_y = torch.stack([fx * one, none, none], -1), torch.stack([none, fy * one, none], -1)
-    return torch.stack([fx * x + cx, fy * y + cy], -1), to_x, to_y
+    return x, y, (one, none, none), (none, one, none)
 
 
-def _fisheye(request: Request, points: torch.Tensor):
+def _fisheye(_request: Request, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor):
     """Equidistant: the distance from the principal point is the angle to the axis (Kannala and Brandt 2006)."""
-    fx, fy, cx, cy = _numbers(request)
-    x, y, z = points.unbind(-1)
     square = (x * x + y * y).clamp_min(TINY)
     beside, per_ray = square.sqrt(), 1 / (square + z * z)
     share = torch.atan2(beside, z) / beside
     bend = (z * per_ray - share) / square
-    to_x = torch.stack([fx * (share + x * x * bend), fx * x * y * bend, -fx * x * per_ray], -1)
-    to_y = torch.stack([fy * x * y * bend, fy * (share + y * y * bend), -fy * y * per_ray], -1)
-    return torch.stack([fx * x * share + cx, fy * y * share + cy], -1), to_x, to_y
+    to_x = (share + x * x * bend, x * y * bend, -x * per_ray)
+    return x * share, y * share, to_x, (to_x[1], share + y * y * bend, -y * per_ray)
 
 
 _LENSES = {"pinhole": _pinhole, "ortho": _ortho, "fisheye": _fisheye}

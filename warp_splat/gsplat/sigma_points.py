@@ -52,10 +52,16 @@ def see_points(request: Request, axes: torch.Tensor) -> tuple[torch.Tensor, ...]
 
 
 def _look(request: Request, points: torch.Tensor) -> Points:
-    """Images of points in the camera; what falls far outside of the picture does not count as seen."""
-    places, seen = (_fisheye if request.camera_model == "fisheye" else _pinhole)(request, points)
+    """Images of points in the camera; what falls far outside of the picture does not count as seen.
+
+    What lies behind the camera is at (0, 0), as in gsplat.
+    """
+    ahead = points[..., 2] > 0
+    points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
+    u, v, clear = (_fisheye if request.camera_model == "fisheye" else _pinhole)(request, *points.unbind(-1))
+    places = torch.where(ahead[..., None], on_image(request, u, v), 0.0)
     low = -MARGIN * places.new_tensor([request.width, request.height])
-    return places, seen & ((places >= low) & (places < -low / MARGIN - low)).all(-1)
+    return places, ahead & clear & ((places >= low) & (places < -low / MARGIN - low)).all(-1)
 
 
 def _numbers(request: Request, name: str, count: int) -> tuple[torch.Tensor, ...]:
@@ -65,38 +71,31 @@ def _numbers(request: Request, name: str, count: int) -> tuple[torch.Tensor, ...
     return given.double()[:, :, None, None].unbind(-1)
 
 
-def _placed(request: Request, u: torch.Tensor, v: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
-    """Pixels of what is seen (u, v) focal lengths from the principal point; the rest goes to (0, 0), as in gsplat."""
-    Ks = request.Ks.double()[:, :, None, None]
-    places = torch.stack([Ks[..., 0, 0] * u + Ks[..., 0, 2], Ks[..., 1, 1] * v + Ks[..., 1, 2]], -1)
-    return torch.where(seen[..., None], places, 0.0)
+def on_image(request: Request, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Pixels [S, C, ..., 2] of what is seen (u, v) focal lengths from the principal point."""
+    Ks = request.Ks.to(u.dtype)[(slice(None), slice(None), *[None] * (u.dim() - 2))]
+    return torch.stack([Ks[..., 0, 0] * u + Ks[..., 0, 2], Ks[..., 1, 1] * v + Ks[..., 1, 2]], -1)
 
 
-def _pinhole(request: Request, points: torch.Tensor) -> Points:
-    """With OpenCV's distortion: radial, tangential, and four coefficients of a thin prism."""
+def _pinhole(request: Request, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """With OpenCV's distortion: radial, tangential, and four of a thin prism; and whether it is far from a fold."""
     k1, k2, k3, k4, k5, k6 = _numbers(request, "radial_coeffs", 6)
     p1, p2 = _numbers(request, "tangential_coeffs", 2)
     s1, s2, s3, s4 = _numbers(request, "thin_prism_coeffs", 4)
-    ahead = points[..., 2] > 0
-    x, y, z = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     coefficients = (k1, k2, p1, p2, k3, k4, k5, k6)
     u, v = perspective(coefficients, x, y, z)
     r2 = (x * x + y * y) / (z * z)
-    places = _placed(request, u + r2 * (s1 + r2 * s2), v + r2 * (s3 + r2 * s4), ahead)
-    return places, ahead & (radial_of(coefficients, r2) > LEAST_RADIAL)
+    return u + r2 * (s1 + r2 * s2), v + r2 * (s3 + r2 * s4), radial_of(coefficients, r2) > LEAST_RADIAL
 
 
-def _fisheye(request: Request, points: torch.Tensor) -> Points:
+def _fisheye(request: Request, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """A polynomial of the angle from the axis, which ends where it folds or the image does (OpenCV's)."""
     k1, k2, k3, k4 = _numbers(request, "radial_coeffs", 4)
-    ahead = points[..., 2] > 0
-    x, y, z = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     beside = (x * x + y * y).clamp_min(TINY).sqrt()
     angle = torch.atan2(beside, z).minimum(_largest_angles(request))
     square = angle * angle
     ratio = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))) / beside
-    seen = ahead & (ratio > 0)
-    return _placed(request, ratio * x, ratio * y, seen), seen
+    return ratio * x, ratio * y, ratio > 0
 
 
 def _largest_angles(request: Request) -> torch.Tensor:
