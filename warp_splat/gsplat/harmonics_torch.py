@@ -41,16 +41,24 @@ def spherical_harmonics(
 def _basis(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, degree: int) -> torch.Tensor:
     """At unit vectors, [..., (degree + 1)^2]: the recurrences of Sloan (2013), with the signs of the trainers' files.
 
-    ``even`` and ``odd`` are the cosine and the sine of m times the azimuth, times the m-th power of their radius.
+    ``even`` and ``odd`` are the cosine and the sine of m times the azimuth, times the m-th power of their radius. What
+    is the same in all directions is a number.
     """
     found = {}
-    even, odd, first = torch.ones_like(x), torch.zeros_like(x), 1.0
+    even, odd, first = x, y, 1.0
     for m in range(degree + 1):
-        before, here = torch.zeros_like(z), torch.full_like(z, first)  # Legendre's functions, of the last two degrees
+        before, here = 0.0, first  # Legendre's functions of the last two degrees
         for band in range(m, degree + 1):
             norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
-            scaled = norm * (math.sqrt(2) if m else 1) * here
-            found[band, m], found[band, -m] = scaled * even, scaled * odd if m else scaled
-            before, here = here, ((2 * band + 1) * z * here - (band + m) * before) / (band - m + 1)
-        even, odd, first = x * even - y * odd, x * odd + y * even, -(2 * m + 1) * first
+            if m == 0:
+                found[band, 0] = norm * here
+            else:
+                scaled = math.sqrt(2) * norm * here
+                found[band, m], found[band, -m] = scaled * even, scaled * odd
+            slope, last = (2 * band + 1) / (band - m + 1), (band + m) / (band - m + 1)
+            before, here = here, slope * here * z - last * before
+        if m > 0:
+            even, odd = x * even - y * odd, x * odd + y * even
+        first *= -(2 * m + 1)
+    found[0, 0] = torch.full_like(x, found[0, 0])
     return torch.stack([found[band, m] for band in range(degree + 1) for m in range(-band, band + 1)], -1)

@@ -44,8 +44,9 @@ def see(request: Request) -> Seen:
         points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
         u, v, *slopes = _LENSES[request.camera_model](request, *points.unbind(-1))
         places = on_image(request, u, v)
+        focal = request.Ks[..., (0, 1), (0, 1), None, None, None]  # on the side of the matrix: it has fewer entries
         rows = [
-            rows_turned(request.Ks[..., axis, axis, None, None] * torch.stack(slope, -1), turn[:, :, None])
+            rows_turned(torch.stack(slope, -1), focal[:, :, axis] * turn[:, :, None])
             for axis, slope in enumerate(slopes)
         ]
         xx, xy, yy, sharp = _variances(request, *rows)
@@ -86,7 +87,8 @@ def _axes(request: Request) -> torch.Tensor:
 def _variances(request: Request, to_x: torch.Tensor, to_y: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """xx, xy, yy on the image [S, C, N] px^2 and their determinant, from the rows [S, C, N, 3] of J V."""
     if request.covars is None:
-        a, b = (rows_turned(row, _axes(request)[:, None]) for row in (to_x, to_y))
+        axes = _axes(request)[:, None]
+        a, b = rows_turned(to_x, axes), rows_turned(to_y, axes)
         sharp = torch.linalg.cross(a, b).square().sum(-1)  # the determinant, without cancellation
         return (a * a).sum(-1), (a * b).sum(-1), (b * b).sum(-1), sharp
     covars = (request.covars.triu() + request.covars.triu(1).mT).double()[:, None]
