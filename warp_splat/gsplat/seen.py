@@ -12,7 +12,7 @@ import torch
 from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
 from warp_splat.gsplat.arguments import Request
 from warp_splat.gsplat.shutters import moved
-from warp_splat.gsplat.sigma_points import TINY, on_image, see_points
+from warp_splat.gsplat.sigma_points import TINY, pixels_at, see_points
 from warp_splat.gsplat.turns import rotations, rows_turned
 
 
@@ -43,7 +43,7 @@ def see(request: Request) -> Seen:
     else:
         points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
         u, v, *slopes = _LENSES[request.camera_model](request, *points.unbind(-1))
-        places = on_image(request, u, v)
+        places = pixels_at(request, u, v)
         focal = request.Ks[..., (0, 1), (0, 1), None, None, None]  # on the side of the matrix: it has fewer entries
         rows = [
             rows_turned(torch.stack(slope, -1), focal[:, :, axis] * turn[:, :, None])

@@ -59,7 +59,7 @@ def _look(request: Request, points: torch.Tensor) -> Points:
     ahead = points[..., 2] > 0
     points = torch.where(ahead[..., None], points, points.new_tensor([0.0, 0.0, 1.0]))
     u, v, clear = (_fisheye if request.camera_model == "fisheye" else _pinhole)(request, *points.unbind(-1))
-    places = torch.where(ahead[..., None], on_image(request, u, v), 0.0)
+    places = torch.where(ahead[..., None], pixels_at(request, u, v), 0.0)
     low = -MARGIN * places.new_tensor([request.width, request.height])
     return places, ahead & clear & ((places >= low) & (places < -low / MARGIN - low)).all(-1)
 
@@ -71,7 +71,7 @@ def _numbers(request: Request, name: str, count: int) -> tuple[torch.Tensor, ...
     return given.double()[:, :, None, None].unbind(-1)
 
 
-def on_image(request: Request, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+def pixels_at(request: Request, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     """Pixels [S, C, ..., 2] of what is seen (u, v) focal lengths from the principal point."""
     Ks = request.Ks.to(u.dtype)[(slice(None), slice(None), *[None] * (u.dim() - 2))]
     return torch.stack([Ks[..., 0, 0] * u + Ks[..., 0, 2], Ks[..., 1, 1] * v + Ks[..., 1, 2]], -1)
