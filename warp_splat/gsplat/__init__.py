@@ -1,4 +1,7 @@
-"""gsplat's function on this renderer, with its arguments and its results, and what its strategies call beside it."""
+"""gsplat's function on this renderer, with its arguments and its results.
+
+And what its strategies call beside it.
+"""
 
 from warp_splat.gsplat.call import rasterization
 from warp_splat.gsplat.harmonics_torch import spherical_harmonics
