@@ -16,3 +16,13 @@ def shown_in(scene: Scene) -> float | None:
         return None
     points = scene.points.astype(np.float64)
     return float(np.median(sum(visible(view.camera, points).astype(int) for view in scene.train)))
+
+
+def few_photographs(scene: Scene, limit: int) -> tuple[bool, str]:
+    """Whether half of the points lie in fewer training photographs than ``limit``, and a sentence with the figure."""
+    shown = shown_in(scene)
+    if shown is None:
+        return False, "the scene does not say which points its photographs saw"
+    if shown >= len(scene.train):
+        return shown < limit, f"half of its points lie in all {len(scene.train)} photographs"
+    return shown < limit, f"half of its points lie in {shown:.0f} photographs or fewer"

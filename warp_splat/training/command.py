@@ -38,6 +38,7 @@ from warp_splat.training.record import (
 )
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
+from warp_splat.training.trial import settle_parts
 
 if TYPE_CHECKING:
     from warp_splat.training.live import TrainingViewer
@@ -72,7 +73,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     scene = open_scene(config, begun, say)
     if config.learn.minutes and not begun:
         config = plan_training(scene, config, processes, say)
+    config, weighed = settle_parts(config, scene, processes, say)
     trainer = Trainer(scene, config, processes)
+    trainer.told = weighed + trainer.told
     _tell(trainer, run, say)
     with model_folder.claimed(run.folder) if processes.rank == 0 else nullcontext(), _memory_explained(trainer):
         _restore_or_begin(trainer, run, begun, say)

@@ -19,6 +19,7 @@ A part is made of (options, setting). It has any of these methods; ``tests/test_
 they run in this order:
 
     needed(scene) -> Verdict                of the class: whether ``--parts auto`` takes it; without, it never does
+    tried                                   of the class, true: where ``needed`` says yes, trial.py has to confirm it
     parameters() -> [{name, params, lr}]    groups for Adam, each of one leaf, dense float32, with a name that no other
                                             has; lr is a number, or a function of the iteration
     camera(camera, step) -> camera          to render with

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from warp_splat.flags import default_of, learning, rendering
-from warp_splat.training.seams import Entry
+from warp_splat.training.seams import Entry, Verdict
 
 if TYPE_CHECKING:
     from warp_splat.scene.types import Scene
@@ -90,16 +90,23 @@ def asked_for(config: TrainConfig, name: str) -> bool:
     return name in config.model.parts.split(",") or bool(getattr(config.plugins[name], name, False))
 
 
+def weigh(config: TrainConfig, scene: Scene) -> dict[str, Verdict]:
+    """What figures of the scene say on each part that ``--parts auto`` may take; nothing without it."""
+    offered = [name for name in PARTS if config.model.parts == AUTO and not asked_for(config, name)]
+    return {name: PARTS[name].load().needed(scene) for name in offered if hasattr(PARTS[name].load(), "needed")}
+
+
+def sentence_of(name: str, verdict: Verdict) -> str:
+    """What is told of a part that was weighed."""
+    return f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}."
+
+
 def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
-    """The names of the parts to use, and sentences: on each that ``--parts auto`` has weighed, on idle options."""
-    used, told = [], []
-    for name, entry in PARTS.items():
-        if asked_for(config, name):
-            used.append(name)
-        elif config.model.parts == AUTO and hasattr(entry.load(), "needed"):
-            verdict = entry.load().needed(scene)
-            told.append(f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}.")
-            used += [name] * verdict.needed
+    """The names of the parts to use, and sentences: on each that was weighed, on idle options."""
+    verdicts = weigh(config, scene)
+    used = [name for name in PARTS if asked_for(config, name) or (name in verdicts and verdicts[name].needed)]
+    told = [sentence_of(name, verdict) for name, verdict in verdicts.items()]
+    for name in PARTS:
         if name not in used and (idle := _changed(config.plugins[name])):
             told.append(f"Warning: the part {name} is not used, without which {', '.join(idle)} will change nothing.")
     return used, told

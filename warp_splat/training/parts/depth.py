@@ -16,7 +16,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime.timers import stage
-from warp_splat.scene.coverage import shown_in
+from warp_splat.scene.coverage import few_photographs
 from warp_splat.scene.depth_maps import read_inverse_depths
 from warp_splat.scene.types import Scene, View, visible
 from warp_splat.training.optimizer import power
@@ -45,6 +45,8 @@ class Target(NamedTuple):
 class Depth:
     """Adds the mean of error / (error + LARGE), times LARGE: as the mean error where that is small."""
 
+    tried = True
+
     def __init__(self, options: DepthOptions, setting: Setting):
         self.options, self.iterations, self.extent = options, setting.iterations, setting.scene.extent
         self.device = setting.model.device
@@ -64,11 +66,7 @@ class Depth:
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If few photographs show the same: then they do not tell depth well, and points do."""
-        shown = shown_in(scene)
-        if shown is None:
-            return Verdict(False, "the scene does not say which points its photographs saw")
-        figure = f"half of its points lie in {shown:.0f} photographs or fewer"
-        return Verdict(shown < FEW, f"{figure}; under {FEW} their depths are worth it")
+        return Verdict(*few_photographs(scene, FEW))
 
     def asks(self, options: RasterOptions, step: Step) -> RasterOptions:
         """The expected depth."""

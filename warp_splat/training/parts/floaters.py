@@ -5,21 +5,18 @@ from __future__ import annotations
 import torch
 
 from warp_splat.raster.api import RenderOutput
-from warp_splat.scene.coverage import shown_in
+from warp_splat.scene.coverage import few_photographs
 from warp_splat.scene.types import Scene
 from warp_splat.training.parts import FloatersOptions
 from warp_splat.training.seams import Setting, Step, Verdict
 
-#: Photographs that show a point, under which floaters have room. Tried on three scenes, three seeds each, PSNR of
-#: held-out views with the part, less that without:
-#: - +1.40 dB where half of the points lie in 18 photographs or fewer
-#: - +0.02 dB: 34
-#: - -0.82 dB: 38
-FEW = 25
+FEW = 25  # photographs that show a point, from which on there is little room for floaters: not worth a trial
 
 
 class Floaters:
     """Adds the mean opacity of all Gaussians, times a weight, to the loss of every step."""
+
+    tried = True
 
     def __init__(self, options: FloatersOptions, setting: Setting):
         self.weight = options.opacity_reg
@@ -27,11 +24,7 @@ class Floaters:
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If few photographs show the same: what hangs before some of them is not seen by the others."""
-        shown = shown_in(scene)
-        if shown is None:
-            return Verdict(False, "the scene does not say which points its photographs saw")
-        figure = f"half of its points lie in {shown:.0f} photographs or fewer"
-        return Verdict(shown < FEW, f"{figure}; under {FEW} floaters cost more than the part does")
+        return Verdict(*few_photographs(scene, FEW))
 
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """Add the term; its gradient is the weight / N for each opacity."""

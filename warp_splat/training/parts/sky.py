@@ -22,6 +22,8 @@ LAST_RATE = 0.01  # of the first one, at the end
 class Sky:
     """Harmonics of degree 3, as a Gaussian's colors, wherever Gaussians let light through."""
 
+    tried = True
+
     def __init__(self, options: SkyOptions, setting: Setting):
         self.options, self.iterations, device = options, setting.iterations, setting.model.device
         if clear := [view.name for view in setting.scene.train if view.alpha is not None and (view.alpha < 255).any()]:
@@ -40,7 +42,7 @@ class Sky:
             return Verdict(False, "photographs are transparent somewhere, and have no sky there")
         share = share_of_sky([view.camera for view in scene.train], scene.points)
         figure = f"{100 * share:.1f} % of the photographs look up to where there are no points"
-        return Verdict(share >= NEEDED, f"{figure}; from {100 * NEEDED} % on it is worth it")
+        return Verdict(share >= NEEDED, f"{figure} (limit {100 * NEEDED} %)")
 
     def parameters(self) -> list[dict]:
         """The coefficients."""

@@ -1,0 +1,132 @@
+"""What a figure of the scene only suggests to ``--parts auto`` is tried: short trainings with the part and without it.
+
+They see small images, and are judged on training photographs that are held back; the test set is not looked at. All of
+them together take SHARE of the training's own work at most, by a count of steps and pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from warp_splat.evaluation.metrics import cc_psnr, ssim
+from warp_splat.runtime.distributed import Processes
+from warp_splat.scene.types import Scene
+from warp_splat.training.memory import expected_gaussians
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import AUTO, PARTS, asked_for, sentence_of, weigh
+from warp_splat.training.plan import Task, of_length
+from warp_splat.training.seams import Verdict
+from warp_splat.training.sizes import shares_of_size, shrink_at
+from warp_splat.training.trainer import Trainer
+
+SHARE = 0.1  # of the training's work
+OVERHEAD = 30_000  # pixels that take as long as what a step does besides
+SHRINK = 4  # of the images' edges
+FOLDS = 2  # rounds, each with a seed and held-back photographs of its own
+PERIOD = 5  # of so many photographs, one is held back
+FEWEST = 4  # photographs
+SHORTEST, LONGEST = 100, 1500  # steps of a training
+GAIN = 0.1  # dB of CC_PSNR, in every round
+
+
+def settle_parts(
+    config: TrainConfig, scene: Scene, processes: Processes, say: Callable[[str], None]
+) -> tuple[TrainConfig, list[str]]:
+    """The options with names in place of ``--parts auto``, and a sentence on each part that was weighed."""
+    if config.model.parts != AUTO:
+        return config, []
+    verdicts = weigh(config, scene)
+    uncertain = [
+        name for name, verdict in verdicts.items() if verdict.needed and getattr(PARTS[name].load(), "tried", False)
+    ]
+    sure = [name for name in PARTS if asked_for(config, name) or (name in verdicts and verdicts[name].needed)]
+    if uncertain:
+        sure = [name for name in sure if name not in uncertain]
+        verdicts |= _tried(config, scene, sure, {name: verdicts[name] for name in uncertain}, say)
+    used = [name for name in PARTS if name in sure or (name in uncertain and verdicts[name].needed)]
+    used = processes.first(",".join(used))
+    return config.changed(parts=used), [sentence_of(name, verdict) for name, verdict in verdicts.items()]
+
+
+def _tried(
+    config: TrainConfig, scene: Scene, sure: list[str], suggested: dict[str, Verdict], say: Callable[[str], None]
+) -> dict[str, Verdict]:
+    """A verdict by trainings on each part that is suggested, beside those that are sure and those taken before it."""
+    count = FOLDS * (1 + len(suggested))
+    steps = steps_of(config, scene, count)
+    lacking = ""
+    if len(scene.train) < FEWEST:
+        lacking = f"{len(scene.train)} photographs are too few to hold some back"
+    elif steps < SHORTEST:
+        lacking = f"this training is too short, which leaves {max(steps, 0)} steps of {SHORTEST} for it"
+    if lacking:
+        return {
+            name: Verdict(False, f"{v.sentence}, but could not be tried: {lacking}") for name, v in suggested.items()
+        }
+    say(f"Trying {', '.join(suggested)}: {count} trainings of {steps} steps on small images ...")
+    found, base = {}, sure
+    without = [quality(config, scene, base, steps, fold) for fold in range(FOLDS)]
+    for name, verdict in suggested.items():
+        given = [quality(config, scene, [*base, name], steps, fold) for fold in range(FOLDS)]
+        found[name] = judged(verdict, without, given)
+        if found[name].needed:
+            base, without = [*base, name], given
+    return found
+
+
+def judged(verdict: Verdict, without: Sequence[tuple[float, float]], given: Sequence[tuple[float, float]]) -> Verdict:
+    """Whether a part is worth it: with it, every round is better by GAIN of CC_PSNR, and none worse in SSIM."""
+    changes = np.subtract(given, without)
+    needed = bool((changes[:, 0] >= GAIN).all() and (changes[:, 1] >= 0).all())
+    decibels, likeness = (
+        " and ".join(f"{change:+.{places}f}" for change in column)
+        for column, places in zip(changes.T, (2, 4), strict=True)
+    )
+    told = f"on photographs held back, short trainings with it changed CC_PSNR by {decibels} dB and SSIM by {likeness}"
+    return Verdict(needed, f"{verdict.sentence}; {told} (limits {GAIN:+} dB and 0)")
+
+
+def steps_of(config: TrainConfig, scene: Scene, trainings: int) -> int:
+    """How long each of the trainings may be, less what their evaluation takes: by a count, so the same everywhere."""
+    learn, shares, camera = config.learn, shares_of_size(config.learn, scene.train), scene.train[0].camera
+    sizes = np.array([shrink_at(learn, shares, step) for step in range(1, learn.end_or_plan + 1)])
+    whole, small = ((camera.width * camera.height / size**2 + OVERHEAD).sum() for size in (sizes, np.array([SHRINK])))
+    return min(int(SHARE * whole / small / trainings) - -(-len(scene.train) // PERIOD), LONGEST)
+
+
+def quality(config: TrainConfig, scene: Scene, parts: list[str], steps: int, fold: int) -> tuple[float, float]:
+    """CC_PSNR [dB] and SSIM of photographs held back from a training with these parts, over so many steps."""
+    held = scene.train[fold::PERIOD]
+    kept = [view for place, view in enumerate(scene.train) if place % PERIOD != fold]
+    part = replace(scene, train=kept, test=held, find_tracks=lambda: scene.tracks)
+    trainer = Trainer(
+        part, _shortened(config, scene, steps).changed(parts=",".join(parts), seed=config.learn.seed ^ fold)
+    )
+    for iteration in range(1, steps + 1):
+        if iteration > 1:
+            trainer.update(iteration - 1)
+        trainer.differentiate(iteration)
+    values = []
+    for view in trainer.refined(held):
+        camera, photograph = trainer.photographs.at_size(view, steps)
+        mask = None if photograph.mask is None else photograph.mask[..., 0].cpu().numpy()
+        if mask is None or mask.any():
+            pair = trainer.picture(camera, view.name), replace(view, image=photograph.image.cpu().numpy()).picture
+            values.append((cc_psnr(*pair, mask), ssim(*pair, mask)))
+    means = np.mean(values, 0) if values else np.zeros(2)
+    return float(means[0]), float(means[1])
+
+
+def _shortened(config: TrainConfig, scene: Scene, steps: int) -> TrainConfig:
+    """The shape of the training over fewer steps, with images that stay small."""
+    camera, learn = scene.train[0].camera, config.learn
+    start = scene.start.splats.means.shape[0] if scene.start else len(scene.points)
+    most = config.grow.max_gaussians or expected_gaussians(start, camera.width * camera.height)[0]
+    task = Task(camera.width * camera.height, start, most // SHRINK, ())
+    short = of_length(config, steps / learn.end_or_plan, task)
+    return short.changed(
+        iterations=steps, minutes=0.0, coarse=SHRINK, coarse_by="steps", coarse_until_iter=SHRINK * steps
+    )
