@@ -101,7 +101,7 @@ def test_the_share_of_sky_of_a_plain(roll, scene, monkeypatch):
 
 def test_auto_tells_how_much_sky_there_is(scene, tmp_path):
     trainer, _ = begin(scene, tmp_path, parts="auto")
-    figure = "0.3 % of the photographs look up to where there are no points; from 1.5 % on it is worth it"
+    figure = "0.3 % of the photographs look up to where there are no points (limit 1.5 %)"
     assert f"Part sky: left out, since {figure}." in trainer.told
     inside = (np.abs(scene.points[:, :2]).max(1) < 4.7) & (scene.points[:, 2] < 3.3)
     assert "sky" in choose(trainer.config.changed(parts="auto"), replace(scene, points=scene.points[inside]))[0]
