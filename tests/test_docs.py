@@ -20,6 +20,8 @@ from warp_splat.cli import COMMANDS, main, parse
 from warp_splat.flags import flags_of
 from warp_splat.scene.depth_maps import PARAMETERS
 from warp_splat.scene.images import read_size
+from warp_splat.training.growth import GROWTHS
+from warp_splat.training.parts import PARTS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -231,6 +233,9 @@ def test_code(page, tmp_path, monkeypatch):
     monkeypatch.chdir(with_scene(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     names = {}
+    for table, name in ((PARTS, "tint"), (GROWTHS, "fade")):
+        monkeypatch.setitem(table, name, None)  # set by a page, and gone after it
+        del table[name]
     exec(example(), names)
     for language, text in blocks(page):
         if file := re.match(r"# (\w+\.py)\n", text):
