@@ -15,8 +15,8 @@ from test_train import SCENE, fails
 from warp_splat.errors import InputError
 from warp_splat.scene.depth_maps import PARAMETERS, read_inverse_depths
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import choose
 from warp_splat.training.seams import Step
+from warp_splat.training.trial import weigh
 
 DEPTH = {"parts": "depth", "depth_l1_weight_init": 0.5}
 
@@ -132,11 +132,10 @@ def test_maps_are_compared_like_points(mapped, tmp_path):
 
 
 def test_verdict(scene):
-    assert "depth" not in choose(TrainConfig(parts="auto"), scene)[0]
-    used, told = choose(TrainConfig(parts="auto"), replace(scene, train=scene.train[::8]))
-    assert "depth" in used and any("half of its points lie in 6 photographs or fewer" in line for line in told)
-    without = replace(scene, train=scene.train[::8], find_tracks=dict)
-    assert "depth" not in choose(TrainConfig(parts="auto"), without)[0]
+    assert not weigh(TrainConfig(), scene)["depth"].needed
+    few = replace(scene, train=scene.train[::8])
+    assert weigh(TrainConfig(), few)["depth"] == (True, "half of its points lie in 6 photographs or fewer")
+    assert not weigh(TrainConfig(), replace(few, find_tracks=dict))["depth"].needed
 
 
 def spoil(folder, name):

@@ -25,8 +25,8 @@ from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
 from warp_splat.scene.neighbors import guessed
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import choose
 from warp_splat.training.record import keep, restore, save_model
+from warp_splat.training.trial import weigh
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 
@@ -197,16 +197,15 @@ def test_gains_are_found_from_the_tracks_and_decide_what_auto_takes(faulty):
     """With those of the truth, but for what shine, noise and eight bits leave."""
     folder, truth = faulty
     clean, changed = (load_scene(path, eval=True, report=str) for path in (SCENE, folder))
-    used, told = choose(TrainConfig(parts="auto"), clean)
-    assert "exposure" not in used and any("Part exposure: left out, since photographs differ by 0.0" in t for t in told)
-    used, told = choose(TrainConfig(parts="auto"), changed)
-    assert "exposure" in used and any("Part exposure: taken, since photographs differ by 0.2" in line for line in told)
+    for scene, needed, figure in ((clean, False, "0.0"), (changed, True, "0.2")):
+        verdict = weigh(TrainConfig(), scene)["exposure"]
+        assert verdict.needed == needed and verdict.sentence.startswith(f"photographs differ by {figure}")
     gains = gains_of(changed).stops
     assert gains.keys() == truth.keys()
     errors = np.array([gains[name] - truth[name] for name in truth])
     assert np.median(np.abs(2 ** (errors - errors.mean(0)) - 1)) < 0.01
     assert abs(sum(gains.values())).max() < 1e-12
-    assert choose(TrainConfig(parts="auto"), replace(changed, find_tracks=dict))[0] == []
+    assert not any(verdict.needed for verdict in weigh(TrainConfig(), replace(changed, find_tracks=dict)).values())
 
 
 @pytest.mark.slow

@@ -9,9 +9,10 @@ from test_checkpoints import begin, state_of, steps
 from test_train import SCENE, fails
 
 from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import choose
 from warp_splat.training.record import keep, restore
+from warp_splat.training.trial import settle_parts, weigh
 
 
 def differentiated(scene, folder, **options):
@@ -70,9 +71,9 @@ def test_it_resumes_to_the_same_bytes(optimizer_type, scene, tmp_path):
 
 
 def test_without_it_nothing_changes(scene, tmp_path):
-    assert choose(TrainConfig(), scene) == ([], [])
-    used, told = choose(TrainConfig(opacity_reg=9.0), scene)
-    assert not used
+    assert settle_parts(TrainConfig(), scene, ALONE, str) == (TrainConfig(), [])
+    config, told = settle_parts(TrainConfig(opacity_reg=9.0), scene, ALONE, str)
+    assert not config.used_parts
     assert told == ["Warning: the part floaters is not used, without which --opacity_reg will change nothing."]
     states = []
     for options in ({}, {"opacity_reg": 9.0}):
@@ -89,8 +90,7 @@ def test_bad_weights_are_refused(value, tmp_path, capsys):
 
 
 def test_verdict(scene):
-    assert "floaters" not in choose(TrainConfig(parts="auto"), scene)[0]
-    used, told = choose(TrainConfig(parts="auto"), replace(scene, train=scene.train[::2]))
-    assert "floaters" in used and any("half of its points lie in 22 photographs or fewer" in line for line in told)
-    without = replace(scene, train=scene.train[::2], find_tracks=dict)
-    assert "floaters" not in choose(TrainConfig(parts="auto"), without)[0]
+    assert not weigh(TrainConfig(), scene)["floaters"].needed
+    few = replace(scene, train=scene.train[::2])
+    assert weigh(TrainConfig(), few)["floaters"] == (True, "half of its points lie in 22 photographs or fewer")
+    assert not weigh(TrainConfig(), replace(few, find_tracks=dict))["floaters"].needed

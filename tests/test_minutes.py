@@ -207,7 +207,7 @@ def test_rates_fall_and_the_set_stays_once_settled(scene, tmp_path):
 
 @pytest.mark.slow
 def test_a_whole_training_by_the_clock_is_repeated_by_its_options(tmp_path, capsys):
-    common = ["train", "-s", str(SCENE), "--eval", "-r", "4", "--densification_interval", "5"]
+    common = ["train", "-s", str(SCENE), "--eval", "-r", "4", "--densification_interval", "5", "--parts", "auto"]
     assert main([*common, "-m", str(tmp_path / "a"), "--minutes", "0.02"]) == 0
     out = capsys.readouterr().out
     assert "Plan for 0.02 minutes" in out and "ms a step with 4500 Gaussians" in out

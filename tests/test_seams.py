@@ -18,7 +18,7 @@ from warp_splat.formats.model_folder import ply_path
 from warp_splat.training.config_file import load_options, read_config, write_config
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import PARTS, choose
+from warp_splat.training.parts import PARTS
 from warp_splat.training.record import keep, restore
 from warp_splat.training.seams import Change, Entry, Verdict
 from warp_splat.training.trainer import Trainer
@@ -220,4 +220,4 @@ def test_a_part_that_auto_took_is_left_out_where_its_flag_says_so(flags, parts, 
     write_config(tmp_path, trainer.config)
     for source in (["--resume", str(tmp_path)], ["--config", str(tmp_path / "config.toml")]):
         config = parse(["train", *source, *flags])
-        assert config.model.parts == parts and choose(config, scene)[0] == [n for n in PARTS if n in parts.split(",")]
+        assert config.model.parts == parts and config.used_parts == [n for n in PARTS if n in parts.split(",")]

@@ -21,8 +21,8 @@ from warp_splat.rendering.command import make_picture
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import choose
 from warp_splat.training.record import save_model
+from warp_splat.training.trial import weigh
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 
@@ -100,11 +100,11 @@ def test_the_share_of_sky_of_a_plain(roll, scene, monkeypatch):
 
 
 def test_auto_tells_how_much_sky_there_is(scene, tmp_path):
-    trainer, _ = begin(scene, tmp_path, parts="auto")
+    trainer, _ = begin(scene, tmp_path)
     figure = "0.3 % of the photographs look up to where there are no points (limit 1.5 %)"
-    assert f"Part sky: left out, since {figure}." in trainer.told
+    assert weigh(trainer.config, scene)["sky"] == (False, figure)
     inside = (np.abs(scene.points[:, :2]).max(1) < 4.7) & (scene.points[:, 2] < 3.3)
-    assert "sky" in choose(trainer.config.changed(parts="auto"), replace(scene, points=scene.points[inside]))[0]
+    assert weigh(trainer.config, replace(scene, points=scene.points[inside]))["sky"].needed
     assert isinstance(trainer.behind, torch.Tensor) and trainer.behind.shape == (3,)
 
 
@@ -114,7 +114,7 @@ def test_the_sky_that_is_made_up_is_one(tmp_path):
     make_faulty(tmp_path / "scene", ["sky"])
     clean, changed = (load_scene(path, eval=True, report=str) for path in (SCENE, tmp_path / "scene"))
     assert not beyond(changed.points).any() and len(changed.points) < len(clean.points)
-    assert choose(TrainConfig(parts="auto"), changed)[0] == ["sky"]
+    assert [name for name, verdict in weigh(TrainConfig(), changed).items() if verdict.needed] == ["sky"]
     for before, after in zip(clean.test + clean.train, changed.test + changed.train, strict=True):
         camera = after.camera
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

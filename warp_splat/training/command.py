@@ -25,7 +25,7 @@ from warp_splat.training.config_file import write_config
 from warp_splat.training.deadline import Deadline, plan_training
 from warp_splat.training.opening import Say, open_scene, refuse_other_training, resolve, speaker, write_inputs
 from warp_splat.training.options import ReportOptions, TrainConfig, check_train
-from warp_splat.training.parts import PARTS, asked_for
+from warp_splat.training.parts import PARTS
 from warp_splat.training.record import (
     Run,
     finish,
@@ -107,7 +107,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
         restore(trainer, run, load_checkpoint(begun.path))
         say(f"Continuing after {run.iteration} iterations, from {begun.path}")
         before = begun.facts["options"].get("parts", "").split(",")
-        for name in filter(lambda name: name in PARTS and not asked_for(config, name), before):
+        for name in filter(lambda name: name in PARTS and name not in config.used_parts, before):
             say(f"Warning: the part {name} is left out from here on, with what it learned; --parts names those kept.")
     else:
         keep(trainer, run)

@@ -19,6 +19,7 @@ from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import LearnOptions, TrainConfig
 from warp_splat.training.plan import Cost, Reached, StepTime, Task, as_flags, comparable, plan_for, seconds_of
 from warp_splat.training.trainer import Trainer
+from warp_splat.training.trial import suggested
 
 REACHED = Path(__file__).with_name("reached.json")  # what benchmarks/minutes.py measured
 REPEATS = 5  # steps of which one is timed: their median
@@ -77,7 +78,8 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     """
     minutes = config.learn.minutes
     say("Measuring this machine (kernels are compiled first, once on a machine, about 40 s) ...")
-    trial = Trainer(scene, config.changed(settle_from_iter=1, minutes=0.0), processes)  # its set stays as it is
+    measured_as = suggested(config, scene).changed(settle_from_iter=1, minutes=0.0)  # its set stays as it is
+    trial = Trainer(scene, measured_as, processes)
     trial.warm_up()
     camera, start = scene.train[0].camera, len(trial.model)
     pixels = camera.width * camera.height
@@ -91,7 +93,7 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     say(f"Plan for {minutes:g} minutes ({seconds_of(plan, cost, task):.0f} s by these figures): {as_flags(plan)}")
     if trial.growth.grows(config.learn.iterations):
         steps = plan.learn.iterations
-        if not Trainer(scene, plan, processes).growth.grows(steps - plan.learn.cooldown):
+        if not Trainer(scene, suggested(plan, scene), processes).growth.grows(steps - plan.learn.cooldown):
             raise InputError(
                 f"--minutes {minutes:g}: expected time for one densification at least, found time for {steps} steps "
                 "before the end; give more, or smaller images (-r)."

@@ -200,6 +200,12 @@ class TrainConfig:
                 owners[item.name] = group
         return found
 
+    @property
+    def used_parts(self) -> list[str]:
+        """The parts that are named, or that a flag of their own asks for, in the order in which they act."""
+        named = self.model.parts.split(",")
+        return [name for name in PARTS if name in named or getattr(self.plugins[name], name, False)]
+
     def flat(self) -> dict[str, Any]:
         """Every option by its name."""
         groups = [*(getattr(self, name) for name in GROUPS), *self.plugins.values()]

@@ -34,7 +34,7 @@ from warp_splat.training.growth import GROWTHS
 from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import AUTO, PARTS, choose
+from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import Photographs
 from warp_splat.training.quarantined import Quarantine
 from warp_splat.training.seams import Setting, Step, having
@@ -67,9 +67,8 @@ class Trainer:
                 f"--loss_space {config.data.loss_space}: expected photographs in linear light (EXR, HDR, TIFF of "
                 f"floats), found {scene.train[0].name}, which is as a screen shows it; leave this flag out."
             )
-        used, self.told = choose(config, scene)
         if config.model.parts == AUTO:
-            config = config.changed(parts=",".join(used))
+            raise InputError("--parts auto: expected names of parts here; trial.settle_parts chooses them.")
         self.scene, self.config, self.device = scene, config, choose_device(config.machine.device)
         self.processes = processes
         if scene.start:
@@ -80,11 +79,11 @@ class Trainer:
         self.background = torch.full((3,), float(config.data.white_background), device=self.device)
         seed, limit, growth = config.learn.seed, config.grow.max_gaussians, config.grow.growth
         setting = Setting(scene, self.model, self.background, processes, seed, limit, config.learn.iterations)
-        self.parts = [PARTS[name].load()(config.plugins[name], setting) for name in used]
+        self.parts = [PARTS[name].load()(config.plugins[name], setting) for name in config.used_parts]
         groups = [group for parameters in having(self.parts, "parameters") for group in parameters()]
         self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)
         self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
-        self.told += [sentence for told in having([self.growth], "told") for sentence in told()]
+        self.told = [sentence for told in having([self.growth], "told") for sentence in told()]
         self.quarantine = Quarantine()
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0

@@ -7,16 +7,19 @@ them together take SHARE of the training's own work at most, by a count of steps
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 
+from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import cc_psnr, ssim
+from warp_splat.flags import default_of
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.types import Scene
 from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.parts import AUTO, PARTS, asked_for, sentence_of, weigh
+from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.plan import Task, of_length
 from warp_splat.training.seams import Verdict
 from warp_splat.training.sizes import shares_of_size, shrink_at
@@ -35,20 +38,41 @@ GAIN = 0.1  # dB of CC_PSNR, in every round
 def settle_parts(
     config: TrainConfig, scene: Scene, processes: Processes, say: Callable[[str], None]
 ) -> tuple[TrainConfig, list[str]]:
-    """The options with names in place of ``--parts auto``, and a sentence on each part that was weighed."""
+    """The options with names in place of ``--parts auto``; sentences on what was weighed, and on idle options."""
+    verdicts: dict[str, Verdict] = {}
+    if config.model.parts == AUTO:
+        used, verdicts = config.used_parts, weigh(config, scene)
+        suggested = {name: verdict for name, verdict in verdicts.items() if verdict.needed}
+        tried = {name: suggested.pop(name) for name in list(suggested) if getattr(PARTS[name].load(), "tried", False)}
+        used += suggested
+        if tried:
+            verdicts |= _tried(config, scene, used, tried, say)
+            used += [name for name in tried if verdicts[name].needed]
+        config = config.changed(parts=processes.first(",".join(name for name in PARTS if name in used)))
+    told = [f"Part {name}: {'taken' if v.needed else 'left out'}, since {v.sentence}." for name, v in verdicts.items()]
+    for name in PARTS:
+        if name not in config.used_parts and (idle := _changed(config.plugins[name])):
+            told.append(f"Warning: the part {name} is not used, without which {', '.join(idle)} will change nothing.")
+    return config, told
+
+
+def weigh(config: TrainConfig, scene: Scene) -> dict[str, Verdict]:
+    """What figures of the scene say on each part that ``--parts auto`` may take."""
+    offered = {name: entry.load() for name, entry in PARTS.items() if name not in config.used_parts}
+    return {name: part.needed(scene) for name, part in offered.items() if hasattr(part, "needed")}
+
+
+def suggested(config: TrainConfig, scene: Scene) -> TrainConfig:
+    """The options with all that figures suggest in place of ``--parts auto``: the most that a training may have."""
     if config.model.parts != AUTO:
-        return config, []
-    verdicts = weigh(config, scene)
-    uncertain = [
-        name for name, verdict in verdicts.items() if verdict.needed and getattr(PARTS[name].load(), "tried", False)
-    ]
-    sure = [name for name in PARTS if asked_for(config, name) or (name in verdicts and verdicts[name].needed)]
-    if uncertain:
-        sure = [name for name in sure if name not in uncertain]
-        verdicts |= _tried(config, scene, sure, {name: verdicts[name] for name in uncertain}, say)
-    used = [name for name in PARTS if name in sure or (name in uncertain and verdicts[name].needed)]
-    used = processes.first(",".join(used))
-    return config.changed(parts=used), [sentence_of(name, verdict) for name, verdict in verdicts.items()]
+        return config
+    needed = [name for name, verdict in weigh(config, scene).items() if verdict.needed]
+    return config.changed(parts=",".join([*config.used_parts, *needed]))
+
+
+def _changed(options: Any) -> list[str]:
+    """The flags of a part's options that have not their defaults."""
+    return [f"--{item.name}" for item in fields(options) if getattr(options, item.name) != default_of(item)]
 
 
 def _tried(
@@ -57,24 +81,29 @@ def _tried(
     """A verdict by trainings on each part that is suggested, beside those that are sure and those taken before it."""
     count = FOLDS * (1 + len(suggested))
     steps = steps_of(config, scene, count)
-    lacking = ""
     if len(scene.train) < FEWEST:
         lacking = f"{len(scene.train)} photographs are too few to hold some back"
-    elif steps < SHORTEST:
+        return {name: _untried(verdict, lacking) for name, verdict in suggested.items()}
+    if steps < SHORTEST:
         lacking = f"this training is too short, which leaves {max(steps, 0)} steps of {SHORTEST} for it"
-    if lacking:
-        return {
-            name: Verdict(False, f"{v.sentence}, but could not be tried: {lacking}") for name, v in suggested.items()
-        }
+        return {name: _untried(verdict, lacking) for name, verdict in suggested.items()}
     say(f"Trying {', '.join(suggested)}: {count} trainings of {steps} steps on small images ...")
     found, base = {}, sure
     without = [quality(config, scene, base, steps, fold) for fold in range(FOLDS)]
     for name, verdict in suggested.items():
-        given = [quality(config, scene, [*base, name], steps, fold) for fold in range(FOLDS)]
+        try:
+            given = [quality(config, scene, [*base, name], steps, fold) for fold in range(FOLDS)]
+        except InputError as error:  # what it needs is in the photographs that are held back
+            found[name] = _untried(verdict, str(error).rstrip("."))
+            continue
         found[name] = judged(verdict, without, given)
         if found[name].needed:
             base, without = [*base, name], given
     return found
+
+
+def _untried(verdict: Verdict, reason: str) -> Verdict:
+    return Verdict(False, f"{verdict.sentence}, but could not be tried: {reason}")
 
 
 def judged(verdict: Verdict, without: Sequence[tuple[float, float]], given: Sequence[tuple[float, float]]) -> Verdict:

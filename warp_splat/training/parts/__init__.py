@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
-from warp_splat.flags import default_of, learning, rendering
-from warp_splat.training.seams import Entry, Verdict
-
-if TYPE_CHECKING:
-    from warp_splat.scene.types import Scene
-    from warp_splat.training.options import TrainConfig
+from warp_splat.flags import learning, rendering
+from warp_splat.training.seams import Entry
 
 EXPOSURES = ("gain", "affine", "bilateral")
 AUTO = "auto"  # in --parts: those that the scene needs
@@ -83,35 +78,3 @@ PARTS: dict[str, Entry] = {
     "depth": Entry(DepthOptions, "warp_splat.training.parts.depth.Depth"),
     "floaters": Entry(FloatersOptions, "warp_splat.training.parts.floaters.Floaters"),
 }
-
-
-def asked_for(config: TrainConfig, name: str) -> bool:
-    """Whether a part is named, or a flag of its own asks for it."""
-    return name in config.model.parts.split(",") or bool(getattr(config.plugins[name], name, False))
-
-
-def weigh(config: TrainConfig, scene: Scene) -> dict[str, Verdict]:
-    """What figures of the scene say on each part that ``--parts auto`` may take; nothing without it."""
-    offered = [name for name in PARTS if config.model.parts == AUTO and not asked_for(config, name)]
-    return {name: PARTS[name].load().needed(scene) for name in offered if hasattr(PARTS[name].load(), "needed")}
-
-
-def sentence_of(name: str, verdict: Verdict) -> str:
-    """What is told of a part that was weighed."""
-    return f"Part {name}: {'taken' if verdict.needed else 'left out'}, since {verdict.sentence}."
-
-
-def choose(config: TrainConfig, scene: Scene) -> tuple[list[str], list[str]]:
-    """The names of the parts to use, and sentences: on each that was weighed, on idle options."""
-    verdicts = weigh(config, scene)
-    used = [name for name in PARTS if asked_for(config, name) or (name in verdicts and verdicts[name].needed)]
-    told = [sentence_of(name, verdict) for name, verdict in verdicts.items()]
-    for name in PARTS:
-        if name not in used and (idle := _changed(config.plugins[name])):
-            told.append(f"Warning: the part {name} is not used, without which {', '.join(idle)} will change nothing.")
-    return used, told
-
-
-def _changed(options: Any) -> list[str]:
-    """The flags of a part's options that have not their defaults."""
-    return [f"--{item.name}" for item in fields(options) if getattr(options, item.name) != default_of(item)]
