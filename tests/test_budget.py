@@ -58,8 +58,9 @@ def test_any_number_of_threads_makes_the_same_bytes(growth, scene):
     assert found[0] == found[1] and found[0][0][-1] > POINTS
 
 
-def test_a_budget_has_to_be_named(capsys, tmp_path):
-    command = ["train", "-s", str(SCENE), "-r", "8", "-m", str(tmp_path / "a"), "--growth", "budget"]
+@pytest.mark.parametrize("flags", ["--growth budget", "--preset fast --max_gaussians 0"])
+def test_a_budget_has_to_be_named(flags, capsys, tmp_path):
+    command = ["train", "-s", str(SCENE), "-r", "8", "-m", str(tmp_path / "a"), *flags.split()]
     sentence = "--max_gaussians 0: expected the number of Gaussians that --growth budget ends with, at least 1"
     assert sentence in fails(capsys, *command)
 

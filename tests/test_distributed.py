@@ -218,7 +218,7 @@ def test_each_view_once_before_any_comes_again(scene):
     count, views = 4, len(scene.train)
     assert views % count != 0
     trainers = [Trainer(scene, TrainConfig(device="cpu"), Pretended(rank, count)) for rank in range(count)]
-    steps = [[trainer._next_view().name for trainer in trainers] for _ in range(3 * views)]
+    steps = [[trainer.deck.deal(trainer.processes).name for trainer in trainers] for _ in range(3 * views)]
     assert all(len(set(step)) == count for step in steps)
     dealt = [name for step in steps for name in step]
     seen = [dealt[: views * n].count(view.name) for n in (1, 5, 12) for view in scene.train]

@@ -266,7 +266,7 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
 
 def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, capsys):
     from warp_splat.errors import InputError  # noqa: PLC0415
-    from warp_splat.training import command as module  # noqa: PLC0415
+    from warp_splat.training import loop as module  # noqa: PLC0415
 
     def full(path, image):
         raise InputError(f"{path}: could not be written (no space left on device).")

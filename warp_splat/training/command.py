@@ -8,45 +8,28 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
 from tqdm import tqdm
 
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import Checkpoint, load_checkpoint
-from warp_splat.formats.png import save_png
-from warp_splat.runtime import pool, timers
+from warp_splat.runtime import pool
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.training import memory
-from warp_splat.training.config_file import write_config
-from warp_splat.training.deadline import Deadline, plan_training
+from warp_splat.training.deadline import plan_training
+from warp_splat.training.loop import train_steps
 from warp_splat.training.opening import Say, open_scene, refuse_other_training, resolve, speaker, write_inputs
-from warp_splat.training.options import ReportOptions, TrainConfig, check_train
+from warp_splat.training.options import TrainConfig, check_train
 from warp_splat.training.parts import PARTS
-from warp_splat.training.record import (
-    Run,
-    finish,
-    how_to_continue,
-    keep,
-    restore,
-    save_model,
-    save_or_warn,
-    warn,
-)
+from warp_splat.training.record import Run, finish, how_to_continue, keep, restore, save_model
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
 from warp_splat.training.trial import settle_parts
 
 if TYPE_CHECKING:
     from warp_splat.training.live import TrainingViewer
-
-EVALUATIONS = 20  # over the run, besides --test_iterations
-PROGRESS_VIEWS = 8  # at most, in the evaluations while training
-PREVIEW_SECONDS = 5.0
-KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 
 
 def train(config: TrainConfig) -> int:
@@ -126,7 +109,7 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
         if viewer:  # only now: who has read it may press Ctrl-C
             print(viewer.viewer.announcement, flush=True)
         try:
-            _loop(trainer, run, interrupted, viewer)
+            train_steps(trainer, run, interrupted, viewer)
         except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
             tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
             return 1
@@ -179,95 +162,3 @@ def _memory_explained(trainer: Trainer):
         fewer.append("--data_device cpu")
     sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
     return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
-
-
-def _loop(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
-    learn, report, processes = trainer.config.learn, trainer.config.report, trainer.processes
-    checks = {learn.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)}
-    profiled, before_profile = max(learn.end - report.profile, run.iteration), run.seconds
-    deadline = Deadline(learn, trainer.photographs.full_size_from, processes.count)
-    pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
-    often = {"mininterval": pause, "maxinterval": pause, "miniters": 0}
-    bar = tqdm(total=learn.end_or_plan, initial=run.iteration, disable=report.quiet, unit="it", **often)
-    trainer.check_identical(run.iteration)
-    with bar, timers.profile(report.profile > 0) as stages:
-        while run.iteration < (end := trainer.config.learn.end):
-            iteration, whole_checks = run.iteration + processes.count, {*report.test_iterations, end}
-            if processes.reaches(iteration, [profiled + 1]):
-                stages.clear()
-                before_profile = run.seconds
-            start = time.perf_counter()
-            if run.iteration:  # now, since models and checkpoints are those of before the update
-                trainer.update(run.iteration)
-            run.losses.append(trainer.differentiate(iteration))
-            run.iteration = iteration
-            done = time.perf_counter()
-            run.seconds += done - start
-            run.spent += done - start
-            wish = processes.largest(STOP if interrupted else KEEP if _keeping_is_due(report, run) else 0)
-            stop = wish == STOP or iteration >= end
-            check, whole = (processes.reaches(iteration, marks) for marks in (checks | whole_checks, whole_checks))
-            named = processes.reaches(iteration, report.checkpoint_iterations)
-            if check:
-                _check(trainer, run, bar, whole)
-            if stop or wish == KEEP or named:
-                keep(trainer, run, named)
-            if stop and not check:  # after the checkpoint: a run that goes on from there never had this record
-                _check(trainer, run, bar, whole=False)
-            if processes.reaches(iteration, report.save_iterations) and not stop:
-                save_or_warn(trainer, run)
-            bar.update(processes.count)
-            if stop:
-                break
-            run.spent += time.perf_counter() - done
-            if trainer.config.learn.minutes and (cooldown := deadline.due(iteration, run.spent, processes)):
-                trainer.settle(iteration + 1, cooldown)
-                profiled = max(trainer.config.learn.end - report.profile, iteration)
-                bar.total = trainer.config.learn.end
-                if processes.rank == 0:
-                    write_config(run.folder, trainer.config)
-            if viewer:
-                viewer.between_steps(interrupted)
-    run.dropped = trainer.quarantine.read(processes)
-    steps = -(-(run.iteration - profiled) // processes.count)
-    if report.profile and steps > 0:
-        times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
-        step = 1e3 * (run.seconds - before_profile) / steps
-        run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
-
-
-def _keeping_is_due(report: ReportOptions, run: Run) -> bool:
-    return 0 < 60 * report.checkpoint_interval <= time.perf_counter() - run.kept_at
-
-
-@timers.profile(False)
-def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
-    """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
-    trainer.check_identical(run.iteration)
-    losses, run.losses = run.losses, []
-    if trainer.processes.rank > 0:
-        return
-    split, views = trainer.scene.evaluated
-    if not whole:
-        views = views[:: -(-len(views) // PROGRESS_VIEWS)]
-    values = torch.stack(losses).double().cpu().numpy()
-    record = {
-        "iteration": run.iteration,
-        "loss": float(np.mean(values)),
-        "psnr": trainer.evaluate(views),
-        "gaussians": len(trainer.model),
-        "seconds": run.seconds,
-    }
-    run.history.append(record)
-    run.events.write_losses(run.iteration, values, trainer.processes.count)
-    run.events.write_record(record, split)
-    text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
-    bar.set_postfix_str(text, refresh=False)
-    if time.perf_counter() - run.preview > PREVIEW_SECONDS:
-        run.preview = time.perf_counter()
-        view = trainer.refined(views)[len(views) // 2]
-        try:
-            picture = trainer.picture(view.camera, view.name)
-            save_png(run.folder / "preview.png", np.concatenate([view.picture, picture], 1))
-        except InputError as error:
-            warn(error)

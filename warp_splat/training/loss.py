@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
+from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
 from warp_splat.kernels.simd import LANES, vec16
@@ -21,6 +22,12 @@ from warp_splat.runtime.pool import even_slices
 from warp_splat.runtime.timers import stage
 from warp_splat.training.loss_in_blocks import FAR_APART, LossInBlocks
 
+LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
+#: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.
+LOSS_CURVES = {
+    "srgb": lambda linear: to_srgb(linear.clamp_min(0.0), torch.where),
+    "log": lambda linear: torch.log1p(linear.clamp_min(0.0) / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR),
+}
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
 
 

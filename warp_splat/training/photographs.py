@@ -1,7 +1,8 @@
-"""Photographs as a step needs them: on its device and at its size, from coarse to fine if so configured."""
+"""Which photograph a step sees; on its device and at its size, from coarse to fine if so configured."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,6 +11,9 @@ import torch
 from torch.nn import functional
 
 from warp_splat.camera import Camera
+from warp_splat.errors import InputError
+from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.runtime.distributed import Processes
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import View
 from warp_splat.training.options import TrainConfig
@@ -69,3 +73,37 @@ class Photographs:
             means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
             kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
         return kept if kept.device.type == self.device.type else kept.pin_memory()
+
+
+class Deck:
+    """Views in random order, each once before any comes again; all processes deal alike, each takes its own."""
+
+    def __init__(self, views: Sequence[View], seed: int):
+        self.views, self.left, self.random = views, list[View](), random.Random(seed)
+
+    def deal(self, processes: Processes) -> View:
+        """The view of this process in the next step."""
+        dealt: list[View] = []
+        while len(dealt) < processes.count:
+            if not self.left:
+                self.left = list(self.views)
+            index = self.random.randrange(len(self.left))
+            if self.left[index] not in dealt:  # a new deck holds those of this step again
+                dealt.append(self.left.pop(index))
+        return dealt[processes.rank]
+
+    def state(self) -> dict[str, list[int]]:
+        """What :meth:`restore` needs, as values of JSON."""
+        places = {view: place for place, view in enumerate(self.views)}
+        return {"deck": [places[view] for view in self.left], "random.views": list(self.random.getstate()[1])}
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on dealing. Raises InputError if what is in the checkpoint does not fit."""
+        places, words = checkpoint.fact("deck", list), checkpoint.fact("random.views", list)
+        try:
+            self.left = list(dict.fromkeys(self.views[place] for place in places))
+            self.random.setstate((3, tuple(words), None))
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
+            raise InputError(
+                f"{checkpoint.path}: expected a deck of views and a random state, found other values ({error!s:.100})."
+            ) from error

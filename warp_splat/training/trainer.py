@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.color import to_bytes, to_srgb
+from warp_splat.color import to_bytes
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
@@ -31,16 +30,15 @@ from warp_splat.runtime.launch import load
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.growth import GROWTHS
-from warp_splat.training.loss import image_loss
+from warp_splat.training.loss import LOSS_CURVES, image_loss
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
-from warp_splat.training.photographs import Photographs
+from warp_splat.training.photographs import Deck, Photographs
 from warp_splat.training.quarantined import Quarantine
 from warp_splat.training.seams import Setting, Step, having
 
 T = TypeVar("T")
-LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
 
 
 class Trainer:
@@ -87,8 +85,7 @@ class Trainer:
         self.quarantine = Quarantine()
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0
-        self._views_random = random.Random(seed)
-        self._deck: list[View] = []
+        self.deck = Deck(scene.train, seed)
         self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
         self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
@@ -104,7 +101,7 @@ class Trainer:
         """
         learn = self.config.learn
         self._set_iteration(iteration)
-        step = Step(iteration, self._next_view())
+        step = Step(iteration, self.deck.deal(self.processes))
         camera, photograph = self.photographs.at_size(step.view, iteration)
         options = self._through("asks", self.options, step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
@@ -177,16 +174,14 @@ class Trainer:
         All processes call it before the first step, or between :meth:`differentiate` and :meth:`update`, where models
         are saved. So a checkpoint holds the same parameters as the model of its iteration, and their gradients.
         """
-        places = {view: place for place, view in enumerate(self.scene.train)}
         tensors = {**self.optimizer.state(), "radii": self._radii}
         for state in having((self.growth, *self.parts), "state"):
             tensors |= state()
         return tensors, {
             "views": [view.name for view in self.scene.train],
             "extent": self.scene.extent,
-            "deck": [places[view] for view in self._deck],
-            "random.views": list(self._views_random.getstate()[1]),
-            **{f"dropped.{name}": count for name, count in self.quarantine.read(self.processes).items()},
+            **self.deck.state(),
+            **self.quarantine.state(self.processes),
         }
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -203,18 +198,8 @@ class Trainer:
                 f"{checkpoint.path}: expected training views of the same names and positions as in this checkpoint, "
                 "found other ones in the scene; name the scene that it was trained on (-s, -i, --eval)."
             )
-        deck, words = checkpoint.fact("deck", list), checkpoint.fact("random.views", list)
-        try:
-            self._deck = list(dict.fromkeys(self.scene.train[place] for place in deck))
-            self._views_random.setstate((3, tuple(words), None))
-        except (TypeError, ValueError, LookupError, OverflowError) as error:
-            raise InputError(
-                f"{checkpoint.path}: expected a deck of views and a random state, found other values ({error!s:.100})."
-            ) from error
-        dropped = {item.name: checkpoint.count(f"dropped.{item.name}") for item in fields(Quarantine)}
-        if self.processes.rank > 0:  # they are summed over the processes, but for the prunings
-            dropped = {"prunings": dropped["prunings"]}
-        self.quarantine = Quarantine(**dropped)
+        self.deck.restore(checkpoint)
+        self.quarantine = Quarantine.restored(checkpoint, self.processes)
         self.optimizer.restore(checkpoint)
         for restore in having((self.growth, *self.parts), "restore"):
             restore(checkpoint)
@@ -224,17 +209,6 @@ class Trainer:
     def _set_iteration(self, iteration: int) -> None:
         self.optimizer.set_iteration(iteration)
         self.degree = min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree)
-
-    def _next_view(self) -> View:
-        """Views in random order, each once before any comes again; all processes deal, each takes its own."""
-        dealt: list[View] = []
-        while len(dealt) < self.processes.count:
-            if not self._deck:
-                self._deck = list(self.scene.train)
-            index = self._views_random.randrange(len(self._deck))
-            if self._deck[index] not in dealt:  # a new deck holds those of this step again
-                dealt.append(self._deck.pop(index))
-        return dealt[self.processes.rank]
 
     def _render(
         self,
@@ -284,10 +258,3 @@ class Trainer:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
         views = self.refined(views)
         return float(np.mean([psnr(self.picture(view.camera, view.name), view.picture, view.mask) for view in views]))
-
-
-#: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.
-LOSS_CURVES = {
-    "srgb": lambda linear: to_srgb(linear.clamp_min(0.0), torch.where),
-    "log": lambda linear: torch.log1p(linear.clamp_min(0.0) / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR),
-}

@@ -1,0 +1,144 @@
+"""The training loop: a step, then what is due between two steps."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from warp_splat.errors import InputError
+from warp_splat.formats.png import save_png
+from warp_splat.runtime import timers
+from warp_splat.training.config_file import write_config
+from warp_splat.training.deadline import Deadline
+from warp_splat.training.record import Run, keep, save_or_warn, warn
+from warp_splat.training.trainer import Trainer
+
+if TYPE_CHECKING:
+    from warp_splat.training.live import TrainingViewer
+
+EVALUATIONS = 20  # over the run, besides --test_iterations
+PROGRESS_VIEWS = 8  # at most, in the evaluations while training
+PREVIEW_SECONDS = 5.0
+KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
+
+
+def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
+    """Train until the last step, or until Ctrl-C has put a signal into ``interrupted``."""
+    report, processes = trainer.config.report, trainer.processes
+    deadline = Deadline(trainer.config.learn, trainer.photographs.full_size_from, processes.count)
+    profile = _Profile(trainer, run)
+    trainer.check_identical(run.iteration)
+    with _progress_bar(trainer, run) as bar, timers.profile(report.profile > 0) as stages:
+        while run.iteration < trainer.config.learn.end:
+            iteration = run.iteration + processes.count
+            profile.begin_if_due(iteration, stages)
+            start = time.perf_counter()
+            if run.iteration:  # now, since models and checkpoints are those of before the update
+                trainer.update(run.iteration)
+            run.losses.append(trainer.differentiate(iteration))
+            run.iteration = iteration
+            done = time.perf_counter()
+            run.seconds += done - start
+            run.spent += done - start
+            stop = _do_what_is_due(trainer, run, interrupted, bar)
+            bar.update(processes.count)
+            if stop:
+                break
+            run.spent += time.perf_counter() - done
+            if trainer.config.learn.minutes and (cooldown := deadline.due(iteration, run.spent, processes)):
+                trainer.settle(iteration + 1, cooldown)
+                profile = _Profile(trainer, run)
+                bar.total = trainer.config.learn.end
+                if processes.rank == 0:
+                    write_config(run.folder, trainer.config)
+            if viewer:
+                viewer.between_steps(interrupted)
+    run.dropped = trainer.quarantine.read(processes)
+    profile.end(stages)
+
+
+def _do_what_is_due(trainer: Trainer, run: Run, interrupted: list[int], bar: tqdm) -> bool:
+    """Evaluate, write a checkpoint, save the model, as far as it is time; returns whether training ends here."""
+    learn, report, processes = trainer.config.learn, trainer.config.report, trainer.processes
+    keeping_is_due = 0 < 60 * report.checkpoint_interval <= time.perf_counter() - run.kept_at
+    wish = processes.largest(STOP if interrupted else KEEP if keeping_is_due else 0)
+    stop = wish == STOP or run.iteration >= learn.end
+    some = [learn.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)]
+    whole = processes.reaches(run.iteration, [*report.test_iterations, learn.end])
+    check = whole or processes.reaches(run.iteration, some)
+    named = processes.reaches(run.iteration, report.checkpoint_iterations)
+    if check:
+        _check(trainer, run, bar, whole)
+    if stop or wish == KEEP or named:
+        keep(trainer, run, named)
+    if stop and not check:  # after the checkpoint: a run that goes on from there never had this record
+        _check(trainer, run, bar, whole=False)
+    if processes.reaches(run.iteration, report.save_iterations) and not stop:
+        save_or_warn(trainer, run)
+    return stop
+
+
+def _progress_bar(trainer: Trainer, run: Run) -> tqdm:
+    pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
+    often = {"mininterval": pause, "maxinterval": pause, "miniters": 0}
+    total, quiet = trainer.config.learn.end_or_plan, trainer.config.report.quiet
+    return tqdm(total=total, initial=run.iteration, disable=quiet, unit="it", **often)
+
+
+class _Profile:
+    """Of the last ``--profile`` steps, or of all there are: milliseconds of each stage."""
+
+    def __init__(self, trainer: Trainer, run: Run):
+        self.trainer, self.run = trainer, run
+        self.first = max(trainer.config.learn.end - trainer.config.report.profile, run.iteration)
+        self.before = run.seconds
+
+    def begin_if_due(self, iteration: int, stages: dict[str, float]) -> None:
+        if self.trainer.processes.reaches(iteration, [self.first + 1]):
+            stages.clear()
+            self.before = self.run.seconds
+
+    def end(self, stages: dict[str, float]) -> None:
+        run, steps = self.run, -(-(self.run.iteration - self.first) // self.trainer.processes.count)
+        if self.trainer.config.report.profile and steps > 0:
+            times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
+            step = 1e3 * (run.seconds - self.before) / steps
+            run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
+
+
+@timers.profile(False)
+def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
+    """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
+    trainer.check_identical(run.iteration)
+    losses, run.losses = run.losses, []
+    if trainer.processes.rank > 0:
+        return
+    split, views = trainer.scene.evaluated
+    if not whole:
+        views = views[:: -(-len(views) // PROGRESS_VIEWS)]
+    values = torch.stack(losses).double().cpu().numpy()
+    record = {
+        "iteration": run.iteration,
+        "loss": float(np.mean(values)),
+        "psnr": trainer.evaluate(views),
+        "gaussians": len(trainer.model),
+        "seconds": run.seconds,
+    }
+    run.history.append(record)
+    run.events.write_losses(run.iteration, values, trainer.processes.count)
+    run.events.write_record(record, split)
+    text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
+    bar.set_postfix_str(text, refresh=False)
+    if time.perf_counter() - run.preview > PREVIEW_SECONDS:
+        run.preview = time.perf_counter()
+        view = trainer.refined(views)[len(views) // 2]
+        try:
+            picture = trainer.picture(view.camera, view.name)
+            save_png(run.folder / "preview.png", np.concatenate([view.picture, picture], 1))
+        except InputError as error:
+            warn(error)
