@@ -1,6 +1,8 @@
 """Launches: one on a GPU, blocks of threads where they are made of fibers, memory that torch owns."""
 
 import gc
+import subprocess
+import sys
 import weakref
 
 import numpy as np
@@ -32,6 +34,26 @@ def test_every_index_once(device):
             device=device,
         )
         assert torch.equal(sums, values + torch.arange(5000.0, device=device))
+
+
+FIRST_LAUNCH = """
+import torch, warp as wp
+from warp_splat.runtime import launch
+
+def stream_from_torch(stream):
+    assert wp._src.context.runtime is not None, "Warp is not initialized"
+
+wp.stream_from_torch = stream_from_torch
+torch.cuda.current_stream = lambda device: "stream"
+launch._stream("cuda")
+"""
+FIRST_ARRAY = 'from warp_splat.runtime import launch; launch.empty(3, float, "cpu")'
+
+
+@pytest.mark.parametrize("code", [FIRST_LAUNCH, FIRST_ARRAY])
+def test_the_first_call_of_a_process_finds_warp_initialized(code):
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):

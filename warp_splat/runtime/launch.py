@@ -170,6 +170,7 @@ def lanes_of(dtype: type, *tensors: torch.Tensor) -> list:
 
 def load(kernel: wp.Kernel, device: torch.device) -> None:
     """Compile and load ``kernel``, and what else is in its module."""
+    wp.init()
     wp.load_module(kernel.module, device=wp.device_from_torch(device))
 
 
@@ -198,6 +199,7 @@ def _stream(device: torch.device | str) -> wp.Stream:
 
 @functools.cache  # one per stream in use, mostly one: wrapping costs tens of microseconds
 def _wrap(stream: torch.cuda.Stream) -> wp.Stream:
+    wp.init()  # launches do so, but need the stream before
     return wp.stream_from_torch(stream)
 
 
@@ -220,6 +222,7 @@ def pack_struct(struct, **fields):
 
 def empty(count: int, dtype, device: torch.device | str) -> wp.array:
     """A Warp array of ``count`` elements in memory of torch's that lives as long as the array."""
+    wp.init()  # it may be the first that a process asks of Warp
     memory = torch.empty(count * wp.types.type_size_in_bytes(dtype), dtype=torch.uint8, device=device)
     array = wp.array(
         ptr=memory.data_ptr(), dtype=dtype, shape=count, device=wp.device_from_torch(memory.device), copy=False
