@@ -105,6 +105,18 @@ def test_two_ways_back_add_up_unless_the_tape_is_zeroed(device):
     assert all(np.array_equal(array.grad.numpy(), 2 * grad) for array, grad in zip(arrays, once, strict=True))
 
 
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_inputs_may_change_before_the_way_back(mode, device):
+    recorded, loss, arrays, _ = on_tape(device, mode)
+    recorded.backward(loss)
+    expected = [array.grad.numpy().copy() for array in arrays]
+    recorded.zero()
+    for array in arrays:
+        wp.to_torch(array, requires_grad=False).mul_(0.8)
+    recorded.backward(loss)
+    assert all(np.array_equal(array.grad.numpy(), grad) for array, grad in zip(arrays, expected, strict=True))
+
+
 def test_gradients_of_the_pixels_are_kept_where_that_is_asked_for(device):
     recorded, loss, _, out = on_tape(device)
     out.image.retain_grad = True

@@ -60,9 +60,9 @@ def rasterize(
 ) -> TapeOutput:
     """:func:`warp_splat.rasterize` of Warp's arrays; inside ``with wp.Tape()`` it is recorded, with its adjoint.
 
-    ``tape.backward`` adds to ``.grad`` of every array with ``requires_grad``, the bits that torch would get. Like a
-    kernel's own adjoint, it reads the values as they then are, and zeroes the gradients of the pixels that it has read.
-    What the adjoint needs is kept as long as the tape.
+    ``tape.backward`` adds to ``.grad`` of every array with ``requires_grad``, the bits that torch would get. It zeroes
+    the gradients of the pixels that it has read, as a kernel's own adjoint does, but the values that it reads are those
+    of the forward pass: inputs may change in between. What the adjoint needs is kept as long as the tape.
 
     Args:
         means: centers, [N] vec3 or [N, 3], float32 as all but the last two.
@@ -96,6 +96,8 @@ def rasterize(
     with _torch_on(means.device, recorded):
         with stage("tape"):
             leaves = {name: wp.to_torch(array, requires_grad=False) for name, array in named.items()}
+            if recorded:  # the adjoint reads them, and simulators reuse their arrays
+                leaves = {name: leaf.clone() for name, leaf in leaves.items()}
             for name, leaf in leaves.items():
                 leaf.requires_grad_(recorded and named[name].requires_grad)
         found = _render(leaves, named, camera, background, adjoint, options)
