@@ -123,6 +123,7 @@ def test_not_finite(name, value, device):
         ("scales", put(-0.25, 3, 1), "-0.25"),
         ("opacities", put(-0.25, 3), "-0.25"),
         ("opacities", put(1.25, 3), "1.25"),
+        ("opacities", put(1.0001, 3), "to 1.0001"),
     ],
 )
 def test_range(name, change, found, device):
@@ -134,6 +135,8 @@ def test_ends_of_the_ranges_are_good(device):
     out = call(device, opacities=lambda t: t.clone().fill_(1), scales=put(1e-30, 0, 0))
     assert out.image.isfinite().all()
     assert not call(device, opacities=lambda t: t.clone().fill_(0)).alpha.any()
+    rounded, exact = (call(device, opacities=lambda t, value=value: t.clone().fill_(value)) for value in (1.0000001, 1))
+    assert torch.allclose(rounded.image, exact.image, atol=1e-5)
 
 
 def test_camera_too_large(device):

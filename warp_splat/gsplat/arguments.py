@@ -10,7 +10,7 @@ import torch
 
 from warp_splat.config import CHANNELS_MOST
 from warp_splat.errors import InputError
-from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_range, is_one_of
+from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_opacities, is_one_of
 from warp_splat.raster.drivers import DRIVERS, driver_of
 
 CHOICES = {
@@ -31,7 +31,6 @@ COEFFICIENTS = {
     "thin_prism_coeffs": {"pinhole": 4},
 }
 OPTIONAL = ("covars", "viewmats_rs", "backgrounds", *COEFFICIENTS)
-ROUNDING = 1e-5  # by which an opacity may lie above 1; alpha is clamped anyway
 #: Of rolling shutters: along which axis of the image they read, and whether from its end.
 SHUTTERS = {
     "ROLLING_TOP_TO_BOTTOM": (1, False),
@@ -106,9 +105,7 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
         if name not in flat and (given[name] is not None or name not in OPTIONAL):
             _check_tensor(name, given[name], (*batch, *shape), means.device)
             flat[name] = given[name].reshape(math.prod(batch), *shape)
-    opacities = flat["opacities"].detach()
-    outside = bool(((opacities < 0) | (opacities > 1 + ROUNDING)).any())
-    check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
+    check_opacities(flat["opacities"].detach())
     for name in ("viewmats", "viewmats_rs"):
         if name in flat and not bool(torch.linalg.det(flat[name].detach()).all()):
             raise InputError(f"{name}: expected matrices from world to camera, got one that has no inverse.")

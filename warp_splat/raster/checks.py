@@ -26,6 +26,7 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import DRIVERS
 
+ROUNDING = 1e-5  # by which an opacity may lie above 1; alpha is clamped anyway
 CAMERA_PIXELS_MOST = 2**32  # 80 GiB of image, alpha and what the adjoint reads; kernels number tiles with 32 bits
 
 
@@ -131,8 +132,7 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
     for name, tensor in named.items():
         _check_finite(name.strip(), tensor.detach())
     check_range("scales", scales, bool((scales <= 0).any()), "positive values (activated, not their logarithm)")
-    outside = bool(((opacities < 0) | (opacities > 1)).any())
-    check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
+    check_opacities(opacities)
     return Gaussians(*(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
 
 
@@ -186,11 +186,17 @@ def check_background(background, device: torch.device) -> torch.Tensor:
     return background
 
 
+def check_opacities(opacities: torch.Tensor) -> None:
+    """Raise InputError if one lies outside of 0..1 by more than rounding."""
+    outside = bool(((opacities < 0) | (opacities > 1 + ROUNDING)).any())
+    check_range("opacities", opacities, outside, "values in 0..1 (activated, not logits)")
+
+
 def check_range(name: str, tensor: torch.Tensor, outside: bool, wanted: str) -> None:
     """Raise InputError with the tensor's range if it lies ``outside`` what is ``wanted``."""
     if outside:
         low, high = tensor.min().item(), tensor.max().item()
-        raise InputError(f"{name}: expected {wanted}, got values from {low:g} to {high:g}.")
+        raise InputError(f"{name}: expected {wanted}, got values from {low:.8g} to {high:.8g}.")
 
 
 def _dense(tensor: torch.Tensor) -> torch.Tensor:
