@@ -14,7 +14,7 @@ from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster import api
-from warp_splat.raster.data import Gaussians, Room
+from warp_splat.raster.data import LONG, Gaussians, Room
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.runtime.launch import launch_blocks, view
 
@@ -124,6 +124,22 @@ def test_room_grows_before_it_is_needed():
     assert len(sizes) < 70  # or there would be new memory for each
     room.learn(5)
     assert room.instances == max(sizes)
+
+
+def test_room_shrinks_once_it_has_been_far_too_large_for_long():
+    room = Room()
+    room.learn(10**6)
+    large = room.instances
+    for _ in range(LONG - 1):  # the view that needed it all is among these
+        room.learn(1000)
+    assert room.instances == large
+    for _ in range(LONG):
+        room.learn(1000)
+    assert 1250 <= room.instances < 3000
+    room = Room(2000)
+    for _ in range(3 * LONG):
+        room.learn(1000)
+    assert room.instances == 2048, "no new memory where little is gained"
 
 
 @pytest.mark.slow

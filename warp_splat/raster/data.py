@@ -20,6 +20,7 @@ from warp_splat.kernels.structs import BinsView, PixelsView, Splats2DView
 from warp_splat.runtime.launch import pack_struct
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
+LONG = 1000  # views: a training sees all of its photographs meanwhile, mostly several times
 WIDTHS = (2, 3, 1, 3, 1)  # columns of a slot: mean, conic, opacity, color, and depth where it is asked for
 
 
@@ -89,17 +90,23 @@ class Room:
     """For how many tile instances a GPU makes room before it knows their number; kept from one view to the next.
 
     It is a quarter more than there were in any view so far. As long as none is known, the host waits for the number.
-    The number of a view is on its way to the host while the view is rendered; see :meth:`overflowed`.
+    The number of a view is on its way to the host while the view is rendered; see :meth:`overflowed`. Where views have
+    needed less than half of it for LONG, it shrinks to what the largest of these takes.
     """
 
     instances: int = 0  # 0: not known
     counted: Callable[[], list] | None = None  # tile instances of the last view
+    recent: int = 0  # the most that any view needed since `views` was 0
+    views: int = 0
 
     def learn(self, count: int) -> None:
         """Make room for ``count`` and some more, in steps of an eighth at most: memory of the same size is at hand."""
-        wanted = count + count // 4
-        step = 1 << max(wanted.bit_length() - 4, 10)
-        self.instances = max(self.instances, -(-wanted // step) * step)
+        self.instances = max(self.instances, _with_spare(count))
+        self.recent, self.views = max(self.recent, count), self.views + 1
+        if self.views == LONG:
+            enough = _with_spare(self.recent)
+            self.instances = enough if 2 * enough < self.instances else self.instances
+            self.recent = self.views = 0
 
     def overflowed(self) -> bool:
         """Whether the last view had more than there was room for: what it shows is wrong. The next one is waited for.
@@ -113,6 +120,13 @@ class Room:
         if count > room:
             self.instances = 0
         return count > room
+
+
+def _with_spare(count: int) -> int:
+    """Room for ``count`` instances; see :meth:`Room.learn`."""
+    wanted = count + count // 4
+    step = 1 << max(wanted.bit_length() - 4, 10)
+    return -(-wanted // step) * step
 
 
 class Pixels(NamedTuple):
