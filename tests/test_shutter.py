@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, check_gradients, rasterize
-from warp_splat.compare import oracle, truth
+from warp_splat.compare import exact_shutter, oracle, truth
 from warp_splat.compare.exact_camera import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.formats import model_folder
@@ -105,6 +105,39 @@ def test_image_and_gradients_are_those_in_float64(name, options, device):
     expected = torch.autograd.grad((wanted.image * weights).sum(), exact_leaves)
     for one, other in zip(found, expected, strict=True):
         assert (one.cpu() - other).norm() < ERROR * other.norm()
+
+
+def test_beyond_the_picture_the_motion_ends_and_that_alone_is_what_an_oracle_without_the_end_misses(monkeypatch):
+    """Gaussians of which a tail alone reaches into the picture: their means lie at up to twice its half height."""
+    generator, count = torch.Generator().manual_seed(1), 40
+    uniform = lambda *shape: torch.rand(count, *shape, generator=generator)  # noqa: E731
+    depth = 2 + 2 * uniform()
+    across, down = (depth[:, None] * 2 * (2 * uniform(2) - 1)).T
+    given = [torch.stack([across, down, depth], 1), 2 * uniform(4) - 1, 0.2 + uniform(3), 0.2 + 0.6 * uniform()]
+    given.append(2 * uniform(1, 3) - 1)
+    camera = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(3), np.zeros(3), shutter=SHUTTER)
+    leaves, exact_leaves = (
+        [t.to(kind, copy=True).requires_grad_() for t in given] for kind in (torch.float32, torch.float64)
+    )
+    out = rasterize(*leaves, camera)
+    weights = torch.randn(48, 64, 3, generator=generator)
+
+    def off():
+        """The largest difference of a sure pixel, and of a gradient relative to its norm."""
+        wanted = oracle.exact_render(
+            *exact_leaves, camera, torch.zeros(3).double(), **truth.for_oracle(RasterOptions())
+        )
+        sure = ~wanted.fragile
+        loss = ((out.image * weights)[sure].sum(), (wanted.image * weights)[sure].sum())
+        found = torch.autograd.grad(loss[0], leaves, retain_graph=True)
+        expected = torch.autograd.grad(loss[1], exact_leaves)
+        far = max(float((a - b).norm() / b.norm()) for a, b in zip(found, expected, strict=True))
+        return float((out.image - wanted.image)[sure].detach().abs().max()), far
+
+    assert max(off()) < ERROR
+    monkeypatch.setattr(exact_shutter, "LATEST", 1e9)
+    image, gradient = off()
+    assert 1e-3 < image < 0.05 and 1e-3 < gradient < 0.2
 
 
 def test_nothing_that_only_other_rows_see_is_lost(device):
