@@ -55,6 +55,7 @@ def by_torch(device, mode="manual", options=None):
 
 def on_tape(device, mode="manual", options=None, requires_grad=True):
     """The tape, its loss, and the arrays of :func:`by_torch`."""
+    wp.init()
     scene, intrinsics, weights = scene_of(device)
     given = {name: getattr(scene, name) for name in KINDS} | {"means": scene.means / 2}
     arrays = [wp.from_torch(given[name].clone(), KINDS[name], requires_grad=requires_grad) for name in KINDS]
