@@ -1,6 +1,6 @@
 """What pages repeat, from where it stands: ``python docs/make_pages.py``.
 
-- docs/flags.md, from the configurations.
+- docs/flags.md and docs/presets.md, from the configurations.
 - Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote, a table of docs/sentences.py, or, for
   ``imports``, the package's imports.
 - Figures in running text: see docs/sentences.py.
@@ -23,13 +23,14 @@ PICTURE = DOCS / "images" / "architecture.svg"
 TABLE = re.compile(r"<!-- (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 INTRODUCTION = """# Every flag
 
-`python docs/make_pages.py` wrote this page. `--help` of each command says the same; flags that are on or off have a
-`--no-` form. `train.py` is `warp-splat train`, `render.py` is `warp-splat render`, `python -m warp_splat.compare` is
+What each command can be told, as `--help` says it. `python docs/make_pages.py` wrote this page. Flags that are on or off
+have a `--no-` form. `train.py` is `warp-splat train`, `render.py` is `warp-splat render`, `python -m warp_splat.compare` is
 `warp-splat compare`.
 """
-PRESET_TEXT = """
-## What presets change
-`--preset fast`, and what training the embedded scene (without `-s`) starts from. A flag that is given takes precedence.
+PRESET_TEXT = """# What presets change
+
+`uv run train.py -s path/to/scene --preset fast` trains in less time: these are the flags that it stands for, and those
+that training the embedded scene (without `-s`) starts from. A flag that is given takes precedence.
 """
 
 
@@ -41,8 +42,8 @@ def filled(page: Path) -> str:
         make = {**sentences.TABLES, "imports": make_architecture.table}.get(name, written.read_text)
         return f"<!-- {name} -->\n{make().strip()}\n<!-- end -->"
 
-    if page.name == "flags.md":
-        return flags()
+    if page.name in GENERATED:
+        return GENERATED[page.name]()
     return sentences.filled(page.name, TABLE.sub(table, page.read_text()))
 
 
@@ -65,7 +66,12 @@ def flags() -> str:
             choices = [str(choice) for choice in item.metadata["choices"] or () if choice != ""]
             note = f" ({', '.join(choices)})" if choices else ""
             parts.append(f"| {names} | {_shown(default_of(item))} | {what}{note} |\n")
-    parts.append(PRESET_TEXT)
+    return "".join(parts)
+
+
+def presets() -> str:
+    """The page of presets."""
+    parts = [PRESET_TEXT]
     columns = {"fast": PRESETS["fast"], "embedded": EMBEDDED_DEFAULTS[""]}
     columns["embedded, fast"] = {**EMBEDDED_DEFAULTS[""], **PRESETS["fast"], **EMBEDDED_DEFAULTS["fast"]}
     changed = list(dict.fromkeys(name for values in columns.values() for name in values))
@@ -84,6 +90,8 @@ def _shown(value: object) -> str:
         return " ".join(map(str, value))
     return str(value)
 
+
+GENERATED = {"flags.md": flags, "presets.md": presets}
 
 if __name__ == "__main__":
     PICTURE.write_text(make_architecture.picture())

@@ -235,7 +235,7 @@ def sentences() -> dict[str, list[tuple]]:
             ("`stored` takes {} to {} times the adjoint", *f.span(f.stored_to_reversible(), f.one)),
             ("What it costs is {} times the memory", round(f.mebibytes("stored") / f.mebibytes("manual"))),
         ],
-        "performance.md": [
+        "steps.md": [
             (
                 "Two threads do {} times the multiply-adds of one, and moved {} times the bytes in that run",
                 f.two(f.of_two_threads("rate")),
@@ -246,7 +246,18 @@ def sentences() -> dict[str, list[tuple]]:
                 f.one(f.looked_at("full")),
                 f.one(f.looked_at("synthetic")),
             ),
+        ],
+        "performance.md": [
             ("two processes see {} times the images per second", f.two(f.images_gained())),
+        ],
+        "shutters.md": [
+            (
+                "find the means to within {} px, one step to within {} px.",
+                *(f.small(max(f.shutter(way, "off"))) for way in ("two steps", "one step")),
+            ),
+            ("the adjoint has {} registers, without spills", f.registers("project, rolling shutter")[0]),
+            ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
+            ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
         ],
         "cameras.md": [
             (
@@ -271,16 +282,9 @@ def sentences() -> dict[str, list[tuple]]:
                 *(f.two(f.footprint("OPENCV_F", w, "0.03", "seconds", "pinhole")) for w in f.WAYS),
             ),
             (
-                "are off by {} at most, relative to float64, over all",
+                "are off by {}, the largest seen, relative to float64, over all",
                 f.off_by("gaussians"),
             ),
-            (
-                "find the means to within {} px, one step to within {} px.",
-                *(f.small(max(f.shutter(way, "off"))) for way in ("two steps", "one step")),
-            ),
-            ("the adjoint has {} registers, without spills", f.registers("project, rolling shutter")[0]),
-            ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
-            ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
             *((f"{where} | {{}} |", f.off_by(*parts)) for where, parts in f.LEARNED.items()),
             (
                 "px takes {} % longer with a camera that learns its pose, fx, fy, cx and cy. Through an OPENCV lens it "
