@@ -228,7 +228,7 @@ def main() -> None:
         trainer = trained(arguments.scene, arguments.models, "full")
     else:
         trainer = synthetic(*SYNTHETIC)
-    trainer.scene = replace(trainer.scene, train=trainer.scene.train[:1])
+    trainer.deck.views = trainer.scene.train[:1]
     rows = [row_of(case.name, *time_in_turns(trainer, case), difference(trainer, case)) for case in CASES]
     rows += [measure_projection(trainer), measure_decoding(trainer)]
     camera = trainer.scene.train[0].camera

@@ -23,9 +23,9 @@ PICTURE = DOCS / "images" / "architecture.svg"
 TABLE = re.compile(r"<!-- (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 INTRODUCTION = """# Every flag
 
-What each command can be told, as `--help` says it. `python docs/make_pages.py` wrote this page. Flags that are on or off
-have a `--no-` form. `train.py` is `warp-splat train`, `render.py` is `warp-splat render`, `python -m warp_splat.compare` is
-`warp-splat compare`.
+What each command can be told, as `--help` says it. `python docs/make_pages.py` wrote this page. Flags that are on or
+off have a `--no-` form. `train.py` is `warp-splat train`, `render.py` is `warp-splat render`, and
+`python -m warp_splat.compare` is `warp-splat compare`.
 """
 PRESET_TEXT = """# What presets change
 

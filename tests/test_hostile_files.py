@@ -210,6 +210,17 @@ def test_hostile_bytes_for_long(tmp_path, valid, kind, pytestconfig):
     attack(kind, valid, tmp_path, LONG, pytestconfig.getoption("--hypothesis-seed") is not None)
 
 
+@pytest.mark.parametrize("bits", [0x7F800001, 0xFFBFFFFF, 0x7F7FFFFF])
+@pytest.mark.parametrize("kind", ["ply", "compressed.ply", "glb"])
+def test_signaling_and_huge_numbers_are_read_without_a_word(tmp_path, valid, kind, bits):
+    """NumPy warns where it casts a NaN that signals."""
+    data = bytearray(valid[kind])
+    begin = len(data) - 256 if kind == "glb" else data.rindex(b"end_header\n") + len(b"end_header\n")
+    for place in range(begin, len(data) - 8, 28):
+        data[place : place + 4] = bits.to_bytes(4, "little")
+    assert survive(tmp_path, kind, bytes(data))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_cut(tmp_path, valid, kind):
     (tmp_path / "data.bin").write_bytes(valid["data.bin"])

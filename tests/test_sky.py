@@ -54,7 +54,7 @@ def test_what_is_saved_looks_as_in_training(trained, scene):
 def test_it_is_gray_at_first_and_learns_the_color_of_what_gaussians_do_not_cover(scene, tmp_path):
     trainer, run = begin(scene, tmp_path, parts="sky", sky_lr=0.05, iterations=200)
     blue = [replace(view, image=np.full_like(view.image, (30, 90, 200))) for view in scene.train[:3]]
-    trainer.scene = replace(scene, train=blue)
+    trainer.deck.views = blue
     trainer.model.parameters["opacities"].data.fill_(-12.0)  # under what is drawn
     assert (trainer.picture(blue[0].camera) == 128).all()
     steps(trainer, run, 200)

@@ -93,9 +93,8 @@ def read_compressed(tables: PlyTables) -> SplatArrays:
     low, high = ranges.reshape(-1, 3, 2, 3).transpose(2, 1, 0, 3).repeat(CHUNK, axis=2)[:, :, :count]
     colors = _unpack(words[:, 3], COLOR_BITS)
     shares = np.stack([_unpack(words[:, 0], POINT_BITS), _unpack(words[:, 2], POINT_BITS), colors[:, :3]])
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the reader leaves out
-        means, scales, base = (low * (1 - shares) + high * shares).astype(np.float32)
-        base = (base - np.float32(0.5)) / np.float32(SH_C0)
+    means, scales, base = (low * (1 - shares) + high * shares).astype(np.float32)
+    base = (base - np.float32(0.5)) / np.float32(SH_C0)
     return SplatArrays(
         means=means,
         sh=np.concatenate([base[:, None], _harmonics(tables, count)], axis=1),

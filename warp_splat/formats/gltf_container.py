@@ -124,8 +124,7 @@ class Document:
             if index in seen:
                 raise Unexpected(f"node {index} in two places")
             seen.add(index)
-            with np.errstate(over="ignore", invalid="ignore"):
-                world = parent @ _matrix(node)
+            world = parent @ _matrix(node)
             if not np.isfinite(world).all():
                 raise ValueError(f"node {index} has a transform that is not finite")
             if "mesh" in node:
@@ -183,8 +182,7 @@ def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         Unexpected: if it stretches or shears, which would need other Gaussians.
     """
     linear = matrix[:3, :3]
-    with np.errstate(over="ignore"):
-        scale = float(np.linalg.norm(linear)) / math.sqrt(3)
+    scale = float(np.linalg.norm(linear)) / math.sqrt(3)
     turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
     if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
         raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")

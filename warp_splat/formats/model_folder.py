@@ -290,5 +290,4 @@ def _camera(entry: dict) -> Camera:
     numbers = {name: entry.get(name, middle.get(name)) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     lens = Lens(entry["lens"]["model"], tuple(entry["lens"]["coefficients"])) if entry.get("lens") else None
     shutter = Shutter(entry["shutter"]["turn"], entry["shutter"]["shift"]) if entry.get("shutter") else None
-    with np.errstate(invalid="ignore"):  # what is not finite, the camera refuses
-        return Camera(**numbers, rotation=rotation, translation=-rotation @ position, lens=lens, shutter=shutter)
+    return Camera(**numbers, rotation=rotation, translation=-rotation @ position, lens=lens, shutter=shutter)

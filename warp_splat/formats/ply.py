@@ -99,10 +99,10 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     """
     with reading(path, EXPECTED), open(path, "rb") as file:
         vertex = PlyTables(file).rows("vertex")
-    names = vertex.dtype.names or ()
-    if not set(POSITION) <= set(names):
-        raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {', '.join(names):.200}.")
-    with np.errstate(over="ignore", invalid="ignore"):  # as in load_ply; colors that are not finite are any
+        names = vertex.dtype.names or ()
+        if not set(POSITION) <= set(names):
+            found = f"{', '.join(names):.200}"
+            raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {found}.")
         points = np.stack([vertex[name].astype(np.float32) for name in POSITION], axis=1)
         colors = np.full(points.shape, GRAY, np.uint8)
         if set(COLOR) <= set(names):
@@ -136,23 +136,22 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
         if is_compressed(tables):
             return SplatFile(finite_rows(read_compressed(tables), path, report), antialiased)
         vertex = tables.rows("vertex")
-    names = vertex.dtype.names or ()
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    if rest_count not in REST_COUNTS:
-        raise InputError(
-            f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found {rest_count}; "
-            "export the Gaussians with a degree of at most 3."
-        )
-    wanted = (*POSITION, *F_DC, *_rest_names(rest_count), "opacity", *SCALE, *ROTATION)
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        raise InputError(
-            f"{path}: expected a PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
-            "missing; export it as 'PLY (standard)' or train again."
-        )
-    with np.errstate(over="ignore", invalid="ignore"):  # doubles too large for float32 become infinite, and are dropped
+        names = vertex.dtype.names or ()
+        rest_count = sum(name.startswith("f_rest_") for name in names)
+        if rest_count not in REST_COUNTS:
+            raise InputError(
+                f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found {rest_count}; "
+                "export the Gaussians with a degree of at most 3."
+            )
+        wanted = (*POSITION, *F_DC, *_rest_names(rest_count), "opacity", *SCALE, *ROTATION)
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise InputError(
+                f"{path}: expected a PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
+                "missing; export it as 'PLY (standard)' or train again."
+            )
         table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
-    splats = finite_rows(_split_columns(table, rest_count // 3), path, report)
+        splats = finite_rows(_split_columns(table, rest_count // 3), path, report)
     return SplatFile(splats, antialiased)
 
 

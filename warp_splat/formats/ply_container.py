@@ -113,8 +113,7 @@ class PlyTables:
             self.file.seek(self.start)
             first = sum(each.rows for each in before)
             lines = islice(self.file, first, first + element.rows)
-            with np.errstate(over="ignore"):  # too large for a float32: infinite, as from a double
-                rows = np.fromiter((tuple(line.split()) for line in lines), dtype)
+            rows = np.fromiter((tuple(line.split()) for line in lines), dtype)
         else:
             self.file.seek(self.start + skipped)
             rows = np.fromfile(self.file, dtype, element.rows)

@@ -22,7 +22,9 @@ class Unexpected(Exception):
 
 @contextmanager
 def reading(path: str | Path, expected: str) -> Iterator[None]:
-    """Turn what goes wrong in the block into an InputError about ``path``.
+    """Turn what goes wrong in the block into an InputError about ``path``; NumPy does not warn in it.
+
+    What is not finite, or no longer is, the caller leaves out.
 
     Args:
         path: the file that is read.
@@ -33,7 +35,8 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
             MemoryError.
     """
     try:
-        yield
+        with np.errstate(all="ignore"):
+            yield
     except InputError:
         raise
     except FileNotFoundError as error:

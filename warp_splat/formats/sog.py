@@ -156,11 +156,9 @@ class _Bundle:
         sh[:, 0] = self._codebook("sh0")[colors[:, :3]]
         if self.degree:
             sh[:, 1:] = self._harmonics()
-        with np.errstate(over="ignore", invalid="ignore"):  # what is beyond float32, the reader leaves out
-            logs = low + (high - low) * (steps / STEPS)
-            positions = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+        logs = low + (high - low) * (steps / STEPS)
         splats = SplatArrays(
-            means=positions,
+            means=(np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32),
             sh=sh,
             opacities=logit(colors[:, 3] / 255),
             scales=self._codebook("scales")[self._pixels("scales", 0)[:, :3]],
@@ -175,8 +173,7 @@ class _Bundle:
         return part
 
     def _codebook(self, part: str) -> np.ndarray:
-        with np.errstate(over="ignore"):
-            return numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
+        return numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
 
     def _pixels(self, part: str, index: int) -> np.ndarray:
         """The Gaussians' pixels [N, 4] of an image."""
