@@ -1,5 +1,9 @@
 """Kernels assembled from functions: the same as if these were called, whatever their names."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import warp as wp
@@ -60,3 +64,12 @@ def test_functions_that_cannot_be_put_in_place_are_refused(part, message):
             y = out[0]
             y = part(y)
             out[0] = y
+
+
+def test_what_is_compiled_can_be_read():
+    """What was assembled: names of a part stand in the kernel; what was written from a formula."""
+    script = Path(__file__).parents[1] / "benchmarks" / "show_kernel.py"
+    for word, line in (("project", "    qw = quat_of_w\n"), ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n")):
+        command = [sys.executable, script, word]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
+        assert f"def {word}(" in done.stdout and line in done.stdout, done.stderr
