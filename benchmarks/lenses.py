@@ -20,7 +20,7 @@ import warp as wp
 from common import write_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
-from make_scene import TARGET, camera_path
+from make_scene import TARGET, orbit
 from scene_geometry import still_life
 from scene_trace import GRID, LAMP, LAMP_HALF, Scene, Tracer, develop, trace
 
@@ -67,7 +67,7 @@ def write_scene(folder: Path) -> None:
     rays = lens.rays(places).reshape(SIZE * SIZE, GRID * GRID, 3)
     tracer, frames = Tracer(still_life()), []
     (folder / "images").mkdir()
-    for index, (center, rotation) in enumerate(zip(*camera_path(), strict=True)):
+    for index, (center, rotation) in enumerate(zip(*orbit(), strict=True)):
         place = TARGET + NEARER * (center - TARGET)
         image = wp.empty(SIZE * SIZE, dtype=wp.vec3, device="cpu")
         seen = wp.array(np.ascontiguousarray(rays @ rotation, np.float32), dtype=wp.vec3, device="cpu")
