@@ -9,7 +9,7 @@ kept in a folder and not repeated; several of these programs may run at once, an
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -50,8 +50,8 @@ def seldom() -> Iterator[None]:
     """Harmonics of higher degrees learn in every fourth step."""
     step = Optimizer._step
 
-    def some(optimizer: Optimizer, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
-        left = [group for group in groups if optimizer.iteration % 4 == 0 or group["name"] != "sh_rest"]
+    def some(optimizer: Optimizer, names: Sequence[str], rows: int, radii: torch.Tensor | None) -> None:
+        left = [name for name in names if optimizer.iteration % 4 == 0 or name != "sh_rest"]
         step(optimizer, left, rows, radii)
 
     with patch.object(Optimizer, "_step", some):

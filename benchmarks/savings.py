@@ -155,7 +155,7 @@ def outcome(trainer: Trainer, context: AbstractContextManager) -> tuple[torch.Te
     with context:
         trainer.differentiate(10)
         grads = {name: leaf.grad for name, leaf in trainer.model.parameters.items() if leaf.grad is not None}
-        trainer.optimizer.adam.zero_grad()
+        trainer.optimizer.zero_grad()
         with torch.no_grad():
             chosen = replace(trainer.options, sh_degree=trainer.degree)
             camera = trainer.scene.train[0].camera

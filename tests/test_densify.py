@@ -164,8 +164,8 @@ def test_moments_follow_their_gaussians():
     step(alone, other, -0.25)
     for name, tensor in model.parameters.items():
         assert torch.equal(tensor.detach()[:2], alone.parameters[name].detach()[[1, 4]])
-        state = optimizer.adam.state[tensor]
-        assert torch.allclose(state["exp_avg"][2], torch.full_like(state["exp_avg"][2], 0.1 * -0.25))
+        moment = optimizer.tables[name].moments[0][2]
+        assert torch.allclose(moment, torch.full_like(moment, 0.1 * -0.25))
 
 
 def test_moments_follow_when_rows_are_arranged():
@@ -176,9 +176,9 @@ def test_moments_follow_when_rows_are_arranged():
     step(alone, other, gradients)
     optimizer.arrange(order)
     for name, tensor in model.parameters.items():
-        expected, state, moments = alone.parameters[name], optimizer.adam.state[tensor], ("exp_avg", "exp_avg_sq")
-        assert torch.equal(tensor.detach(), expected.detach()[order])
-        assert all(torch.equal(state[moment], other.adam.state[expected][moment][order]) for moment in moments)
+        assert torch.equal(tensor.detach(), alone.parameters[name].detach()[order])
+        pairs = zip(optimizer.tables[name].moments, other.tables[name].moments, strict=True)
+        assert all(torch.equal(moment, expected[order]) for moment, expected in pairs)
 
 
 def test_densification_arranges_the_set_along_a_curve():
@@ -216,7 +216,7 @@ def test_reset_forgets_the_opacities_moments_only():
     model, optimizer, _ = setup(4)
     step(model, optimizer, 0.5)
     optimizer.reset_opacities(0.01)
-    moments = {name: optimizer.adam.state[tensor]["exp_avg"] for name, tensor in model.parameters.items()}
+    moments = {name: optimizer.tables[name].moments[0] for name in model.parameters}
     assert (moments["opacities"] == 0).all() and all(
         (m != 0).all() for name, m in moments.items() if name != "opacities"
     )
@@ -226,16 +226,16 @@ def test_rate_of_the_means_decays_exponentially():
     _, optimizer, _ = setup(2, position_lr_init=1e-2, position_lr_final=1e-4, position_lr_max_steps=100)
     for iteration, rate in ((0, 1e-2), (50, 1e-3), (100, 1e-4), (200, 1e-4)):
         optimizer.set_iteration(iteration)
-        assert optimizer.adam.param_groups[0]["lr"] == pytest.approx(rate * EXTENT)
+        assert optimizer.tables["means"].rate == pytest.approx(rate * EXTENT)
 
 
 def test_all_rates_fall_to_a_tenth_in_the_end():
     _, optimizer, _ = setup(2, iterations=100, cooldown=20, position_lr_init=1e-2, position_lr_final=1e-2)
     optimizer.set_iteration(0)
-    start = [group["lr"] for group in optimizer.adam.param_groups]
+    start = [table.rate for table in optimizer.tables.values()]
     for iteration, share in ((80, 1.0), (90, 0.1**0.5), (100, 0.1)):
         optimizer.set_iteration(iteration)
-        assert [group["lr"] for group in optimizer.adam.param_groups] == pytest.approx([share * lr for lr in start])
+        assert [table.rate for table in optimizer.tables.values()] == pytest.approx([share * lr for lr in start])
 
 
 def test_sparse_adam_moves_only_what_was_drawn():

@@ -198,7 +198,7 @@ def test_rates_fall_and_the_set_stays_once_settled(scene, tmp_path):
     rates, sizes = [], []
     for iteration in range(1, 32):
         steps(trainer, run, iteration)
-        rates.append(trainer.optimizer._groups["opacities"]["lr"])
+        rates.append(trainer.optimizer.tables["opacities"].rate)
         sizes.append(len(trainer.model))
     assert rates[:21] == [trainer.config.learn.opacity_lr] * 21
     np.testing.assert_allclose(rates[20:], trainer.config.learn.opacity_lr * 0.1 ** np.linspace(0, 1, 11))

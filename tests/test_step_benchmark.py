@@ -126,8 +126,7 @@ def test_inactive_degrees_get_no_gradient_and_the_same_bytes():
             trainer.update(iteration)
     for name, tensor in trainers[0].model.parameters.items():
         assert torch.equal(tensor, trainers[1].model.parameters[name]), name
-    rest = trainers[0].model.parameters["sh_rest"]
-    assert trainers[0].optimizer.adam.state[rest]["step"] == 13
+    assert trainers[0].optimizer.tables["sh_rest"].steps == 13
 
 
 def test_degree_rises_without_a_compilation(monkeypatch, capsys):

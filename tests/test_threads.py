@@ -61,7 +61,7 @@ def test_steps_are_those_of_adam_in_torch(threads, model):
     """The coefficients of higher degrees get no gradients at first: zeros to torch."""
     optimizer = Optimizer(model, TrainConfig().learn, extent=2.0)
     copies = {name: tensor.detach().double().requires_grad_() for name, tensor in model.parameters.items()}
-    groups = [{"params": [copies[group["name"]]], "lr": group["lr"]} for group in optimizer.adam.param_groups]
+    groups = [{"params": [copies[name]], "lr": table.rate} for name, table in optimizer.tables.items()]
     expected = torch.optim.Adam(groups, eps=EPS)
     generator = torch.Generator().manual_seed(1)
     for iteration in range(4):
@@ -74,10 +74,10 @@ def test_steps_are_those_of_adam_in_torch(threads, model):
         expected.step()
     for name, tensor in model.parameters.items():
         assert torch.allclose(tensor.double(), copies[name], rtol=2e-7, atol=1e-7) and tensor.grad is None
-        state, known = optimizer.adam.state[tensor], expected.state[copies[name]]
-        assert state["step"] == known["step"]
-        for key in ("exp_avg", "exp_avg_sq"):
-            assert torch.allclose(state[key].double(), known[key], rtol=1e-6, atol=1e-7)
+        table, known = optimizer.tables[name], expected.state[copies[name]]
+        assert table.steps == known["step"]
+        for key, moment in zip(("exp_avg", "exp_avg_sq"), table.moments, strict=True):
+            assert torch.allclose(moment.double(), known[key], rtol=1e-6, atol=1e-7)
 
 
 def test_activations_are_those_of_torch(threads, model):

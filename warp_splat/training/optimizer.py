@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from decimal import Decimal
 
 import numpy as np
@@ -32,22 +32,15 @@ def _root(base: float, degree: int) -> Decimal:
     return Decimal(base) ** (Decimal(1) / degree)
 
 
-class Tables:
-    """Groups of parameters and their moments, by the names of torch's Adam, which loads torch's compiler: 5 s.
+@dataclass
+class Table:
+    """A leaf, and what Adam knows of it."""
 
-    Args:
-        groups: each with ``name`` and ``params``, a list of one leaf.
-        settings: of all groups: ``lr``, ``betas``, ``eps``.
-    """
-
-    def __init__(self, groups: Sequence[dict], **settings):
-        self.param_groups = [settings | group for group in groups]
-        self.state: defaultdict[torch.Tensor, dict] = defaultdict(dict)
-
-    def zero_grad(self) -> None:
-        """Forget all gradients."""
-        for group in self.param_groups:
-            group["params"][0].grad = None
+    leaf: torch.Tensor
+    part_rate: float | Callable[[int], float] = 0.0  # of a part: a number, or a function of the iteration
+    rate: float = 0.0  # in this step
+    steps: float = 0.0
+    moments: list[torch.Tensor] = field(default_factory=list)  # as in MOMENTS; none before the first step
 
 
 class Optimizer:
@@ -76,11 +69,9 @@ class Optimizer:
         for name, leaf in self.parts.items():
             if leaf.dtype != torch.float32 or not leaf.is_contiguous():
                 raise InputError(f"parameters of a part: expected dense float32, got {name} of {leaf.dtype}.")
-        self._part_rates = {group["name"]: group["lr"] for group in parts}
-        groups = [{"name": name, "params": [leaf]} for name, leaf in model.parameters.items()]
-        betas = tuple(power(beta, batch) for beta in BETAS)
-        self.adam = Tables([*groups, *parts], lr=0.0, betas=betas, eps=EPS / self.scale)
-        self._groups = {group["name"]: group for group in self.adam.param_groups}
+        self.tables = {name: Table(leaf) for name, leaf in model.parameters.items()}
+        self.tables |= {group["name"]: Table(group["params"][0], group["lr"]) for group in parts}
+        self.betas, self.eps = tuple(power(beta, batch) for beta in BETAS), EPS / self.scale
         self.set_iteration(0)
 
     def set_iteration(self, iteration: int) -> None:
@@ -98,12 +89,14 @@ class Optimizer:
             "opacities": options.opacity_lr,
             "scales": options.scaling_lr,
             "quats": options.rotation_lr,
-            **{name: rate(iteration) if callable(rate) else rate for name, rate in self._part_rates.items()},
         }
+        for name in self.parts:
+            rate = self.tables[name].part_rate
+            rates[name] = rate(iteration) if callable(rate) else rate
         cooldown = int(min(options.cooldown, options.end))
         late = power(0.1, max(iteration - options.falls_from, 0), max(cooldown, 1))
         for name, rate in rates.items():
-            self._groups[name]["lr"] = rate * self.scale * late
+            self.tables[name].rate = rate * self.scale * late
 
     def step(self, radii: torch.Tensor | None) -> None:
         """Update from the gradients and clear them.
@@ -111,13 +104,17 @@ class Optimizer:
         Args:
             radii: [N] int32, what the image showed (0: not); None if the set has just changed, and has no gradients.
         """
-        sparse, parts = self.options.optimizer_type == "sparse_adam", [self._groups[name] for name in self.parts]
+        sparse = self.options.optimizer_type == "sparse_adam"
         if radii is not None:
-            gaussians = [group for group in self.adam.param_groups if group["name"] not in self.parts]
-            self._step(gaussians, len(radii), radii if sparse else None)
-        for group in parts:
-            self._step([group], group["params"][0].numel(), None)
-        self.adam.zero_grad()
+            self._step(self.model.NAMES, len(radii), radii if sparse else None)
+        for name, leaf in self.parts.items():
+            self._step([name], leaf.numel(), None)
+        self.zero_grad()
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for table in self.tables.values():
+            table.leaf.grad = None
 
     def load(self) -> None:
         """Compile and load what :meth:`step` launches."""
@@ -125,61 +122,52 @@ class Optimizer:
         for kind in [(sparse, halves)] + [(False, False)] * bool(self.parts):
             load_adam(self.model.device, *kind)
 
-    def _step(self, groups: list[dict], rows: int, radii: torch.Tensor | None) -> None:
+    def _step(self, names: Sequence[str], rows: int, radii: torch.Tensor | None) -> None:
         """Adam on tables of ``rows`` rows.
 
         With ``radii`` only on rows that are drawn, and without bias correction, as the reference's sparse_adam.
         """
-        tables, numbers = [], []
-        for group in groups:
-            parameter, (beta1, beta2), biases = group["params"][0], group["betas"], (1.0, 1.0)
-            state, grad = self._state(parameter), parameter.grad
+        moved, numbers, (beta1, beta2) = [], [], self.betas
+        for name in names:
+            table, grad, biases = self.tables[name], self.tables[name].leaf.grad, (1.0, 1.0)
+            table.moments = table.moments or [torch.zeros_like(table.leaf, dtype=self._kept_as(name)) for _ in MOMENTS]
             if radii is None:
-                state["step"] += 1
-            if grad is not None and parameter.numel() > 0:  # degree 0: zeros would change nothing but the count
+                table.steps += 1
+            if grad is not None and grad.numel() > 0:  # degree 0: zeros would change nothing but the count
                 if radii is None:
-                    biases = [1.0 - power(beta, state["step"]) for beta in (beta1, beta2)]
-                tables.append([parameter.detach(), grad.contiguous(), *(state[name] for name in MOMENTS)])
-                rates = [group["lr"] / biases[0], group["eps"], 1.0 / math.sqrt(biases[1])]
+                    biases = [1.0 - power(beta, table.steps) for beta in self.betas]
+                moved.append([table.leaf.detach(), grad.contiguous(), *table.moments])
+                rates = [table.rate / biases[0], self.eps, 1.0 / math.sqrt(biases[1])]
                 numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])
-        if tables:
-            move(tables, numbers, rows, radii, self.iteration)
+        if moved:
+            move(moved, numbers, rows, radii, self.iteration)
 
-    def _state(self, parameter: torch.Tensor) -> dict:
-        """Moments and number of steps, as torch's Adam keeps them, but for the latter, which is a plain number."""
-        state = self.adam.state[parameter]
-        if not state:
-            zeros = {name: torch.zeros_like(parameter, dtype=self._kept_as(parameter)) for name in MOMENTS}
-            state.update(zeros, step=0.0)
-        return state
-
-    def _kept_as(self, parameter: torch.Tensor) -> torch.dtype:
+    def _kept_as(self, name: str) -> torch.dtype:
         """The type of a parameter's moments."""
-        of_part = any(parameter is leaf for leaf in self.parts.values())
-        return HALF if self.options.half_moments and not of_part else parameter.dtype
+        return HALF if self.options.half_moments and name not in self.parts else torch.float32
 
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
         """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""
         for name in self.model.NAMES:
-            rows, nothing = added[name], torch.zeros_like(added[name])
-            self._swap(name, torch.cat([self.model.parameters[name].detach()[kept], rows]))
-            self._change_moments(name, lambda moment, nothing=nothing: torch.cat([moment[kept], nothing.to(moment)]))
+            table, rows, nothing = self.tables[name], added[name], torch.zeros_like(added[name])
+            moments = [torch.cat([moment[kept], nothing.to(moment)]) for moment in table.moments]
+            self._put(name, torch.cat([table.leaf.detach()[kept], rows]), moments)
 
     def arrange(self, order: torch.Tensor) -> None:
         """Put the rows in ``order`` (indices), moments and all."""
         for name in self.model.NAMES:
-            self._swap(name, self.model.parameters[name].detach()[order])
-            self._change_moments(name, lambda moment: moment[order])
+            table = self.tables[name]
+            self._put(name, table.leaf.detach()[order], [moment[order] for moment in table.moments])
 
     def reset_opacities(self, ceiling: float) -> None:
         """Lower every opacity to at most ``ceiling`` and forget its moments."""
-        logits = self.model.parameters["opacities"].detach()
-        self._swap("opacities", logits.clamp_max(math.log(ceiling / (1.0 - ceiling))))
-        self._change_moments("opacities", torch.zeros_like)
+        table, most = self.tables["opacities"], math.log(ceiling / (1.0 - ceiling))
+        self._put("opacities", table.leaf.detach().clamp_max(most), [torch.zeros_like(m) for m in table.moments])
 
-    def _change_moments(self, name: str, change: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        state = self.adam.state.get(self.model.parameters[name], {})
-        state.update({moment: change(state[moment]) for moment in MOMENTS if moment in state})
+    def _put(self, name: str, values: torch.Tensor, moments: list[torch.Tensor]) -> None:
+        """Put a new leaf, without a gradient, in the place of a parameter of the Gaussians."""
+        self.tables[name].leaf = self.model.parameters[name] = values.requires_grad_()
+        self.tables[name].moments = moments
 
     def state(self) -> dict[str, torch.Tensor]:
         """The parameters and all that belongs to them, as ``kind.name``: gradients, moments, and images learned from.
@@ -187,53 +175,42 @@ class Optimizer:
         Those are steps times ``batch``: bias correction then goes on as it should for any other ``batch``.
         """
         found: dict[str, torch.Tensor] = {}
-        for name, leaf in (self.model.parameters | self.parts).items():
-            found[f"parameters.{name}"] = leaf.detach()
-            if leaf.grad is not None:
-                found[f"gradients.{name}"] = leaf.grad
-            if state := self.adam.state.get(leaf):
-                found |= {f"{moment}.{name}": state[moment].to(leaf) for moment in MOMENTS}
-                found[f"images.{name}"] = torch.tensor(state["step"] * self.batch, dtype=torch.float64)
+        for name, table in self.tables.items():
+            found[f"parameters.{name}"] = table.leaf.detach()
+            if table.leaf.grad is not None:
+                found[f"gradients.{name}"] = table.leaf.grad
+            if table.moments:
+                found |= {f"{kind}.{name}": m.to(table.leaf) for kind, m in zip(MOMENTS, table.moments, strict=True)}
+                found[f"images.{name}"] = torch.tensor(table.steps * self.batch, dtype=torch.float64)
         return found
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Take what :meth:`state` gave from a checkpoint. Raises InputError if something does not fit."""
         arrays, count = checkpoint.arrays, len(checkpoint.array("parameters.means", (-1, 3)))
-        for name, old in (self.model.parameters | self.parts).items():
+        for name, table in self.tables.items():
             if name in self.parts and f"parameters.{name}" not in arrays:  # training went without this part so far
                 continue
-            shape = old.shape if name in self.parts else (count, *old.shape[1:])
+            shape = table.leaf.shape if name in self.parts else (count, *table.leaf.shape[1:])
             moments = MOMENTS if any(f"{moment}.{name}" in arrays for moment in MOMENTS) else ()
             gradients = ("gradients",) if f"gradients.{name}" in arrays else ()
-            tables = {
-                kind: torch.empty(shape, device=old.device).copy_(
+            found = {
+                kind: torch.empty(shape, device=table.leaf.device).copy_(
                     torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape))
                 )
                 for kind in ("parameters", *gradients, *moments)
             }
             if name in self.parts:
-                old.detach().copy_(tables["parameters"])  # the part knows this leaf
+                table.leaf.detach().copy_(found["parameters"])  # the part knows this leaf
             else:
-                self._swap(name, tables["parameters"])
-            leaf = self._groups[name]["params"][0]
-            leaf.grad = tables.get("gradients")
+                self._put(name, found["parameters"], [])
+            table.leaf.grad = found.get("gradients")
             if moments:
                 images = np.nan_to_num(checkpoint.array(f"images.{name}", (), np.float64)).clip(0)
-                self.adam.state[leaf] = {
-                    "step": float(np.float32(images / self.batch)),
-                    **{moment: tables[moment].to(self._kept_as(leaf)) for moment in MOMENTS},
-                }
+                table.steps = float(np.float32(images / self.batch))
+                table.moments = [found[moment].to(self._kept_as(name)) for moment in moments]
 
     def part_gradients(self) -> list[torch.Tensor]:
         """The gradients of what parts learn, zeros where there are none."""
         for leaf in self.parts.values():
             leaf.grad = torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
         return [leaf.grad for leaf in self.parts.values()]
-
-    def _swap(self, name: str, values: torch.Tensor) -> None:
-        """Put a new leaf, without a gradient, in the place of a parameter; its state moves along."""
-        old, new = self.model.parameters[name], values.requires_grad_()
-        self.model.parameters[name] = new
-        self._groups[name]["params"][0] = new
-        if old in self.adam.state:
-            self.adam.state[new] = self.adam.state.pop(old)

@@ -158,7 +158,7 @@ class Trainer:
         camera = self._through("camera", view.camera.resized(TILE, TILE), step)
         out = self._render(camera, self.behind, self._through("asks", self.options, step))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
-        self.optimizer.adam.zero_grad()
+        self.optimizer.zero_grad()
         self.optimizer.load()
         for load_kernels in having((self.growth, *self.parts), "load"):
             load_kernels()

@@ -180,11 +180,10 @@ def adam(gradient: float, kind: str, _mode: str) -> Outcome:
         optimizer.step(torch.ones(count, dtype=torch.int32))
     overflows, sparse = 0.001 * gradient**2 > check.FLOAT_MAX, kind == "sparse_adam"
     found, exact, stuck = [], [], 0
-    for group in optimizer.adam.param_groups:
-        (parameter,) = group["params"]
-        found.append(parameter.detach().double().flatten() / group["lr"])
+    for table in optimizer.tables.values():
+        found.append(table.leaf.detach().double().flatten() / table.rate)
         exact.append(torch.full_like(found[-1], 0.0 if overflows else exact_adam(gradient, 1.0, sparse)))
-        stuck += int(optimizer.adam.state[parameter]["exp_avg_sq"].isinf().sum())
+        stuck += int(table.moments[1].isinf().sum())
     error, limit = relative_error(torch.cat(found), torch.cat(exact)), 1e-5
     failures = () if error < limit else (f"steps off by {error:.1e} > {limit:.1e}",)
     says = f"moves by {exact_adam(gradient, 1.0, sparse):.3g} rates"

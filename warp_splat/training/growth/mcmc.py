@@ -60,7 +60,7 @@ class Mcmc:
         scales, quats = scales[faint], raw["quats"].detach()[faint]
         gate = activate(scales, SHARPNESS * (PRUNE_OPACITY - opacities[faint]))[1]
         drawn = torch.randint(LEVELS, (len(faint), 3), generator=self.random)  # on the host: the same on any device
-        rate = self.optimizer.adam.param_groups[0]["lr"]
+        rate = self.optimizer.tables["means"].rate
         # the covariance R S S R' times a normal vector is R S S times another
         moved = rotate(quats, scales * scales * normals()[drawn].to(scales)) * (NOISE * rate * gate)[:, None]
         means = raw["means"].detach()
