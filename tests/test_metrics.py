@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import torch
 import torch.nn.functional as F
 
 from warp_splat.errors import InputError
-from warp_splat.evaluation.metrics import METRICS, cc_psnr, evaluate_folder, psnr, ssim, write_results
+from warp_splat.evaluation.metrics import METRICS, cc_psnr, psnr, ssim, write_results
 from warp_splat.evaluation.perceptual import choose_metrics, flip
+from warp_splat.evaluation.views import evaluate_views
 from warp_splat.formats.png import load_png, save_png
 
 
@@ -143,34 +145,17 @@ def test_png_errors(tmp_path):
         load_png(tmp_path / "b.png")
 
 
-def rendered_folder(folder, pairs):
-    for index, (image, reference) in enumerate(pairs):
-        save_png(folder / "renders" / f"{index:05d}.png", image)
-        save_png(folder / "gt" / f"{index:05d}.png", reference)
-    return folder
-
-
-def test_evaluate_folder_means_the_values_of_the_images(tmp_path):
+def test_views_have_the_metrics_of_the_files_that_are_written(tmp_path):
     pairs = [images(20, 30, 5, seed=1), images(25, 12, 60, seed=2)]
-    means, per_view = evaluate_folder(rendered_folder(tmp_path, pairs), {"SSIM": ssim, "PSNR": psnr})
-    assert per_view["PSNR"] == {f"{index:05d}.png": psnr(*pair) for index, pair in enumerate(pairs)}
-    assert per_view["SSIM"] == {f"{index:05d}.png": ssim(*pair) for index, pair in enumerate(pairs)}
-    assert means == {
-        "SSIM": pytest.approx(np.mean([ssim(*pair) for pair in pairs])),
-        "PSNR": pytest.approx(np.mean([psnr(*pair) for pair in pairs])),
-    }
-
-
-def test_evaluate_folder_errors(tmp_path):
-    with pytest.raises(InputError, match="found 0 and 0"):
-        evaluate_folder(tmp_path)
-    image, reference = images(20, 30)
-    rendered_folder(tmp_path, [(image, reference[:-1])])
-    with pytest.raises(InputError, match="30x19, found 30x20"):
-        evaluate_folder(tmp_path)
-    save_png(tmp_path / "renders" / "00001.png", image)
-    with pytest.raises(InputError, match="found 2 and 1"):
-        evaluate_folder(tmp_path)
+    views = [SimpleNamespace(camera=i, name=f"{i}.jpg", picture=pair[1], mask=None) for i, pair in enumerate(pairs)]
+    metrics = {"SSIM": ssim, "PSNR": psnr}
+    means, compared = evaluate_views(lambda i, _: pairs[i][0], views, tmp_path, "test", 7, {}, metrics)
+    written = json.loads((tmp_path / "per_view.json").read_text())["ours_7"]
+    for name, metric in metrics.items():
+        folders = [tmp_path / "test" / "ours_7" / folder for folder in ("renders", "gt")]
+        expected = [metric(*(load_png(folder / f"{i:05d}.png") for folder in folders)) for i in (0, 1)]
+        assert written[name] == {"00000.png": expected[0], "00001.png": expected[1]}
+        assert [view.values[name] for view in compared] == expected and means[name] == pytest.approx(np.mean(expected))
 
 
 def read_strictly(path):
@@ -183,8 +168,8 @@ def read_strictly(path):
 def test_results_are_json_and_keep_other_methods(tmp_path):
     other = '{"ours_7000": {"SSIM": 0.5, "PSNR": Infinity}, "ours_30000": {"LPIPS": 0.1}}'
     (tmp_path / "results.json").write_text(other)  # the reference writes Infinity
-    image, _ = images(12, 12)
-    means, per_view = evaluate_folder(rendered_folder(tmp_path / "test", [(image, image)]))
+    means = {"SSIM": 1.0, "PSNR": np.inf, "CC_PSNR": np.inf}
+    per_view = {name: {"00000.png": value} for name, value in means.items()}
     write_results(tmp_path, 30000, means, per_view, {"gaussians": 12, "seconds": 1.5})
     ours = {"SSIM": means["SSIM"], "PSNR": None, "CC_PSNR": None, "gaussians": 12, "seconds": 1.5}
     expected = {"ours_7000": {"SSIM": 0.5, "PSNR": None}, "ours_30000": ours}

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_json
-from warp_splat.formats.png import check_image, load_png
+from warp_splat.formats.png import check_image
 
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
 RADIUS, SIGMA = 5, 1.5
@@ -104,43 +104,6 @@ Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]  # of an i
 METRICS: dict[str, Metric] = {"SSIM": ssim, "PSNR": psnr, "CC_PSNR": cc_psnr}  # those that need nothing but this file
 
 
-def evaluate_folder(
-    folder_split: Path, metrics: Mapping[str, Metric] = METRICS
-) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """Compare ``renders/*.png`` with ``gt/*.png`` of the same name, where ``masks/*.png`` is not black if there is one.
-
-    Args:
-        folder_split: such as ``<model>/test/ours_30000``.
-        metrics: what to measure, by name.
-
-    Returns:
-        The mean over the images of each metric, ``{"SSIM": ..., "PSNR": ..., ...}``, and the values for each image,
-        ``{"SSIM": {"00000.png": ...}, "PSNR": {...}, ...}``. PSNR is infinite if the images are equal.
-
-    Raises:
-        InputError: if there are no renders, an image has no partner, or their sizes differ.
-    """
-    folder_split = Path(folder_split)
-    names = [sorted(path.name for path in (folder_split / folder).glob("*.png")) for folder in ("renders", "gt")]
-    if not names[0] or names[0] != names[1]:
-        raise InputError(
-            f"{folder_split}: expected the same PNG files in renders and gt, found {len(names[0])} and "
-            f"{len(names[1])}; render the views again."
-        )
-    per_view: dict[str, dict[str, float]] = {metric: {} for metric in metrics}
-    for name in names[0]:
-        image, reference = load_png(folder_split / "renders" / name), load_png(folder_split / "gt" / name)
-        if image.shape != reference.shape:
-            raise InputError(
-                f"{folder_split / 'renders' / name}: expected the size of gt/{name}, "
-                f"{reference.shape[1]}x{reference.shape[0]}, found {image.shape[1]}x{image.shape[0]}."
-            )
-        mask = load_png(folder_split / "masks" / name)[..., 0] if (folder_split / "masks" / name).is_file() else None
-        for metric, measure in metrics.items():
-            per_view[metric][name] = measure(image, reference, mask)
-    return {metric: sum(values.values()) / len(values) for metric, values in per_view.items()}, per_view
-
-
 def write_results(
     model_folder: str | Path,
     iteration: int,
@@ -156,7 +119,7 @@ def write_results(
     Args:
         model_folder: the model folder.
         iteration: the iteration that was rendered.
-        means: means of each metric, as :func:`evaluate_folder` returns them.
+        means: means of each metric.
         per_view: values of each metric for each image.
         extra: more to keep in ``results.json`` beside the means: number of Gaussians, seconds, iterations per second.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.evaluation import report
-from warp_splat.evaluation.metrics import Metric, evaluate_folder, psnr, write_results
+from warp_splat.evaluation.metrics import Metric, psnr, write_results
 from warp_splat.formats.atomic import write_text
 from warp_splat.formats.png import save_png
 from warp_splat.scene.types import View
@@ -63,7 +63,7 @@ def evaluate_views(
     metrics: Mapping[str, Metric],
     where_taken: Callable[[View], Camera] | None = None,
 ) -> tuple[dict[str, float], list[Comparison]]:
-    """Render ``views`` into ``<model>/<split>/ours_<iteration>``, then ``metrics`` of the saved 8-bit images.
+    """Render ``views`` into ``<model>/<split>/ours_<iteration>``, and take ``metrics`` of these 8-bit images.
 
     With ``where_taken``, also the PSNR of renders from there, under a name of its own.
 
@@ -73,18 +73,21 @@ def evaluate_views(
     Raises:
         InputError: if a file cannot be written.
     """
-    folder = model_folder / split / f"ours_{iteration}"
-    renders = write_views(picture, views, folder)
-    means, per_view = evaluate_folder(folder, metrics)
-    if where_taken:
-        values = [psnr(picture(where_taken(view), view.name), view.picture, view.mask) for view in views]
-        per_view[POSE] = dict(zip(per_view["PSNR"], values, strict=True))
-        means[POSE] = sum(values) / len(values)
+    compared = []
+    renders = write_views(picture, views, model_folder / split / f"ours_{iteration}")
+    for view, render in zip(views, renders, strict=True):
+        photo, mask = view.picture, view.mask
+        values = {name: measure(render, photo, mask) for name, measure in metrics.items()}
+        if where_taken:
+            values[POSE] = psnr(picture(where_taken(view), view.name), photo, mask)
+        compared.append(Comparison(view.name, photo, render, values))
+    per_view = {
+        name: {f"{index:05d}.png": view.values[name] for index, view in enumerate(compared)}
+        for name in compared[0].values
+    }
+    means = {name: sum(values.values()) / len(values) for name, values in per_view.items()}
     write_results(model_folder, iteration, means, per_view, extra)
-    values = [
-        dict(zip(per_view, row, strict=True)) for row in zip(*(v.values() for v in per_view.values()), strict=True)
-    ]
-    return means, [Comparison(v.name, v.picture, r, row) for v, r, row in zip(views, renders, values, strict=True)]
+    return means, compared
 
 
 def show_views(
