@@ -1,4 +1,4 @@
-"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM); on the CPU, one pass over the rows of two images."""
+"""The training loss: (1 - lambda) L1 + lambda (1 - SSIM), on a CPU and on a GPU."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torch.autograd.function import once_differentiable
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
 from warp_splat.kernels import ssim
+from warp_splat.kernels.cuda.comparison import BAND, STRIP, PicturesView, adj_compare_block, compare_block
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.window import CHANNELS, MOMENTS, RADIUS, RING, ROWS, SLOPES, WEIGHTS, WINDOW
 from warp_splat.raster.drivers import DRIVERS, driver_of
-from warp_splat.runtime.launch import launch, pack_struct, view
+from warp_splat.runtime.launch import launch, launch_blocks, pack_struct, view
 from warp_splat.runtime.pool import even_slices
 from warp_splat.runtime.timers import stage
-from warp_splat.training.loss_in_blocks import FAR_APART, LossInBlocks
 
 LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
 #: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.
@@ -28,6 +28,7 @@ LOSS_CURVES = {
     "srgb": lambda linear: to_srgb(linear.clamp_min(0.0), torch.where),
     "log": lambda linear: torch.log1p(linear.clamp_min(0.0) / LOG_FLOOR) / math.log1p(1.0 / LOG_FLOOR),
 }
+FAR_APART = 10.0  # in units of an image's usual range
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
 
 
@@ -88,13 +89,13 @@ def _problem(image, target, lambda_dssim: float, mask) -> str | None:
 
 
 class ImageLoss(torch.autograd.Function):
-    """See :func:`image_loss`."""
+    """See :func:`image_loss`: on the CPU, one pass over the rows of two images."""
 
     @staticmethod
     def forward(ctx, image, target, lambda_dssim, limits):
         with stage("loss"):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
-            groups, centers = -(-length // LANES), _centers(image, target)
+            groups, centers = -(-length // LANES), _centers(image, target).tolist()
             if target.is_inference():  # which autograd does not keep
                 target = target.clone()
             image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
@@ -147,6 +148,34 @@ class ImageLoss(torch.autograd.Function):
             return adj.view(height, -1, CHANNELS), None, None, None
 
 
+class LossInBlocks(torch.autograd.Function):
+    """See :func:`image_loss`: on a GPU, two kernels, and nothing that the host waits for."""
+
+    @staticmethod
+    def forward(ctx, image, target, lambda_dssim, limits):
+        with stage("loss"):
+            height, length = image.shape[0], image.shape[1] * image.shape[2]
+            image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
+            ctx.pictures = (image, target, _centers(image, target), limits)
+            shares = ((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel(), lambda_dssim)
+            ctx.weights = wp.vec3(*shares)
+            ctx.blocks = -(-height // int(BAND)) * -(-length // int(STRIP))
+            sums, ctx.slopes = image.new_empty(ctx.blocks), image.new_empty(SLOPES, height, length)
+            outputs = [view(sums, wp.float32), view(ctx.slopes, wp.float32)]
+            launch_blocks(compare_block, ctx.blocks, [_dense(*ctx.pictures), ctx.weights], outputs, image.device)
+            return sums.sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_loss):
+        with stage("adjoint of loss"):
+            adj = torch.empty_like(ctx.pictures[0])
+            given = [view(ctx.slopes, wp.float32), view(adj_loss.reshape(1), wp.float32)]
+            inputs = [_dense(*ctx.pictures), ctx.weights, *given]
+            launch_blocks(adj_compare_block, ctx.blocks, inputs, [view(adj, wp.float32)], adj.device)
+            return adj.view(len(adj), -1, 3), None, None, None
+
+
 def _lanes(*shape: int) -> torch.Tensor:
     return torch.empty(*shape, LANES, dtype=torch.float32, device="cpu")
 
@@ -163,30 +192,47 @@ def _bands(height: int) -> tuple[torch.Tensor, int]:
 
 def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor, centers) -> ssim.Pictures:
     """What both kernels read of [H, L]: the target as floats or as bytes, the other is empty."""
-    types = (torch.float32, torch.uint8)
-    floats, levels = (target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype) for dtype in types)
+    floats, levels = _by_type(target)
     return pack_struct(
         ssim.Pictures, image=image, image_taps=_taps(image), limits=wp.vec2(*limits), centers=wp.vec2(*centers),
         target=floats, target_taps=_taps(floats), levels=levels, level_taps=_taps(levels, ssim.vec16b),
     )  # fmt: skip
 
 
-def _centers(image: torch.Tensor, target: torch.Tensor) -> tuple[float, float]:
-    """What to subtract from the two images: any numbers are right, the middles of their ranges keep most digits.
+def _dense(image: torch.Tensor, target: torch.Tensor, centers: torch.Tensor, limits: tuple[float, float]):
+    """Likewise for the kernels of a GPU."""
+    floats, levels = _by_type(target)
+    return pack_struct(
+        PicturesView, image=image, limits=wp.vec2(*limits), target=floats, levels=levels, centers=centers
+    )
+
+
+def _by_type(target: torch.Tensor) -> list[torch.Tensor]:
+    """The target as floats and as bytes; one of them is empty."""
+    types = (torch.float32, torch.uint8)
+    return [target if target.dtype == dtype else target.new_empty(0, 0, dtype=dtype) for dtype in types]
+
+
+def _centers(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """What to subtract from the two images, [2]: any numbers are right, the middles of their ranges keep most digits.
 
     One number for both unless they lie far apart, so that equal pixels stay equal.
     """
-    if target.dtype == torch.uint8 or not target.numel():
-        return 0.5, 0.5
-    center = _middle(target)
-    own = _middle(image.detach())
-    return (own, center) if abs(own - center) > FAR_APART else (center, center)
+    if target.dtype == torch.uint8:
+        return _halves(image.device)
+    own, other = _middle(image), _middle(target)
+    return torch.stack([torch.where((own - other).abs() > FAR_APART, own, other), other])
 
 
-def _middle(image: torch.Tensor) -> float:
+@functools.cache
+def _halves(device: torch.device) -> torch.Tensor:
+    return torch.full((2,), 0.5, device=device)
+
+
+def _middle(image: torch.Tensor) -> torch.Tensor:
     low, high = image.aminmax()
-    middle = 0.5 * low.item() + 0.5 * high.item()
-    return float(np.float32(middle)) if math.isfinite(middle) else 0.5
+    middle = 0.5 * low + 0.5 * high
+    return torch.where(middle.isfinite(), middle, 0.5)
 
 
 @functools.cache
