@@ -97,7 +97,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     if leads:  # only now: where a checkpoint is refused, the folder stays as it was
         write_inputs(run.folder, config, trainer.scene, continues=begun is not None)
     if leads and config.report.tensorboard:
-        run.events = EventLog.open(run.folder, run.iteration)
+        run.events = EventLog(run.folder, run.iteration)
     if config.machine.device == "cpu":
         say(memory.describe(trainer))
 

@@ -31,12 +31,14 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: Trai
     """Train until the last step, or until Ctrl-C has put a signal into ``interrupted``."""
     report, processes = trainer.config.report, trainer.processes
     deadline = Deadline(trainer.config.learn, trainer.photographs.full_size_from, processes.count)
-    profile = _Profile(trainer, run)
+    unprofiled = None  # iteration and seconds before the last --profile steps
     trainer.check_identical(run.iteration)
     with _progress_bar(trainer, run) as bar, timers.profile(report.profile > 0) as stages:
         while run.iteration < trainer.config.learn.end:
             iteration = run.iteration + processes.count
-            profile.begin_if_due(iteration, stages)
+            if unprofiled is None and iteration > trainer.config.learn.end - report.profile:
+                stages.clear()
+                unprofiled = run.iteration, run.seconds
             start = time.perf_counter()
             if run.iteration:  # now, since models and checkpoints are those of before the update
                 trainer.update(run.iteration)
@@ -52,14 +54,17 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: Trai
             run.spent += time.perf_counter() - done
             if trainer.config.learn.minutes and (cooldown := deadline.due(iteration, run.spent, processes)):
                 trainer.settle(iteration + 1, cooldown)
-                profile = _Profile(trainer, run)
                 bar.total = trainer.config.learn.end
                 if processes.rank == 0:
                     write_config(run.folder, trainer.config)
             if viewer:
                 viewer.between_steps(interrupted)
     run.dropped = trainer.quarantine.read(processes)
-    profile.end(stages)
+    if report.profile and unprofiled:
+        steps = (run.iteration - unprofiled[0]) // processes.count
+        times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
+        step = 1e3 * (run.seconds - unprofiled[1]) / steps
+        run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
 
 
 def _do_what_is_due(trainer: Trainer, run: Run, interrupted: list[int], bar: tqdm) -> bool:
@@ -90,27 +95,6 @@ def _progress_bar(trainer: Trainer, run: Run) -> tqdm:
     return tqdm(total=total, initial=run.iteration, disable=quiet, unit="it", **often)
 
 
-class _Profile:
-    """Of the last ``--profile`` steps, or of all there are: milliseconds of each stage."""
-
-    def __init__(self, trainer: Trainer, run: Run):
-        self.trainer, self.run = trainer, run
-        self.first = max(trainer.config.learn.end - trainer.config.report.profile, run.iteration)
-        self.before = run.seconds
-
-    def begin_if_due(self, iteration: int, stages: dict[str, float]) -> None:
-        if self.trainer.processes.reaches(iteration, [self.first + 1]):
-            stages.clear()
-            self.before = self.run.seconds
-
-    def end(self, stages: dict[str, float]) -> None:
-        run, steps = self.run, -(-(self.run.iteration - self.first) // self.trainer.processes.count)
-        if self.trainer.config.report.profile and steps > 0:
-            times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
-            step = 1e3 * (run.seconds - self.before) / steps
-            run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
-
-
 @timers.profile(False)
 def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
@@ -130,8 +114,11 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         "seconds": run.seconds,
     }
     run.history.append(record)
-    run.events.write_losses(run.iteration, values, trainer.processes.count)
-    run.events.write_record(record, split)
+    for steps_ago, loss in zip(reversed(range(len(values))), values, strict=True):
+        run.events.write(run.iteration - steps_ago * trainer.processes.count, {"train/loss": loss})
+    shown = {f"{split}/psnr_on_the_way": record["psnr"], "gaussians": record["gaussians"], "seconds": record["seconds"]}
+    run.events.write(run.iteration, shown)
+    run.events.flush()
     text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
     bar.set_postfix_str(text, refresh=False)
     if time.perf_counter() - run.preview > PREVIEW_SECONDS:

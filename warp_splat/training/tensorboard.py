@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,38 +13,26 @@ if TYPE_CHECKING:
 
 
 class EventLog:
-    """Curves of a training in its folder; without a writer, nowhere."""
+    """Curves of a training in its folder; without a folder, nowhere.
 
-    def __init__(self, writer: SummaryWriter | None = None):
-        self.writer = writer
+    Args:
+        folder: where.
+        begun: what an earlier run logged after this iteration is no longer shown.
+    """
 
-    @classmethod
-    def open(cls, folder: Path, begun: int) -> EventLog:
-        """A log in ``folder``; what an earlier run logged after iteration ``begun`` is no longer shown."""
-        return cls(writer_class()(str(folder), purge_step=begun + 1, flush_secs=10))
+    def __init__(self, folder: Path | None = None, begun: int = 0):
+        self.writer = writer_class()(str(folder), purge_step=begun + 1, flush_secs=10) if folder else None
 
-    def write_losses(self, iteration: int, losses: Sequence[float], stride: int) -> None:
-        """The losses of the steps up to ``iteration``, ``stride`` iterations apart."""
+    def write(self, iteration: int, values: Mapping[str, float]) -> None:
+        """A point of each curve, by its name."""
         if self.writer:
-            first = iteration - (len(losses) - 1) * stride
-            for number, loss in enumerate(losses):
-                self.writer.add_scalar("train/loss", loss, first + number * stride)
+            for name, value in values.items():
+                self.writer.add_scalar(name, value, iteration)
 
-    def write_record(self, record: Mapping[str, float], split: str) -> None:
-        """What an evaluation before the end found, as in ``history.json``."""
+    def flush(self) -> None:
+        """Put all into the file."""
         if self.writer:
-            step = int(record["iteration"])
-            self.writer.add_scalar(f"{split}/psnr_on_the_way", record["psnr"], step)
-            self.writer.add_scalar("gaussians", record["gaussians"], step)
-            self.writer.add_scalar("seconds", record["seconds"], step)
             self.writer.flush()
-
-    def write_means(self, iteration: int, split: str, means: Mapping[str, float]) -> None:
-        """The mean of each metric of the last evaluation; nothing follows."""
-        if self.writer:
-            for name, value in means.items():
-                self.writer.add_scalar(f"{split}/{name}", value, iteration)
-            self.writer.close()
 
 
 def writer_class() -> type[SummaryWriter]:
