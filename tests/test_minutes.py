@@ -16,6 +16,7 @@ from warp_splat.formats.model_folder import ply_path
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.deadline import REACHED, Deadline, plan_training
 from warp_splat.training.options import LearnOptions, TrainConfig, schedule_of
+from warp_splat.training.photographs import shrink_at
 from warp_splat.training.plan import (
     Cost,
     Reached,
@@ -28,7 +29,6 @@ from warp_splat.training.plan import (
     seconds_of,
 )
 from warp_splat.training.record import keep, restore
-from warp_splat.training.sizes import shrink_at
 
 FAST = parse(["train", "-s", "x", "--preset", "fast"])
 TASK, COST = Task(500_000, 10_000, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.004, 3e-7, 5e-8)

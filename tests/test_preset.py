@@ -11,7 +11,7 @@ from warp_splat.flags import flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.sizes import shares_of_size, shrink_at
+from warp_splat.training.photographs import shares_of_size, shrink_at
 from warp_splat.training.trainer import Trainer
 
 SCENE = Path(__file__).parents[1] / "assets" / "still_life"

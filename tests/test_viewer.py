@@ -20,7 +20,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import make_renderer
 from warp_splat.viewer import server
 from warp_splat.viewer.command import view_model
-from warp_splat.viewer.pace import MOST
+from warp_splat.viewer.watcher import MOST
 
 
 @pytest.fixture

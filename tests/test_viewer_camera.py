@@ -16,8 +16,8 @@ from warp_splat.errors import InputError
 from warp_splat.lenses import Lens
 from warp_splat.viewer import server
 from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
-from warp_splat.viewer.pace import FEWEST, MOST, Pace
 from warp_splat.viewer.picture import depth_colors, depth_range, overlay
+from warp_splat.viewer.watcher import FEWEST, MOST, Pace
 
 
 def project(camera, points):

@@ -105,26 +105,24 @@ def _count(config: SimplifyConfig, total: int, size_of: Callable[[int], int]) ->
 
 def _fewest(total: int, good: Callable[[int], bool]) -> int:
     """The least count found that is ``good``; ``total`` is."""
-    low, high = 0, total
-    for _ in range(TRIES):
-        if high - low < 2:
-            break
-        middle = (low + high) // 2
-        low, high = (low, middle) if good(middle) else (middle, high)
-    return high
+    return _narrowed(0, total, lambda count: not good(count))[1]
 
 
 def _most(total: int, good: Callable[[int], bool]) -> int:
     """The largest count found that is ``good``, 0 if none is."""
     if good(total):
         return total
-    low, high = (1, total) if good(1) else (0, 1)
+    return _narrowed(1, total, good)[0] if good(1) else 0
+
+
+def _narrowed(low: int, high: int, is_low: Callable[[int], bool]) -> tuple[int, int]:
+    """Nearer to where ``is_low`` ends: it holds of the first of the two, and not of the second."""
     for _ in range(TRIES):
         if high - low < 2:
             break
         middle = (low + high) // 2
-        low, high = (middle, high) if good(middle) else (low, middle)
-    return low
+        low, high = (middle, high) if is_low(middle) else (low, middle)
+    return low, high
 
 
 def squared_error(opened: Opened, splats: SplatArrays) -> float:

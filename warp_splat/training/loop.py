@@ -59,7 +59,7 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: Trai
                     write_config(run.folder, trainer.config)
             if viewer:
                 viewer.between_steps(interrupted)
-    run.dropped = trainer.quarantine.read(processes)
+    run.dropped = trainer.all_dropped()
     if report.profile and unprofiled:
         steps = (run.iteration - unprofiled[0]) // processes.count
         times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}

@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from warp_splat.flags import flags_of
 from warp_splat.training.options import TrainConfig, schedule_of
-from warp_splat.training.sizes import shrink_at
+from warp_splat.training.photographs import shrink_at
 
 COOLDOWN = 0.2  # share of the steps, where the shape has none: the end needs a beginning
 SHORTEST, LONGEST = 1e-4, 1e4  # times the shape

@@ -52,7 +52,7 @@ class Run:
     kept: int | None = None  # iteration of the last checkpoint
     kept_at: float = 0.0  # when that was written, on time.perf_counter
     stages: dict[str, float] = field(default_factory=dict)  # milliseconds per step
-    dropped: dict[str, int] = field(default_factory=dict)  # see Quarantine
+    dropped: dict[str, int] = field(default_factory=dict)  # see Trainer.all_dropped
     events: EventLog = field(default_factory=EventLog)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -35,10 +36,12 @@ from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import Deck, Photographs
-from warp_splat.training.quarantined import Quarantine
 from warp_splat.training.seams import Setting, Step, having
 
 T = TypeVar("T")
+#: What is kept from spreading because it is not finite: pixels with an upstream gradient that is not; gradients of
+#: Gaussians, which are not updated in that step; Gaussians with a parameter that is not, once for each image.
+NOT_FINITE = ("pixels", "gradients", "gaussians")
 
 
 class Trainer:
@@ -82,7 +85,7 @@ class Trainer:
         self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)
         self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
         self.told = [sentence for told in having([self.growth], "told") for sentence in told()]
-        self.quarantine = Quarantine()
+        self.dropped: Counter = Counter()  # of NOT_FINITE, on the device; prunings that would have emptied the scene
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0
         self.deck = Deck(scene.train, seed)
@@ -119,9 +122,8 @@ class Trainer:
         with stage("densify"):
             for observe in having([self.growth] if learn.grows_at(iteration) else [], "observe"):
                 observe(out, step)
-        self.quarantine.pixels += out.dropped.pixel_count
-        self.quarantine.gradients += out.dropped.gaussian_count
-        self.quarantine.gaussians += out.invalid_count
+        dropped = (out.dropped.pixel_count, out.dropped.gaussian_count, out.invalid_count)
+        self.dropped.update(dict(zip(NOT_FINITE, dropped, strict=True)))
         self._radii, loss = out.radii, loss.detach()
         if learn.optimizer_type == "sparse_adam":
             self.processes.maximum(self._radii)
@@ -140,7 +142,7 @@ class Trainer:
             changed = self.growth.update(iteration) if self.config.learn.grows_at(iteration) else None
         if changed is not None:
             self.check_identical(iteration)
-            self.quarantine.prunings += changed.refused
+            self.dropped["prunings"] += changed.refused
         with stage("Adam"):
             self.optimizer.step(self._radii if changed is None or changed.refused else None)
         for after_step in having((*self.parts, self.growth), "after_step"):
@@ -168,6 +170,12 @@ class Trainer:
         """Raise GroupError if the model is not the same, byte for byte, in all processes."""
         self.processes.check_identical([*self.model.parameters.values(), *self.optimizer.parts.values()], iteration)
 
+    def all_dropped(self) -> dict[str, int]:
+        """What was dropped so far, by name, over all processes."""
+        counts = torch.tensor([int(self.dropped[name]) for name in NOT_FINITE])
+        self.processes.sum(counts)  # but a refused pruning is the same one everywhere
+        return {**dict(zip(NOT_FINITE, counts.tolist(), strict=True)), "prunings": self.dropped["prunings"]}
+
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Tensors by name and values of JSON: all that :meth:`restore` needs to go on as if nothing had happened.
 
@@ -181,7 +189,7 @@ class Trainer:
             "views": [view.name for view in self.scene.train],
             "extent": self.scene.extent,
             **self.deck.state(),
-            **self.quarantine.state(self.processes),
+            **{f"dropped.{name}": count for name, count in self.all_dropped().items()},
         }
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -199,7 +207,10 @@ class Trainer:
                 "found other ones in the scene; name the scene that it was trained on (-s, -i, --eval)."
             )
         self.deck.restore(checkpoint)
-        self.quarantine = Quarantine.restored(checkpoint, self.processes)
+        counts = {name: checkpoint.count(f"dropped.{name}") for name in (*NOT_FINITE, "prunings")}
+        if self.processes.rank > 0:  # the first process goes on with what is summed over all
+            counts.update(dict.fromkeys(NOT_FINITE, 0))
+        self.dropped = Counter(counts)
         self.optimizer.restore(checkpoint)
         for restore in having((self.growth, *self.parts), "restore"):
             restore(checkpoint)

@@ -20,9 +20,9 @@ from warp_splat.scene.types import Scene
 from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
+from warp_splat.training.photographs import shares_of_size, shrink_at
 from warp_splat.training.plan import Task, of_length
 from warp_splat.training.seams import Verdict
-from warp_splat.training.sizes import shares_of_size, shrink_at
 from warp_splat.training.trainer import Trainer
 
 SHARE = 0.1  # of the training's work

@@ -17,8 +17,8 @@ from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.scene.types import Scene
-from warp_splat.viewer.pace import LARGEST
 from warp_splat.viewer.server import Viewer, free_port
+from warp_splat.viewer.watcher import LARGEST
 
 AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
 IDLE = 0.2  # seconds between two looks at Ctrl-C

@@ -25,9 +25,8 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene.types import Scene, View
 from warp_splat.viewer.browser_camera import look_at_all, look_from
-from warp_splat.viewer.pace import MOST
 from warp_splat.viewer.picture import KINDS, overlay, paint
-from warp_splat.viewer.watcher import Watcher
+from warp_splat.viewer.watcher import MOST, Watcher
 
 if TYPE_CHECKING:
     import viser

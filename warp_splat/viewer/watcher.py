@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from warp_splat.camera import Camera
 from warp_splat.scene.types import View
 from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, pivot, sized
-from warp_splat.viewer.pace import Pace
 from warp_splat.viewer.picture import KINDS
 
 if TYPE_CHECKING:
@@ -20,7 +19,27 @@ if TYPE_CHECKING:
 
 REST = 0.25  # seconds without a movement after which a frame is drawn sharp
 FREE = "none"  # in the list of photographs
+FRAME_SECONDS = 0.1  # to draw one while moving: 10 per second, of which the way to the browser may take half
+LARGEST = (1920, 1080)  # px; a frame at rest has at most this area
+FEWEST, MOST = 100 * 100, LARGEST[0] * LARGEST[1]  # pixels
+CHANGE = (0.25, 1.5)  # from one frame to the next: down quickly, up slowly
 STEPS = {"previous": -1, "again": 0, "next": 1}
+
+
+class Pace:
+    """The pixels that a moving frame may have, learned from what the last ones took.
+
+    A frame also has costs without any pixel. That only makes the steps too short: the size still settles where a frame
+    takes FRAME_SECONDS, or at a bound.
+    """
+
+    def __init__(self):
+        self.pixels = 0.25 * MOST
+
+    def took(self, seconds: float, pixels: int) -> None:
+        """Note that a frame of ``pixels`` took ``seconds``."""
+        change = min(max(FRAME_SECONDS / max(seconds, 1e-6), CHANGE[0]), CHANGE[1])
+        self.pixels = min(max(pixels * change, FEWEST), MOST)
 
 
 class Watcher:
