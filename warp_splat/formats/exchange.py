@@ -23,16 +23,17 @@ class Format(NamedTuple):
     load: Callable[[str | Path, Report], SplatFile]
     save: Callable[[str | Path, SplatFile, Report], None]
     along_curve: bool = False  # written in an order in which near Gaussians follow each other
+    empty: bool = True  # can say that there are no Gaussians
 
 
 FORMATS = {
     ".ply": Format(load_ply, save_ply),
     ".compressed.ply": Format(load_ply, save_compressed_ply, along_curve=True),
-    ".splat": Format(load_splat, save_splat),
+    ".splat": Format(load_splat, save_splat, empty=False),
     ".spz": Format(load_spz, save_spz),
-    ".sog": Format(load_sog, save_sog, along_curve=True),
-    ".glb": Format(load_gltf, save_gltf),
-    ".gltf": Format(load_gltf, save_gltf),
+    ".sog": Format(load_sog, save_sog, along_curve=True, empty=False),
+    ".glb": Format(load_gltf, save_gltf, empty=False),
+    ".gltf": Format(load_gltf, save_gltf, empty=False),
 }
 
 
@@ -75,10 +76,13 @@ def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) ->
         The Gaussians in the order in which they were written.
 
     Raises:
-        InputError: if the ending is unknown, a shape disagrees with the others, or the file cannot be written.
+        InputError: if the ending is unknown, a shape disagrees with the others, there are no Gaussians and the format
+            cannot say so, or the file cannot be written.
     """
     check_shapes(file.splats)
     form = format_of(path)
+    if not (form.empty or len(file.splats.means)):
+        raise InputError(f"{path}: there are no Gaussians, and such a file cannot say so; choose another format.")
     if form.along_curve:
         from warp_splat.formats.curve import arranged  # noqa: PLC0415 - torch takes seconds to load
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from warp_splat.color import COLOR_MAPS
-from warp_splat.formats.atomic import write_text
-from warp_splat.formats.model_folder import is_file_of_gaussians, ply_path
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.model_folder import read_beside, write_beside
+from warp_splat.formats.reading import Unexpected
 
 EXPOSURES = "exposures.json"
 
@@ -31,13 +29,11 @@ def write_exposures(ply: Path, exposures: Exposures | None) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
-    path = ply.parent / EXPOSURES
-    if exposures is None:
-        path.unlink(missing_ok=True)
-        return
-    maps = {name: numbers.ravel().tolist() for name, numbers in exposures.maps.items()}
-    facts = {"kind": exposures.kind, "pivot": exposures.pivot, "falloff": exposures.falloff.tolist(), "maps": maps}
-    write_text(path, json.dumps(facts, allow_nan=False))
+    facts = None
+    if exposures is not None:
+        maps = {name: numbers.ravel().tolist() for name, numbers in exposures.maps.items()}
+        facts = exposures._asdict() | {"falloff": exposures.falloff.tolist(), "maps": maps}
+    write_beside(ply, EXPOSURES, facts)
 
 
 def read_exposures(path: str | Path, iteration: int) -> Exposures | None:
@@ -46,17 +42,13 @@ def read_exposures(path: str | Path, iteration: int) -> Exposures | None:
     Raises:
         InputError: if the file is damaged.
     """
-    file = (Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)).parent / EXPOSURES
-    if not file.exists():
-        return None
-    with reading(file, "exposures as training writes them"):
-        try:
-            facts = json.loads(file.read_text(encoding="utf-8"))
-            shape, falloff = COLOR_MAPS[facts["kind"]], np.array(facts["falloff"], np.float32).reshape(2)
-            maps = {name: np.array(n, np.float32).reshape(shape) for name, n in facts["maps"].items()}
-            pivot = float(facts["pivot"])
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise Unexpected(f"other JSON ({error!s:.100})") from error
+
+    def parse(facts: dict) -> Exposures:
+        shape, falloff = COLOR_MAPS[facts["kind"]], np.array(facts["falloff"], np.float32).reshape(2)
+        maps = {name: np.array(n, np.float32).reshape(shape) for name, n in facts["maps"].items()}
+        pivot = float(facts["pivot"])
         if not all(np.isfinite(numbers).all() for numbers in (pivot, falloff, *maps.values())):
             raise Unexpected("numbers that are not finite")
-    return Exposures(facts["kind"], pivot, falloff, maps)
+        return Exposures(facts["kind"], pivot, falloff, maps)
+
+    return read_beside(path, iteration, EXPOSURES, "exposures as training writes them", parse)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_splat import __version__
+from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
@@ -52,15 +53,13 @@ def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] =
 
     Args:
         path: the file to write.
-        file: the Gaussians.
+        file: the Gaussians, at least one.
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
-        InputError: if there are no Gaussians; if a file cannot be written.
+        InputError: if a file cannot be written, or is too large for its kind.
     """
     path = Path(path)
-    if not len(file.splats.means):
-        raise InputError(f"{path}: there are no Gaussians, and a glTF file cannot say so; choose another format.")
     attributes = _attributes(turned(file.splats, frame(AXES).T), report)
     data = b"".join(array.tobytes() for array in attributes.values())
     document = _describe(attributes, file.antialiased)
@@ -116,7 +115,7 @@ def _attributes(splats: SplatArrays, report: Callable[[str], None]) -> dict[str,
     means, sh, opacities, scales, quats = splats
     opacity = sigmoid(opacities)
     shown = np.clip(SH_C0 * sh[:, 0] + 0.5, 0, 1)
-    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # COLOR_0 is linear, IEC 61966
+    linear = from_srgb(shown, np.where)  # as COLOR_0 is
     attributes = {
         "POSITION": means,
         "COLOR_0": np.rint(255 * np.concatenate([linear, opacity[:, None]], axis=1)).astype(np.uint8),

@@ -10,11 +10,11 @@ import json
 import os
 import re
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from warp_splat.lenses.shutter import Shutter
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
 
-
+T = TypeVar("T")
 CAMERAS = "cameras.json"
 ENVIRONMENT = "environment.json"
 
@@ -225,19 +225,14 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     Raises:
         InputError: if the file is damaged.
     """
-    path = Path(folder) / CAMERAS
-    if not path.exists():
-        return []
-    with reading(path, "a list of cameras as training writes it"):
-        entries = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise Unexpected("other JSON")
+
+    def parse(entries: list[dict]) -> list[tuple[str, Camera]]:
         try:
             return [(str(entry["img_name"]), _camera(entry)) for entry in entries]
-        except KeyError as error:
-            raise Unexpected(f"a camera without {error}") from error
-        except (TypeError, ValueError, InputError) as error:
+        except InputError as error:
             raise Unexpected(f"a camera with other values ({error!s:.200})") from error
+
+    return _read_json(Path(folder) / CAMERAS, "a list of cameras as training writes it", parse) or []
 
 
 def read_refined(folder: str | Path, iteration: int) -> dict[str, Camera]:
@@ -250,17 +245,12 @@ def read_refined(folder: str | Path, iteration: int) -> dict[str, Camera]:
 
 
 def write_environment(ply: Path, harmonics: np.ndarray | None) -> None:
-    """Beside a model's Gaussians, write what lies behind them: coefficients as those of a Gaussian, [16, 3].
-
-    None: nothing does; what an earlier training wrote there is removed.
+    """Beside a model's Gaussians, write what lies behind them: coefficients as those of a Gaussian, [16, 3], or None.
 
     Raises:
         InputError: if the file cannot be written.
     """
-    if harmonics is None:
-        (ply.parent / ENVIRONMENT).unlink(missing_ok=True)
-    else:
-        write_text(ply.parent / ENVIRONMENT, json.dumps({"harmonics": harmonics.tolist()}, allow_nan=False))
+    write_beside(ply, ENVIRONMENT, None if harmonics is None else {"harmonics": harmonics.tolist()})
 
 
 def read_environment(path: str | Path, iteration: int) -> np.ndarray | None:
@@ -269,18 +259,46 @@ def read_environment(path: str | Path, iteration: int) -> np.ndarray | None:
     Raises:
         InputError: if the file is damaged.
     """
-    beside = Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
-    file = beside.parent / ENVIRONMENT
-    if not file.exists():
-        return None
-    with reading(file, "harmonics as training writes them"):
-        try:
-            harmonics = np.array(json.loads(file.read_text(encoding="utf-8"))["harmonics"], np.float32)
-        except (KeyError, TypeError, ValueError) as error:
-            raise Unexpected(f"other JSON ({error!s:.100})") from error
+
+    def parse(facts: dict) -> np.ndarray:
+        harmonics = np.array(facts["harmonics"], np.float32)
         if harmonics.shape != (16, 3) or not np.isfinite(harmonics).all():
             raise Unexpected(f"numbers of shape {list(harmonics.shape)}, or such that are not finite")
-    return harmonics
+        return harmonics
+
+    return read_beside(path, iteration, ENVIRONMENT, "harmonics as training writes them", parse)
+
+
+def write_beside(ply: Path, name: str, facts: Mapping[str, object] | None) -> None:
+    """Write JSON beside a model's Gaussians. None: there is none; what an earlier training wrote there is removed.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    if facts is None:
+        (ply.parent / name).unlink(missing_ok=True)
+    else:
+        write_text(ply.parent / name, json.dumps(facts, allow_nan=False))
+
+
+def read_beside(path: str | Path, iteration: int, name: str, expected: str, parse: Callable[[Any], T]) -> T | None:
+    """What ``parse`` makes of the JSON beside the Gaussians of a model folder, or beside a file; None if there is none.
+
+    Raises:
+        InputError: if the file is damaged, or another than ``expected``.
+    """
+    beside = Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
+    return _read_json(beside.parent / name, expected, parse)
+
+
+def _read_json(path: Path, expected: str, parse: Callable[[Any], T]) -> T | None:
+    if not path.exists():
+        return None
+    with reading(path, expected):
+        try:
+            return parse(json.loads(path.read_text(encoding="utf-8")))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise Unexpected(f"other JSON ({error!s:.100})") from error
 
 
 def _camera(entry: dict) -> Camera:

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.palettes import ENTRIES, codebook, palette
 from warp_splat.formats.reading import (
@@ -58,16 +57,14 @@ def save_sog(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
 
     Args:
         path: the file to write.
-        file: the Gaussians.
+        file: the Gaussians, at least one.
         report: not called: every range follows the values.
 
     Raises:
-        InputError: if there are no Gaussians; if the file cannot be written.
+        InputError: if the file cannot be written.
     """
     means, sh, opacities, scales, quats = file.splats
     count, coefficients, _ = sh.shape
-    if not count:
-        raise InputError(f"{path}: there are no Gaussians, and a .sog file cannot say so; choose another format.")
     logs = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = logs.min(axis=0), logs.max(axis=0)
     steps = np.rint(STEPS * (logs - low) / np.where(high > low, high - low, 1)).astype(np.uint16)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.formats.splats import (
@@ -35,15 +34,13 @@ def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] 
 
     Args:
         path: the file to write.
-        file: the Gaussians, of which SH degree 0 is kept.
+        file: the Gaussians, at least one, of which SH degree 0 is kept.
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
-        InputError: if there are no Gaussians; if the file cannot be written.
+        InputError: if the file cannot be written.
     """
     means, sh, opacities, scales, quats = file.splats
-    if not len(means):
-        raise InputError(f"{path}: there are no Gaussians, and a .splat file cannot say so; choose another format.")
     colors = clipped("color", SH_C0 * sh[:, 0] + 0.5, 0, 1, report)
     rows = np.empty(len(means), ROW)
     rows["mean"] = means

@@ -25,6 +25,7 @@ from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, check_expansion, reading
 from warp_splat.formats.splats import (
     COEFFICIENTS,
+    OTHERS,
     SplatArrays,
     SplatFile,
     clipped,
@@ -48,6 +49,7 @@ COLOR_SCALE = 0.15  # of the SH coefficient of degree 0, to leave room above whi
 SCALE_STEP, SCALE_LOW = 16.0, -10.0  # per unit of the log scale; its least
 FRACTION_BITS = 12  # steps of 1/4096 world unit, as the authors write, if the scene is less than 2048 units wide
 POSITION_MAX = 2**23 - 1
+FIELDS = np.array([2**20, 2**10, 1], np.uint32)  # where the numbers of a rotation lie in their word
 DEGREE_COEFFICIENTS = (*COEFFICIENTS, 25)  # degree 4 is read, and left out
 
 
@@ -149,28 +151,21 @@ def _bytes(values: np.ndarray) -> bytes:
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
     """Rotations as uint32: which of x y z w is largest (2 bits), then the others in that order (sign, 9 bits)."""
     xyzw = unit_quats(quats)[:, [1, 2, 3, 0]]
-    rows = np.arange(len(xyzw))
     largest = np.abs(xyzw).argmax(axis=1)
-    negative = (xyzw < 0) ^ (xyzw[rows, largest] < 0)[:, None]
-    size = np.minimum(np.rint(511 * np.sqrt(2) * np.abs(xyzw)), 511).astype(np.uint32)
-    packed = largest.astype("<u4")
-    for axis in range(4):
-        with_axis = (packed << 10) | (negative[:, axis].astype("<u4") << 9) | size[:, axis]
-        packed = np.where(largest == axis, packed, with_axis)
-    return packed
+    others = np.take_along_axis(xyzw, OTHERS[largest], axis=1)
+    negative = (others < 0) ^ (np.take_along_axis(xyzw, largest[:, None], axis=1) < 0)
+    size = np.minimum(np.rint(511 * np.sqrt(2) * np.abs(others)), 511).astype("<u4")
+    return largest.astype("<u4") << 30 | (negative.astype("<u4") << 9 | size) @ FIELDS
 
 
 def _unpack_quats(stream: np.ndarray) -> np.ndarray:
-    packed = stream.view("<u4").copy()
-    largest = packed >> 30
+    packed = stream.view("<u4")
+    fields = packed[:, None] // FIELDS & 1023
+    size = (fields & 511) * np.float32(np.sqrt(0.5) / 511)
     xyzw = np.zeros((len(packed), 4), np.float32)
-    for axis in (3, 2, 1, 0):
-        stored = largest != axis
-        size = (packed & 511) * np.float32(np.sqrt(0.5) / 511)
-        xyzw[:, axis] = np.where(stored, np.where(packed & 512, -size, size), 0)
-        packed = np.where(stored, packed >> 10, packed)
+    np.put_along_axis(xyzw, OTHERS[packed >> 30], np.where(fields & 512, -size, size), axis=1)
     rest = np.maximum(0, 1 - (xyzw * xyzw).sum(axis=1))
-    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(rest)
+    xyzw[np.arange(len(xyzw)), packed >> 30] = np.sqrt(rest)
     return xyzw[:, [3, 0, 1, 2]]
 
 
