@@ -8,12 +8,12 @@ largest, then the others, 10 bits each), the scale (11, 10, 11 bits) and the col
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.ply_container import PlyTables, write_tables
+from warp_splat.formats.ply_container import PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import Unexpected
 from warp_splat.formats.splats import SH_C0, SplatArrays, clipped, from_smallest_three, logit, sigmoid, smallest_three
 
@@ -119,7 +119,7 @@ def _harmonics(tables: PlyTables, count: int) -> np.ndarray:
     return values.reshape(count, 3, len(names) // 3).transpose(0, 2, 1)
 
 
-def _columns(tables: PlyTables, element: str, names: tuple[str, ...] | list[str], code: str) -> np.ndarray:
+def _columns(tables: PlyTables, element: str, names: Sequence[str], code: str) -> np.ndarray:
     """The properties [N, len(names)] of an element, which have to have the type ``code``."""
     if element not in tables.elements:
         raise Unexpected(f"a compressed one without an element {element!r}")
@@ -127,8 +127,7 @@ def _columns(tables: PlyTables, element: str, names: tuple[str, ...] | list[str]
     wrong = [name for name in names if properties.get(name) != code]
     if wrong:
         raise Unexpected(f"a compressed one whose {element} lacks {', '.join(wrong):.200} of type {code}")
-    rows = tables.rows(element)
-    return np.stack([rows[name] for name in names], axis=1).astype(code)
+    return columns_of(tables.rows(element), names, code)
 
 
 def _pack(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

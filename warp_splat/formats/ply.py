@@ -14,7 +14,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.compressed_ply import is_compressed, read_compressed, write_compressed
-from warp_splat.formats.ply_container import PlyTables, write_tables
+from warp_splat.formats.ply_container import PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 
@@ -103,7 +103,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
         if not set(POSITION) <= set(names):
             found = f"{', '.join(names):.200}"
             raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {found}.")
-        points = np.stack([vertex[name].astype(np.float32) for name in POSITION], axis=1)
+        points = columns_of(vertex, POSITION)
         colors = np.full(points.shape, GRAY, np.uint8)
         if set(COLOR) <= set(names):
             unit = [255 if vertex.dtype[name].kind == "f" else 1 for name in COLOR]
@@ -143,29 +143,17 @@ def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFi
                 f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found {rest_count}; "
                 "export the Gaussians with a degree of at most 3."
             )
-        wanted = (*POSITION, *F_DC, *_rest_names(rest_count), "opacity", *SCALE, *ROTATION)
-        missing = [name for name in wanted if name not in names]
+        columns = (POSITION, F_DC, _rest_names(rest_count), ("opacity",), SCALE, ROTATION)
+        missing = [name for group in columns for name in group if name not in names]
         if missing:
             raise InputError(
                 f"{path}: expected a PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
                 "missing; export it as 'PLY (standard)' or train again."
             )
-        table = np.stack([vertex[name].astype(np.float32) for name in wanted], axis=1)
-        splats = finite_rows(_split_columns(table, rest_count // 3), path, report)
-    return SplatFile(splats, antialiased)
-
-
-def _split_columns(table: np.ndarray, rest: int) -> SplatArrays:
-    """Arrays from the columns x y z, f_dc, f_rest, opacity, scale, rot, with ``rest`` coefficients in each channel."""
-    sh_rest = table[:, 6 : 6 + 3 * rest].reshape(len(table), 3, rest).transpose(0, 2, 1)
-    other = table[:, 6 + 3 * rest :]
-    return SplatArrays(
-        means=table[:, :3].copy(),
-        sh=np.concatenate([table[:, None, 3:6], sh_rest], axis=1),
-        opacities=other[:, 0].copy(),
-        scales=other[:, 1:4].copy(),
-        quats=other[:, 4:8].copy(),
-    )
+        means, base, rest, opacities, scales, quats = (columns_of(vertex, group) for group in columns)
+        rest = rest.reshape(len(vertex), 3, rest_count // 3).transpose(0, 2, 1)
+        splats = SplatArrays(means, np.concatenate([base[:, None], rest], axis=1), opacities[:, 0], scales, quats)
+        return SplatFile(finite_rows(splats, path, report), antialiased)
 
 
 def _rest_names(count: int) -> list[str]:

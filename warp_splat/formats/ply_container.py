@@ -43,6 +43,14 @@ def write_tables(path: str | Path, tables: Mapping[str, np.ndarray], comments: S
             file.write(rows.data)
 
 
+def columns_of(rows: np.ndarray, names: Sequence[str], dtype: str = "f4") -> np.ndarray:
+    """Some columns of a table as [N, len(names)]."""
+    table = np.empty((len(rows), len(names)), dtype)
+    for place, name in enumerate(names):
+        table[:, place] = rows[name]
+    return table
+
+
 class Element(NamedTuple):
     """A table of the file, as the header announces it."""
 
