@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from warp_splat.errors import InputError
 
+Report = Callable[[str], object]  # is called with a line for each thing that the user should know
 NUMBER = re.compile(r"[-+]?[\d.,]+(e[-+]?\d+)?\s?\S{0,4}|-?|inf|nan")
-
-
 NAMED = 3  # things that a message names
 
 

@@ -1,32 +1,27 @@
 // Cameras: as in cameras.json, with the principal point: width, height, fx, fy, cx, cy [px]; position; rotation, the rows
-// of world from camera, whose columns are right, down and forward. They are never changed, only replaced.
+// of world from camera. Here its columns, `axes`, take its place: right, down, forward. They are never changed, only
+// replaced.
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const sum = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
 const cross = (a, b) => [0, 1, 2].map((i) => a[(i + 1) % 3] * b[(i + 2) % 3] - a[(i + 2) % 3] * b[(i + 1) % 3]);
-const axis = (camera, column) => camera.rotation.map((row) => row[column]);
-const apply = (matrix, vector) => matrix.map((row) => dot(row, vector));
 
-// The matrix that turns by `angle` about the unit vector `about` (Rodrigues).
-function turn(about, angle) {
-  const columns = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((unit) => {
-    const along = about.map((value) => value * dot(about, unit) * (1 - Math.cos(angle)));
-    return sum(sum(along, unit, Math.cos(angle)), cross(about, unit), Math.sin(angle));
-  });
-  return [0, 1, 2].map((row) => columns.map((column) => column[row]));
+// `vector` turned by `angle` about the unit vector `about` (Rodrigues).
+function turned(vector, about, angle) {
+  const along = about.map((value) => value * dot(about, vector) * (1 - Math.cos(angle)));
+  return sum(sum(along, vector, Math.cos(angle)), cross(about, vector), Math.sin(angle));
 }
 
 // The camera carried around `pivot`: by `yaw` about `up`, then by `pitch` about its own right, but never over the top.
 function orbited(camera, pivot, up, yaw, pitch) {
-  const tilt = Math.acos(Math.max(-1, Math.min(1, dot(axis(camera, 2), up)))); // 0: looks along up
+  const tilt = Math.acos(Math.max(-1, Math.min(1, dot(camera.axes[2], up)))); // 0: looks along up
   const bounded = Math.max(Math.min(0, tilt - 3.1), Math.min(Math.max(0, tilt - 0.04), pitch));
-  let { rotation, position } = camera;
-  for (const matrix of [turn(up, yaw), turn(apply(turn(up, yaw), axis(camera, 0)), bounded)]) {
-    const columns = [0, 1, 2].map((column) => apply(matrix, rotation.map((row) => row[column])));
-    rotation = [0, 1, 2].map((row) => columns.map((column) => column[row]));
-    position = sum(pivot, apply(matrix, sum(position, pivot, -1)));
-  }
-  return { ...camera, rotation, position };
+  const carried = ({ axes, position }, about, angle) => ({
+    ...camera, axes: axes.map((axis) => turned(axis, about, angle)),
+    position: sum(pivot, turned(sum(position, pivot, -1), about, angle)),
+  });
+  const beside = carried(camera, up, yaw);
+  return carried(beside, beside.axes[0], bounded);
 }
 
 // The camera in an image of another size, which shows all that its own shows, in the middle.
@@ -41,8 +36,7 @@ function fitted(camera, width, height) {
 
 // Depth of what the camera looks at: the median of those Gaussians that are near its axis.
 function focusDepth(camera, means) {
-  const [right, down, forward] = [0, 1, 2].map((column) => axis(camera, column));
-  const depths = [];
+  const [right, down, forward] = camera.axes, depths = [];
   for (let i = 0; i < means.length; i += 3) {
     const offset = [means[i] - camera.position[0], means[i + 1] - camera.position[1], means[i + 2] - camera.position[2]];
     const depth = dot(offset, forward);

@@ -73,9 +73,10 @@ class Renderer {
     return { handle, at: (name) => gl.getUniformLocation(handle, name) };
   }
 
-  // A target for images of this size; the old one is dropped.
+  // A target for images of this size; one of another size is dropped.
   resize(width, height) {
     const { gl } = this;
+    if (this.size?.[0] === width && this.size?.[1] === height) return;
     gl.deleteTexture(this.image);
     gl.deleteFramebuffer(this.blendTarget);
     this.image = this.texture(this.imageFormat, width, height);
@@ -108,9 +109,7 @@ class Renderer {
   // Draws what `camera` sees, which moves or is at rest; its size is that of the canvas times `detail`.
   draw(camera, detail, atRest) {
     const size = [camera.width, camera.height];
-    if (this.size?.[0] !== this.gl.canvas.width || this.size?.[1] !== this.gl.canvas.height) {
-      this.resize(this.gl.canvas.width, this.gl.canvas.height);
-    }
+    this.resize(this.gl.canvas.width, this.gl.canvas.height);
     this.project(camera, size);
     this.blend(size);
     this.resolve(detail);
@@ -138,16 +137,27 @@ class Renderer {
     return Math.min(1, Math.max(LEAST_DETAIL, this.detail * Math.min(1.1, factor)));
   }
 
-  project(camera, size) {
-    const { gl } = this, { handle, at } = this.programs.project;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.projectTarget);
-    const [row, end] = [Math.floor(this.range[0] / this.width), Math.ceil(this.range[1] / this.width)];
-    gl.viewport(0, row, this.width, end - row);
-    gl.disable(gl.BLEND);
+  // Begins a pass of the program `name` over the textures of its samplers; returns where its uniforms are.
+  begin(name, target, viewport, textures) {
+    const { gl } = this, { handle, at } = this.programs[name];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    gl.viewport(...viewport);
     gl.useProgram(handle);
-    this.bind([this.gaussians, this.harmonics], handle, ["gaussians", "harmonics"]);
+    Object.entries(textures).forEach(([sampler, texture], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.uniform1i(at(sampler), unit);
+    });
+    return at;
+  }
+
+  project(camera, size) {
+    const { gl, gaussians, harmonics } = this;
+    const [row, end] = [Math.floor(this.range[0] / this.width), Math.ceil(this.range[1] / this.width)];
+    const at = this.begin("project", this.projectTarget, [0, row, this.width, end - row], { gaussians, harmonics });
+    gl.disable(gl.BLEND);
     gl.uniform1i(at("end"), this.range[1]);
-    gl.uniformMatrix3fv(at("rotation"), false, camera.rotation.flat());
+    gl.uniformMatrix3fv(at("rotation"), true, camera.axes.flat());
     gl.uniform3fv(at("center"), camera.position);
     gl.uniform2f(at("focal"), camera.fx, camera.fy);
     gl.uniform2f(at("principal"), camera.cx, camera.cy);
@@ -156,14 +166,11 @@ class Renderer {
   }
 
   blend(size) {
-    const { gl } = this, { handle, at } = this.programs.blend;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.blendTarget);
-    gl.viewport(0, 0, ...size);
+    const { gl, order, projected: [meanAndRoot, rootAndColor] } = this;
+    const at = this.begin("blend", this.blendTarget, [0, 0, ...size], { order, meanAndRoot, rootAndColor });
     gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 1]);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.DST_ALPHA, gl.ONE, gl.ZERO, gl.ONE_MINUS_SRC_ALPHA);
-    gl.useProgram(handle);
-    this.bind([this.order, ...this.projected], handle, ["order", "meanAndRoot", "rootAndColor"]);
     gl.uniform2fv(at("size"), size);
     for (let first = 0; first < this.visible; first += BATCH) {
       gl.uniform1i(at("first"), first);
@@ -172,23 +179,10 @@ class Renderer {
   }
 
   resolve(detail) {
-    const { gl } = this, { handle, at } = this.programs.resolve;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, ...this.size);
+    const { gl, image } = this, at = this.begin("resolve", null, [0, 0, ...this.size], { image });
     gl.disable(gl.BLEND);
-    gl.useProgram(handle);
-    this.bind([this.image], handle, ["image"]);
     gl.uniform2fv(at("size"), this.size);
     gl.uniform1f(at("detail"), detail);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-  }
-
-  bind(textures, program, names) {
-    const { gl } = this;
-    textures.forEach((texture, unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.uniform1i(gl.getUniformLocation(program, names[unit]), unit);
-    });
   }
 }

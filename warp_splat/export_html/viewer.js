@@ -103,8 +103,9 @@ class Viewer {
   // detail.
   setCamera(camera) {
     this.lastInput = -Infinity;
-    this.move({ ...camera, position: sum(camera.position, this.scene.origin, -1) });
-    this.pivot = sum(this.camera.position, axis(this.camera, 2), focusDepth(this.camera, this.means));
+    const axes = [0, 1, 2].map((column) => camera.rotation.map((row) => row[column]));
+    this.move({ ...camera, axes, position: sum(camera.position, this.scene.origin, -1) });
+    this.pivot = sum(this.camera.position, axes[2], focusDepth(this.camera, this.means));
     return new Promise((resolve) => this.waiting.push(resolve));
   }
 
@@ -145,8 +146,8 @@ class Viewer {
   sort() {
     if (this.sorting || (this.sortedVersion === this.version && this.current)) return;
     this.sorting = true;
-    const { position } = this.camera;
-    this.worker.postMessage({ position, forward: axis(this.camera, 2), version: this.version, range: this.wanted });
+    const { position, axes: [, , forward] } = this.camera;
+    this.worker.postMessage({ position, forward, version: this.version, range: this.wanted });
   }
 
   sorted({ order, visible, version, range, milliseconds }) {
@@ -202,9 +203,9 @@ class Viewer {
   }
 
   pan(dx, dy) {
-    const { fx } = fitted(this.camera, this.canvas.clientWidth, this.canvas.clientHeight);
-    const depth = dot(sum(this.pivot, this.camera.position, -1), axis(this.camera, 2));
-    const shift = [0, 1, 2].map((i) => (-depth / fx) * (axis(this.camera, 0)[i] * dx + axis(this.camera, 1)[i] * dy));
+    const { fx, position, axes } = fitted(this.camera, this.canvas.clientWidth, this.canvas.clientHeight);
+    const perPixel = -dot(sum(this.pivot, position, -1), axes[2]) / fx;
+    const shift = [0, 1, 2].map((i) => perPixel * (axes[0][i] * dx + axes[1][i] * dy));
     this.pivot = sum(this.pivot, shift);
     this.input({ ...this.camera, position: sum(this.camera.position, shift) });
   }

@@ -8,7 +8,7 @@ largest, then the others, 10 bits each), the scale (11, 10, 11 bits) and the col
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from warp_splat.formats.ply_container import PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import Unexpected
 from warp_splat.formats.splats import SH_C0, SplatArrays, clipped, from_smallest_three, logit, sigmoid, smallest_three
+from warp_splat.text import Report
 
 CHUNK = 256  # Gaussians that share their ranges
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -39,7 +40,7 @@ def is_compressed(tables: PlyTables) -> bool:
     return "vertex" in tables.elements and WORDS[0] in tables.elements["vertex"].properties
 
 
-def write_compressed(path: str | Path, splats: SplatArrays, comments: list[str], report: Callable[[str], None]) -> None:
+def write_compressed(path: str | Path, splats: SplatArrays, comments: list[str], report: Report) -> None:
     """Write Gaussians; near ones should follow each other, since ranges of chunks are small then.
 
     Args:

@@ -13,8 +13,7 @@ from warp_splat.formats.sog import load_sog, save_sog
 from warp_splat.formats.splat32 import load_splat, save_splat
 from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows
 from warp_splat.formats.spz import load_spz, save_spz
-
-Report = Callable[[str], None]
+from warp_splat.text import Report
 
 
 class Format(NamedTuple):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +33,7 @@ from warp_splat.formats.splats import (
     turned,
     unit_quats,
 )
+from warp_splat.text import Report
 
 NAME = "KHR_gaussian_splatting"
 AXES = "LUF"
@@ -46,7 +46,7 @@ GLB_BYTES = 2**32 - 1  # the length in the header of a .glb file has four bytes
 ARRAY_BUFFER = 34962
 
 
-def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+def save_gltf(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians as a .glb file, or as a .gltf file with a .bin file beside it.
 
     The name of the .bin file holds a checksum, so that an older .gltf file keeps its own until it is replaced.
@@ -77,7 +77,7 @@ def save_gltf(path: str | Path, file: SplatFile, report: Callable[[str], None] =
     write_bytes(path, HEADER.pack(b"glTF", 2, HEADER.size + len(chunks)) + chunks)
 
 
-def load_gltf(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
     """Read all Gaussians of a .glb or .gltf file's scene, as its nodes place them.
 
     Args:
@@ -111,7 +111,7 @@ def load_gltf(path: str | Path, report: Callable[[str], None] = print) -> SplatF
     return SplatFile(_joined(parts), antialiased)
 
 
-def _attributes(splats: SplatArrays, report: Callable[[str], None]) -> dict[str, np.ndarray]:
+def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:
     means, sh, opacities, scales, quats = splats
     opacity = sigmoid(opacities)
     shown = np.clip(SH_C0 * sh[:, 0] + 0.5, 0, 1)
@@ -180,7 +180,7 @@ def _splat_primitives(mesh: dict) -> list[dict]:
     ]
 
 
-def _read_primitive(document: Document, primitive: dict, report: Callable[[str], None]) -> SplatArrays:
+def _read_primitive(document: Document, primitive: dict, report: Report) -> SplatArrays:
     extension, attributes = primitive["extensions"][NAME], primitive.get("attributes")
     if not isinstance(extension, dict) or not isinstance(attributes, dict):
         raise Unexpected("a primitive without attributes")

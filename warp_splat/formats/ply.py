@@ -7,7 +7,6 @@ length. ``f_rest`` is channel-major: all coefficients of red, then of green, the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from warp_splat.formats.compressed_ply import is_compressed, read_compressed, wr
 from warp_splat.formats.ply_container import PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
+from warp_splat.text import Report
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # zeros; only there because readers of the reference's files may expect them
@@ -32,7 +32,7 @@ ANTIALIASED = "SplatRenderMode: mip"  # the comment that Brush and splat-transfo
 ANTIALIASED_READ = {ANTIALIASED, "antialiased 1"}  # the second is Postshot's
 
 
-def save_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+def save_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians as stored (see :class:`SplatArrays`); equal arrays give equal bytes.
 
     Args:
@@ -54,7 +54,7 @@ def save_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
     write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased)
 
 
-def save_compressed_ply(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+def save_compressed_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians as a compressed PLY file, in the given order, in which near ones should follow each other.
 
     Args:
@@ -88,7 +88,7 @@ def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> Non
     write_tables(path, {"vertex": rows})
 
 
-def load_points(path: str | Path, report: Callable[[str], None] = print) -> tuple[np.ndarray, np.ndarray]:
+def load_points(path: str | Path, report: Report = print) -> tuple[np.ndarray, np.ndarray]:
     """Read a point cloud: x y z and, if there are any, red green blue (0..255, or 0..1 as floats; gray otherwise).
 
     Returns:
@@ -115,7 +115,7 @@ def load_points(path: str | Path, report: Callable[[str], None] = print) -> tupl
     return points[finite], colors[finite]
 
 
-def load_ply(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+def load_ply(path: str | Path, report: Report = print) -> SplatFile:
     """Read Gaussians, compressed ones or by property name: any order, with or without normals, SH degree 0 to 3.
 
     Rows with a value that is not finite (as a float32) are left out, since one of them can spoil a whole image.

@@ -14,7 +14,6 @@ import json
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +39,7 @@ from warp_splat.formats.splats import (
     sigmoid,
     smallest_three,
 )
+from warp_splat.text import Report
 
 META = "meta.json"
 META_BYTES = 2**20  # fifty times that of any scene
@@ -52,7 +52,7 @@ SPARE_PIXELS = 2**16  # that an image may have beyond twice the Gaussians
 PIXEL_BYTES = 20  # of a Gaussian's images, without harmonics
 
 
-def save_sog(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians as a .sog file; near ones should follow each other, since images of them compress better.
 
     Args:
@@ -109,7 +109,7 @@ def save_sog(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
             archive.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(image))
 
 
-def load_sog(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+def load_sog(path: str | Path, report: Report = print) -> SplatFile:
     """Read a .sog file of version 2.
 
     Args:

@@ -7,7 +7,6 @@ as 128 * q + 128. The axes are those of the PLY file. Spherical harmonics above 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +24,12 @@ from warp_splat.formats.splats import (
     sigmoid,
     unit_quats,
 )
+from warp_splat.text import Report
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+def save_splat(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians as a .splat file.
 
     Args:
@@ -52,7 +52,7 @@ def save_splat(path: str | Path, file: SplatFile, report: Callable[[str], None] 
         rows.tofile(temporary)
 
 
-def load_splat(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+def load_splat(path: str | Path, report: Report = print) -> SplatFile:
     """Read a .splat file; what is no number, or a negative scale, becomes one that is not finite.
 
     Args:

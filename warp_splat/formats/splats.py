@@ -6,12 +6,12 @@ turn the Gaussians on writing and back on reading (:func:`turned`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.text import Report
 
 COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
 SH_C0 = 0.28209479177387814  # color = SH_C0 * (coefficient of degree 0) + 0.5
@@ -49,7 +49,7 @@ def check_shapes(splats: SplatArrays) -> None:
         raise InputError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
 
 
-def finite_rows(splats: SplatArrays, path, report: Callable[[str], None]) -> SplatArrays:
+def finite_rows(splats: SplatArrays, path, report: Report) -> SplatArrays:
     """Leave out Gaussians with a value that is not finite, since one can spoil a whole image; ``report`` says so."""
     count = len(splats.means)
     finite = np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in splats], axis=0)
@@ -107,7 +107,7 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
     return quats.astype(np.float32)
 
 
-def clipped(what: str, values: np.ndarray, low: float, high: float, report: Callable[[str], None]) -> np.ndarray:
+def clipped(what: str, values: np.ndarray, low: float, high: float, report: Report) -> np.ndarray:
     """``values`` [N, ...] moved into a format's range; ``report`` is told of how many Gaussians if there are any."""
     outside = (values < low) | (values > high)
     if outside.any():

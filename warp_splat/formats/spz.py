@@ -15,7 +15,6 @@ import gzip
 import io
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -35,6 +34,7 @@ from warp_splat.formats.splats import (
     turned,
     unit_quats,
 )
+from warp_splat.text import Report
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, streams (version 4)
@@ -64,7 +64,7 @@ class _Packed(NamedTuple):
     axes: str
 
 
-def save_spz(path: str | Path, file: SplatFile, report: Callable[[str], None] = print) -> None:
+def save_spz(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians as an SPZ file, version 3.
 
     Args:
@@ -99,7 +99,7 @@ def save_spz(path: str | Path, file: SplatFile, report: Callable[[str], None] = 
             target.write(b"".join(payload))
 
 
-def load_spz(path: str | Path, report: Callable[[str], None] = print) -> SplatFile:
+def load_spz(path: str | Path, report: Report = print) -> SplatFile:
     """Read an SPZ file of version 2, 3 or 4.
 
     Args:

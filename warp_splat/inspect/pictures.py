@@ -92,10 +92,8 @@ def _on_photos(subject: Subject, measured: Measured) -> Figure:
             title = f"{photo.name}: median {np.median(errors):.2f} px"
         else:
             points = np.array(sample(list(subject.points[visible(photo.camera, subject.points)]), DOTS)).reshape(-1, 3)
-            x, y, z = photo.camera.rotation @ points.T + photo.camera.translation[:, None]
-            scale = small.shape[1] / photo.camera.width
-            u, v = photo.camera.fx * x / z + photo.camera.cx, photo.camera.fy * y / z + photo.camera.cy
-            axes.scatter(u * scale, v * scale, c=ORANGE, s=1.5)
+            pixels = photo.camera.pixels(points @ photo.camera.rotation.T + photo.camera.translation)
+            axes.scatter(*pixels.T * small.shape[1] / photo.camera.width, c=ORANGE, s=1.5)
             title = photo.name
         axes.set_title(title, fontsize=7, color=INK, pad=2)
         axes.set_xlim(0, small.shape[1])

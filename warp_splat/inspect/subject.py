@@ -15,7 +15,7 @@ from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
 from warp_splat.scene import colmap, images, takes_colmap, transforms, with_masks
 from warp_splat.scene.images import Photo
-from warp_splat.scene.lenses import make_photo, make_sampling
+from warp_splat.scene.lenses import make_sampling
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.text import few
 
@@ -100,31 +100,25 @@ def _read_colmap(subject: Subject) -> Iterator[Finding]:
 
 def _match_files(subject: Subject) -> Iterator[Finding]:
     """Find the file of each registered image and compare its size with the camera's; fills ``subject.photos``."""
-    model, root = subject.model, subject.root
-    registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+    root, registered = subject.root, colmap.registered_images(subject.model)
     if not registered:
         yield Finding("files", "error", "the model has no registered images; run the mapper again.")
     missing, scaled, wrong = [], [], False
     finder, sampling = ImageFinder(root), make_sampling()
     for image in registered:
+        check = "files"
         try:
             path = finder.find(image.name)
             if path is None:
                 missing.append(image.name)
                 continue
             size = images.read_size(path)
+            check = "sizes"
+            subject.photos.append(colmap.photo_of(image, path, size, sampling))
+            scaled += [image.name] * (size != colmap.size_of(image))
         except InputError as error:
-            yield Finding("files", "error", str(error))
-            continue
-        try:
-            subject.photos.append(
-                make_photo(image.name, path, colmap.lens_of(image), colmap.pose_of(image), size, sampling)
-            )
-        except InputError as error:
-            wrong = True
-            yield Finding("sizes", "error", str(error))
-        if size != (image.camera.width, image.camera.height):
-            scaled.append(image.name)
+            wrong |= check == "sizes"
+            yield Finding(check, "error", str(error))
     if missing:
         hint = "copy them there" if root.is_dir() else "there is no such folder; name another with --images"
         text = f"{len(missing)} of {len(registered)} images are missing in {root}: {few(missing)}; {hint}."

@@ -55,10 +55,10 @@ def check_cameras(subject: Subject) -> Iterator[Finding]:
 def check_names(subject: Subject) -> Iterator[Finding]:
     """Names that occur twice, images that are the same file, images that no camera belongs to."""
     stems: dict[str, list[str]] = defaultdict(list)
-    copies: dict[tuple[int, str], list[str]] = defaultdict(list)
+    copies: dict[bytes, list[str]] = defaultdict(list)
     for photo in subject.photos:
         stems[str(Path(photo.name).with_suffix("")).lower()].append(photo.name)
-        copies[photo.path.stat().st_size, _digest(photo.path)].append(photo.name)
+        copies[hashlib.sha256(photo.path.read_bytes()).digest()].append(photo.name)
     once = True
     for what, groups in (("the same name but for ending or case", stems), ("the same bytes", copies)):
         twice = [" = ".join(names) for names in groups.values() if len(names) > 1]
@@ -73,11 +73,6 @@ def check_names(subject: Subject) -> Iterator[Finding]:
         if extra:
             text = f"{len(extra)} images in {subject.root} have no camera and are not used: {few(extra)}."
             yield Finding("unregistered", "note", text)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def check_masks(subject: Subject) -> Iterator[Finding]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from warp_splat.config import LENSES
 from warp_splat.errors import InputError
 from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, find_mask, is_video, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, visible
+from warp_splat.text import Report
 
 if TYPE_CHECKING:
     from warp_splat.scene.images import Photo
@@ -35,7 +35,7 @@ def load_scene(
     invert_masks: bool = False,
     start: str = "",
     lens: str = "undistort",
-    report: Callable[[str], object] = print,
+    report: Report = print,
 ) -> Scene:
     """Load a folder with a COLMAP model (sparse/), a nerf-synthetic scene (transforms_train.json) or transforms.json.
 
@@ -92,7 +92,7 @@ def load_scene(
     return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source))
 
 
-def _drop_masked(views: list[View], source: str | Path, report: Callable[[str], object]) -> list[View]:
+def _drop_masked(views: list[View], source: str | Path, report: Report) -> list[View]:
     """The views with a pixel that counts."""
     kept = [view for view in views if view.mask is None or view.mask.any()]
     require_unmasked(len(views), len(views) - len(kept), source)
@@ -123,7 +123,7 @@ def require_one_kind(photographs: list[tuple[str, bool]], source: str | Path) ->
 
 
 def read_photos(
-    source: str | Path, folder: str, report: Callable[[str], object], native: bool = False
+    source: str | Path, folder: str, report: Report, native: bool = False
 ) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
     """All of a scene but its pixels; see :func:`load_scene`.
 
@@ -168,7 +168,7 @@ def takes_colmap(source: Path) -> bool:
     return (source / "sparse").is_dir() and (pycolmap is not None or not has_transforms(source))
 
 
-def with_masks(photos: list[Photo], source: Path, report: Callable[[str], object]) -> list[Photo]:
+def with_masks(photos: list[Photo], source: Path, report: Report) -> list[Photo]:
     """The photos with the masks that lie in the scene's folder, besides those that they have."""
     if photos and (source / MASKS).is_dir():
         masks = ImageFinder(source / MASKS)

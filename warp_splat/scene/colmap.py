@@ -16,6 +16,7 @@ from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.scene.types import Sightings
+from warp_splat.text import Report
 
 UINT32, UINT32_PAIR, UINT64 = struct.Struct("<I"), struct.Struct("<II"), struct.Struct("<Q")
 SENSOR, POSE = 8, 56  # bytes: its kind and number; quaternion and translation
@@ -25,7 +26,7 @@ POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the t
 
 
 def read_colmap(
-    source: Path, folder: str, report: Callable[[str], object], native: bool = False
+    source: Path, folder: str, report: Report, native: bool = False
 ) -> tuple[list[Photo], np.ndarray, np.ndarray]:
     """Read the largest model under ``source``/sparse and find its images in ``source``/``folder``.
 
@@ -42,7 +43,7 @@ def read_colmap(
         InputError: if the model cannot be read, lacks images, or disagrees with the image files.
     """
     where, model = _largest_model(source / "sparse", report)
-    registered = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
+    registered = registered_images(model)
     if not registered:
         raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run its mapper again.")
     points, colors = _points(model, report)
@@ -85,7 +86,7 @@ def find_models(sparse: Path) -> list[Path]:
     return folders
 
 
-def _largest_model(sparse: Path, report: Callable[[str], object]) -> tuple[Path, pycolmap.Reconstruction]:
+def _largest_model(sparse: Path, report: Report) -> tuple[Path, pycolmap.Reconstruction]:
     folders = find_models(sparse)
     models = {path: read_model(path) for path in folders}
     largest = max(folders, key=lambda path: models[path].num_reg_images())
@@ -190,7 +191,7 @@ RECORD_ENDS = {
 }
 
 
-def _points(model: pycolmap.Reconstruction, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
+def _points(model: pycolmap.Reconstruction, report: Report) -> tuple[np.ndarray, np.ndarray]:
     records = [point for _, point in sorted(model.points3D.items(), key=lambda item: item[0])]
     points = np.array([point.xyz for point in records], np.float32).reshape(-1, 3)
     colors = np.array([point.color for point in records], np.uint8).reshape(-1, 3)
@@ -201,35 +202,32 @@ def _points(model: pycolmap.Reconstruction, report: Callable[[str], object]) -> 
 
 
 def _photos(
-    where: Path,
-    registered: list[pycolmap.Image],
-    root: Path,
-    report: Callable[[str], object],
-    sampling: Sampling | None,
+    where: Path, registered: list[pycolmap.Image], root: Path, report: Report, sampling: Sampling | None
 ) -> list[Photo]:
-    finder = ImageFinder(root)
     names = [image.name for image in registered]
-    paths = finder.find_all(
-        names, f"images of {where}", "copy them there or choose another folder with --images", report
-    )
-    photos, scaled = [], 0
-    for image, path in zip(registered, paths, strict=True):
-        size = images.read_size(path)
-        photos.append(make_photo(image.name, path, lens_of(image), pose_of(image), size, sampling))
-        scaled += size != (image.camera.width, image.camera.height)
+    hint = "copy them there or choose another folder with --images"
+    paths = ImageFinder(root).find_all(names, f"images of {where}", hint, report)
+    sizes = [images.read_size(path) for path in paths]
+    photos = [photo_of(*each, sampling) for each in zip(registered, paths, sizes, strict=True)]
+    scaled = sum(size != size_of(image) for size, image in zip(sizes, registered, strict=True))
     if scaled:
         report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {root.name}.")
     tell_lenses(photos, report)
     return photos
 
 
-def lens_of(image: pycolmap.Image) -> Calibration:
-    """What took the image."""
-    camera = image.camera
-    return Calibration(camera.model_name, camera.width, camera.height, tuple(camera.params))
+def size_of(image: pycolmap.Image) -> tuple[int, int]:
+    """Width and height [px] that a registered image's camera has."""
+    return image.camera.width, image.camera.height
 
 
-def pose_of(image: pycolmap.Image) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] of camera_from_world."""
+def photo_of(image: pycolmap.Image, path: Path, size: tuple[int, int], sampling: Sampling | None) -> Photo:
+    """The photo of a registered image; see :func:`make_photo`."""
     pose = image.cam_from_world()
-    return pose.rotation.matrix(), pose.translation
+    lens = Calibration(image.camera.model_name, *size_of(image), tuple(image.camera.params))
+    return make_photo(image.name, path, lens, (pose.rotation.matrix(), pose.translation), size, sampling)
+
+
+def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Those that have a pose, by name."""
+    return sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)

@@ -16,8 +16,10 @@ from warp_splat.lenses.formulas import MODELS
 from warp_splat.scene import images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
+from warp_splat.text import Report
 
 Sampling = Callable[..., np.ndarray]
+Pose = tuple[np.ndarray, np.ndarray]  # rotation [3, 3] and translation [3] of camera_from_world
 PINHOLE = "PINHOLE"  # fx, fy, cx, cy: the model that needs no pycolmap
 
 
@@ -30,10 +32,13 @@ class Calibration:
     height: int
     params: tuple[float, ...]
 
-    def load(self) -> pycolmap.Camera:
-        """The same for pycolmap. Raises InputError where that is missing."""
+    def load(self, *size: int) -> pycolmap.Camera:
+        """The same for pycolmap, for images of another ``size`` if it is given. Raises InputError without pycolmap."""
         require_pycolmap(f"lens {self.model}")
-        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=self.params)
+        camera = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=self.params)
+        if size:
+            camera.rescale(*size)
+        return camera
 
 
 def make_sampling(native: bool = False) -> Sampling | None:
@@ -44,12 +49,7 @@ def make_sampling(native: bool = False) -> Sampling | None:
 
 
 def make_photo(
-    name: str,
-    path: Path,
-    lens: Calibration,
-    pose: tuple[np.ndarray, np.ndarray],
-    size: tuple[int, int],
-    sampling: Sampling | None,
+    name: str, path: Path, lens: Calibration, pose: Pose, size: tuple[int, int], sampling: Sampling | None
 ) -> Photo:
     """The photo whose file has ``size`` = (width, height) pixels, taken through ``lens`` at a pose, world to camera.
 
@@ -80,7 +80,7 @@ def make_photo(
         return Photo(name, path, _pinhole(_undistorted(lens, size), pose), resample, model=lens.model)
 
 
-def tell_lenses(photos: list[Photo], report: Callable[[str], object]) -> None:
+def tell_lenses(photos: list[Photo], report: Report) -> None:
     """Report what becomes of photos with distortion."""
     for verb, rest, chosen in (
         ("Undistorting", "to pinhole cameras", [photo.model for photo in photos if photo.sampling]),
@@ -90,7 +90,7 @@ def tell_lenses(photos: list[Photo], report: Callable[[str], object]) -> None:
             report(f"{verb} {len(chosen)} of {len(photos)} images {rest} (models: {', '.join(sorted(set(chosen)))}).")
 
 
-def _as_it_is(lens: Calibration, pose: tuple[np.ndarray, np.ndarray]) -> Camera:
+def _as_it_is(lens: Calibration, pose: Pose) -> Camera:
     """The camera with its distortion."""
     count = MODELS[lens.model][1]
     distortion = Lens(lens.model, lens.params[len(lens.params) - count :] if count else ())
@@ -102,20 +102,14 @@ def _as_it_is(lens: Calibration, pose: tuple[np.ndarray, np.ndarray]) -> Camera:
     return Camera(lens.width, lens.height, *focal, *center, *pose, lens=distortion)
 
 
-def _pinhole(lens: pycolmap.Camera, pose: tuple[np.ndarray, np.ndarray]) -> Camera:
+def _pinhole(lens: pycolmap.Camera, pose: Pose) -> Camera:
     k = lens.calibration_matrix()
     return Camera(lens.width, lens.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], *pose)
 
 
-def _rescaled(lens: Calibration, size: tuple[int, int]) -> pycolmap.Camera:
-    camera = lens.load()
-    camera.rescale(*size)
-    return camera
-
-
 def _undistorted(lens: Calibration, size: tuple[int, int]) -> pycolmap.Camera:
     """The pinhole that COLMAP's image_undistorter gives ``lens``, without blank pixels."""
-    camera = _rescaled(lens, size)
+    camera = lens.load(*size)
     try:
         return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     except Exception as error:
@@ -130,5 +124,5 @@ def sampling_of(lens: Calibration, size: tuple[int, int]) -> np.ndarray:
     pinhole = _undistorted(lens, size)
     y, x = np.mgrid[-1 : pinhole.height + 1, -1 : pinhole.width + 1] + 0.5
     rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
-    pixels = _rescaled(lens, size).img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+    pixels = lens.load(*size).img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
     return pixels.astype(np.float32).reshape(*x.shape, 2)

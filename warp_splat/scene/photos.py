@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 from warp_splat.errors import InputError
-from warp_splat.text import few
+from warp_splat.text import Report, few
 
 PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")  # what both pycolmap and the loader read, in sRGB
 OTHER_PHOTOS = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
@@ -92,7 +91,7 @@ class ImageFinder:
         """Whether there is a file of exactly this name in the folder."""
         return path.name in self._files(path.parent)
 
-    def find_all(self, names: list[str], what: str, hint: str, report: Callable[[str], object]) -> list[Path]:
+    def find_all(self, names: list[str], what: str, hint: str, report: Report) -> list[Path]:
         """The files of all; says how many were found under other endings.
 
         Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.ply import GRAY
 from warp_splat.formats.splats import SH_C0, SplatFile
 from warp_splat.scene.types import spread_of, visible
+from warp_splat.text import Report
 
 COUNT = 50_000
 DEPTHS = 0.2, 8.0  # of the cameras' extent: from near the middle of an orbit to far behind what a walk shows
@@ -71,7 +71,7 @@ def _power(base: float, shares: np.ndarray) -> np.ndarray:
     return values
 
 
-def load_start(path: str, report: Callable[[str], None]) -> tuple[SplatFile, np.ndarray, np.ndarray]:
+def load_start(path: str, report: Report) -> tuple[SplatFile, np.ndarray, np.ndarray]:
     """Gaussians of a file, their centers [N, 3] float32 and colors [N, 3] uint8, seen from nowhere in particular.
 
     Raises:

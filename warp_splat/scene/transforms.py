@@ -6,7 +6,6 @@ tells how nerfstudio came there from COLMAP's frame. It is ignored, so coordinat
 
 import json
 import reprlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from warp_splat.scene import images
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses
 from warp_splat.scene.photos import ImageFinder
-from warp_splat.text import few
+from warp_splat.text import Report, few
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
 ALL = "transforms.json"  # nerfstudio, instant-ngp
@@ -38,7 +37,7 @@ def has_transforms(source: Path) -> bool:
 
 
 def read_transforms(
-    source: Path, report: Callable[[str], object], native: bool = False
+    source: Path, report: Report, native: bool = False
 ) -> tuple[list[Photo], list[Photo], np.ndarray, np.ndarray]:
     """Read the cameras in ``source``, and its points or, for nerf-synthetic, random ones.
 
@@ -79,9 +78,7 @@ def _parse(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_photos(
-    path: Path, content: dict[str, Any], report: Callable[[str], object], native: bool
-) -> dict[str, Photo]:
+def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bool) -> dict[str, Photo]:
     """The photo of each frame, by the frame's name; a photograph that has several frames has that of the first."""
     frames = _value(content, "frames", path)
     if not isinstance(frames, list) or not frames:
@@ -104,7 +101,7 @@ def _read_photos(
 
 
 def _split(
-    path: Path, content: dict[str, Any], photos: dict[str, Photo], report: Callable[[str], object]
+    path: Path, content: dict[str, Any], photos: dict[str, Photo], report: Report
 ) -> tuple[list[Photo], list[Photo]]:
     """Photos to train on and to hold out, by nerfstudio's lists of names; all are to train on where it has none.
 
@@ -190,7 +187,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     return Calibration(model, int(width), int(height), params)
 
 
-def _points(source: Path, name: Any, report: Callable[[str], object]) -> tuple[np.ndarray, np.ndarray]:
+def _points(source: Path, name: Any, report: Report) -> tuple[np.ndarray, np.ndarray]:
     """The points of nerfstudio's ``ply_file_path``; none without."""
     if name is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
