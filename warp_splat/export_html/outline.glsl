@@ -8,13 +8,9 @@ flat out vec2 mean;
 flat out vec3 root;
 flat out vec4 color; // and opacity
 
-ivec2 placeOf(int index) {
-  return ivec2(index % WIDTH, index / WIDTH);
-}
-
 void main() {
-  ivec2 place = placeOf(int(texelFetch(order, placeOf(first + gl_VertexID / 4), 0).x));
-  uvec4 first = texelFetch(meanAndRoot, place, 0), second = texelFetch(rootAndColor, place, 0);
+  int index = int(texel(order, first + gl_VertexID / 4).x);
+  uvec4 first = texel(meanAndRoot, index), second = texel(rootAndColor, index);
   mean = uintBitsToFloat(first.xy);
   root = uintBitsToFloat(uvec3(first.zw, second.x));
   color = vec4(unpackHalf2x16(second.y), unpackHalf2x16(second.z).x, uintBitsToFloat(second.w));

@@ -8,10 +8,6 @@ uniform vec2 focal, principal, size; // px
 layout(location = 0) out uvec4 meanAndRoot; // mean [px], root xx and xy [1/px], float bits
 layout(location = 1) out uvec4 rootAndColor; // root yy, half floats (r, g) and (b, 0), opacity: 0 where nothing is seen
 
-uvec4 texel(highp usampler2D table, int index) {
-  return texelFetch(table, ivec2(index % WIDTH, index / WIDTH), 0);
-}
-
 int low(uint word) {
   return int(word << 16) >> 16;
 }

@@ -62,8 +62,15 @@ class Renderer {
     const { gl } = this, handle = gl.createProgram();
     names.forEach((name, index) => {
       const shader = gl.createShader(index ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER);
-      const head = `#version 300 es\nprecision highp float;\nprecision highp int;\nconst int WIDTH = ${this.width};\n`;
-      gl.shaderSource(shader, head + source("constants.glsl") + source(name));
+      gl.shaderSource(shader, `#version 300 es
+        precision highp float;
+        precision highp int;
+        const int WIDTH = ${this.width};
+        uvec4 texel(highp usampler2D table, int index) { // of tables in rows of one width
+          return texelFetch(table, ivec2(index % WIDTH, index / WIDTH), 0);
+        }
+        ${source("constants.glsl")}
+        ${source(name)}`);
       gl.compileShader(shader);
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`${name}: ${gl.getShaderInfoLog(shader)}`);
       gl.attachShader(handle, shader);

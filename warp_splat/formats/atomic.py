@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import json
-import math
 import os
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
@@ -75,7 +74,8 @@ def write_json(path: str | Path, value) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
-    write_text(path, json.dumps(_without_infinities(value), indent=1, allow_nan=False))
+    finite = json.loads(json.dumps(value), parse_constant=lambda name: None)
+    write_text(path, json.dumps(finite, indent=1, allow_nan=False))
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping]) -> None:
@@ -88,11 +88,3 @@ def write_csv(path: str | Path, rows: Sequence[Mapping]) -> None:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
-
-
-def _without_infinities(value):
-    if isinstance(value, Mapping):
-        return {key: _without_infinities(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_infinities(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

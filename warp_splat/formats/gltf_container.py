@@ -196,13 +196,11 @@ def _matrix(node: dict) -> np.ndarray:
         return numbers_of(node, "matrix", 16).reshape(4, 4).T
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most files have none
 
+    node = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1], **node}
+    quat = numbers_of(node, "rotation", 4)
+    if not 1e-6 < np.linalg.norm(quat) < 1e6:
+        raise ValueError(f"a rotation {quat.tolist()}")
     matrix = np.eye(4)
-    matrix[:3, 3] = numbers_of(node, "translation", 3) if "translation" in node else 0
-    if "rotation" in node:
-        quat = numbers_of(node, "rotation", 4)
-        if not 1e-6 < np.linalg.norm(quat) < 1e6:
-            raise ValueError(f"a rotation {quat.tolist()}")
-        matrix[:3, :3] = Rotation.from_quat(quat).as_matrix()
-    if "scale" in node:
-        matrix[:3, :3] *= numbers_of(node, "scale", 3)
+    matrix[:3, :3] = Rotation.from_quat(quat).as_matrix() * numbers_of(node, "scale", 3)
+    matrix[:3, 3] = numbers_of(node, "translation", 3)
     return matrix

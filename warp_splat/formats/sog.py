@@ -71,22 +71,15 @@ def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
     scale_entries, scale_labels = codebook(scales)
     color_entries, color_labels = codebook(sh[:, 0])
     alphas = np.rint(255 * sigmoid(opacities.astype(np.float64))).astype(np.uint8)
-    images = {
-        "means_l": _laid_out(steps & 255),
-        "means_u": _laid_out(steps >> 8),
-        "scales": _laid_out(scale_labels),
-        "quats": _laid_out(_pack_quats(quats)),
-        "sh0": _laid_out(np.concatenate([color_labels, alphas[:, None]], axis=1)),
-    }
-    meta = {
-        "version": 2,
-        "asset": {"generator": "warp-splat"},
-        "count": count,
-        **({"antialias": True, "model": "antialiased"} if file.antialiased else {}),
-        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": _listed(scale_entries), "files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": _listed(color_entries), "files": ["sh0.webp"]},
+    # of each part, what the JSON says, and its images
+    parts: dict[str, tuple[dict, dict[str, np.ndarray]]] = {
+        "means": (
+            {"mins": low.tolist(), "maxs": high.tolist()},
+            {"means_l": _laid_out(steps & 255), "means_u": _laid_out(steps >> 8)},
+        ),
+        "scales": ({"codebook": _listed(scale_entries)}, {"scales": _laid_out(scale_labels)}),
+        "quats": ({}, {"quats": _laid_out(_pack_quats(quats))}),
+        "sh0": ({"codebook": _listed(color_entries)}, {"sh0": _laid_out(np.column_stack([color_labels, alphas]))}),
     }
     if coefficients > 1:
         entries, labels = palette(sh[:, 1:].reshape(count, -1), min(PALETTE_MOST, max(1024, count // PALETTE_SHARE)))
@@ -94,18 +87,19 @@ def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
         rows = -(-len(entries) // PALETTE_ROW)
         table = np.zeros((rows * PALETTE_ROW, coefficients - 1, 3), np.uint8)
         table[: len(entries)] = indices.reshape(-1, coefficients - 1, 3)
-        images["shN_centroids"] = table.reshape(rows, -1, 3)
-        images["shN_labels"] = _laid_out(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1))
-        meta["shN"] = {
-            "count": len(entries),
-            "bands": COEFFICIENTS.index(coefficients),
-            "codebook": _listed(numbers),
-            "files": ["shN_centroids.webp", "shN_labels.webp"],
-        }
+        indices = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels)])
+        parts["shN"] = (
+            {"count": len(entries), "bands": COEFFICIENTS.index(coefficients), "codebook": _listed(numbers)},
+            {"shN_centroids": table.reshape(rows, -1, 3), "shN_labels": _laid_out(indices)},
+        )
+    meta = {"version": 2, "asset": {"generator": "warp-splat"}, "count": count}
+    if file.antialiased:
+        meta |= {"antialias": True, "model": "antialiased"}
+    meta |= {part: {**facts, "files": [f"{name}.webp" for name in images]} for part, (facts, images) in parts.items()}
     with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         # entries without a time, so that equal Gaussians give equal bytes; WebP is compressed already
         archive.writestr(zipfile.ZipInfo(META), json.dumps(meta, allow_nan=False))
-        for name, image in images.items():
+        for name, image in (image for _, images in parts.values() for image in images.items()):
             archive.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(image))
 
 

@@ -22,6 +22,7 @@ UINT32, UINT32_PAIR, UINT64 = struct.Struct("<I"), struct.Struct("<II"), struct.
 SENSOR, POSE = 8, 56  # bytes: its kind and number; quaternion and translation
 CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters
 IMAGE_HEAD = 64  # bytes of id, quaternion, translation, camera id; then the name, the number of keypoints, these
+FRAME_HEAD = UINT32_PAIR.size + POSE  # bytes; then the number of its images, these
 POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the track, the track
 
 
@@ -157,15 +158,13 @@ def _camera_end(data: bytes, start: int) -> int | None:
     return start + CAMERA.size + 8 * len(camera.params)
 
 
+def _list_end(data: bytes, start: int, length: struct.Struct, each: int) -> int:
+    """The end of a list, which begins with its length."""
+    return start + length.size + each * length.unpack_from(data, start)[0]
+
+
 def _image_end(data: bytes, start: int) -> int:
-    name_end = data.index(b"\0", start + IMAGE_HEAD) + 1
-    (keypoints,) = UINT64.unpack_from(data, name_end)
-    return name_end + UINT64.size + 24 * keypoints
-
-
-def _point_end(data: bytes, start: int) -> int:
-    (track,) = UINT64.unpack_from(data, start + POINT_HEAD)
-    return start + POINT_HEAD + UINT64.size + 8 * track
+    return _list_end(data, data.index(b"\0", start + IMAGE_HEAD) + 1, UINT64, 24)
 
 
 def _rig_end(data: bytes, start: int) -> int:
@@ -176,18 +175,13 @@ def _rig_end(data: bytes, start: int) -> int:
     return end
 
 
-def _frame_end(data: bytes, start: int) -> int:
-    (images,) = UINT32.unpack_from(data, start + UINT32_PAIR.size + POSE)
-    return start + UINT32_PAIR.size + POSE + UINT32.size + (SENSOR + 8) * images
-
-
 #: Where the record that starts at a place ends, in files whose records have lengths of their own.
 RECORD_ENDS = {
     "rigs.bin": _rig_end,
     "cameras.bin": _camera_end,
-    "frames.bin": _frame_end,
+    "frames.bin": lambda data, start: _list_end(data, start + FRAME_HEAD, UINT32, SENSOR + 8),
     "images.bin": _image_end,
-    "points3D.bin": _point_end,
+    "points3D.bin": lambda data, start: _list_end(data, start + POINT_HEAD, UINT64, 8),
 }
 
 

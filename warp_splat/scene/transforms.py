@@ -82,7 +82,7 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
     """The photo of each frame, by the frame's name; a photograph that has several frames has that of the first."""
     frames = _value(content, "frames", path)
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: expected a list of at least one frame under the key frames; correct the file.")
+        raise _wrong(path, "a list of at least one frame under the key frames", frames)
     places = [f"{path}, frame {index}" for index in range(len(frames))]
     finder = ImageFinder(path.parent)
     names = [_path(frame, "file_path", where) for frame, where in zip(frames, places, strict=True)]
@@ -126,7 +126,7 @@ def _split(
 def _names(content: dict[str, Any], key: str, path: Path) -> set[str]:
     names = content.get(key, [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f"{path}: expected {key} as a list of names, got {reprlib.repr(names)}; correct the file.")
+        raise _wrong(path, f"{key} as a list of names", names)
     return {Path(name).as_posix() for name in names}
 
 
@@ -152,8 +152,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     def number(key: str, default: float = 0.0) -> float:
         value = values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, float | int) or not abs(value) < LARGEST:
-            expected = f"a number between -{LARGEST:g} and {LARGEST:g}"
-            raise InputError(f"{where}: expected {key} as {expected}, got {reprlib.repr(value)}; correct the file.")
+            raise _wrong(where, f"{key} as a number between -{LARGEST:g} and {LARGEST:g}", value)
         return float(value)
 
     width, height = number("w", size[0]), number("h", size[1])
@@ -166,7 +165,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     else:
         angle = _value(values, "camera_angle_x", where, "fl_x or camera_angle_x")
         if not 0 < number("camera_angle_x") < np.pi:
-            raise InputError(f"{where}: expected camera_angle_x between 0 and pi, got {angle!r:.80}; correct it.")
+            raise _wrong(where, "camera_angle_x between 0 and pi", angle)
         fx = 0.5 * width / np.tan(0.5 * angle)
     focal = (fx, number("fl_y", fx), number("cx", width / 2), number("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -181,8 +180,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     else:
         raise InputError(
             f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2, {FISHEYE} with k1 to k4 or {PANORAMA}, "
-            f"got "
-            f"{reprlib.repr(model)} with k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs first."
+            f"got {reprlib.repr(model)} with k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs first."
         )
     return Calibration(model, int(width), int(height), params)
 
@@ -203,7 +201,7 @@ def _points(source: Path, name: Any, report: Report) -> tuple[np.ndarray, np.nda
 def _path(values: Any, key: str, where: str | Path) -> str:
     name = _value(values, key, where)
     if not isinstance(name, str):
-        raise InputError(f"{where}: expected a string as {key}, got {reprlib.repr(name)}; correct the file.")
+        raise _wrong(where, f"a string as {key}", name)
     return Path(name).as_posix()
 
 
@@ -214,10 +212,7 @@ def _pose(matrix: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
     except (TypeError, ValueError, OverflowError):
         world_from_camera = np.empty(0)
     if world_from_camera.shape != (4, 4) or not np.isfinite(world_from_camera).all():
-        raise InputError(
-            f"{where}: expected transform_matrix with 4 x 4 finite numbers, got {reprlib.repr(matrix):.100}; "
-            "correct the file."
-        )
+        raise _wrong(where, "transform_matrix with 4 x 4 finite numbers", matrix)
     given = world_from_camera[:3, :3]
     u, scales, vt = np.linalg.svd(given)  # u @ vt is the nearest rotation
     is_scaled_rotation = np.linalg.det(u @ vt) > 0 and scales[2] > 0 and scales[0] - scales[2] <= TOLERANCE * scales[0]
@@ -239,6 +234,10 @@ def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
         cofactors = np.cross(matrix[[1, 2, 0]], matrix[[2, 0, 1]])
         matrix = 0.5 * (matrix + cofactors / (cofactors[0] * matrix[0]).sum())
     return matrix
+
+
+def _wrong(where: str | Path, expected: str, found: Any) -> InputError:
+    return InputError(f"{where}: expected {expected}, got {reprlib.repr(found):.100}; correct the file.")
 
 
 def _value(content: Any, key: str, where: str | Path, keys: str = "") -> Any:
