@@ -91,21 +91,18 @@ class Renderer {
     this.size = [width, height];
   }
 
-  // Numbers for whole rows of one of the textures, from this one on.
-  fill(texture, row, format, numbers) {
-    const { gl } = this, rows = numbers.length / this.width / (format === gl.RED_INTEGER ? 1 : 4);
-    gl.bindTexture(gl.TEXTURE_2D, texture);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, this.width, rows, format, gl.UNSIGNED_INT, numbers);
-  }
-
-  // A part of the "gaussians" or "harmonics": the texels of those from `first` on.
-  add(table, first, texels, numbers) {
-    this.fill(this[table], (first * texels) / this.width, this.gl.RGBA_INTEGER, numbers);
+  // Numbers for whole rows of the "gaussians", the "harmonics" or the "order", from the texel `first` on.
+  fill(table, first, numbers) {
+    const { gl, width } = this;
+    const [format, channels] = table === "order" ? [gl.RED_INTEGER, 1] : [gl.RGBA_INTEGER, 4];
+    const [row, rows] = [first / width, numbers.length / channels / width];
+    gl.bindTexture(gl.TEXTURE_2D, this[table]);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, rows, format, gl.UNSIGNED_INT, numbers);
   }
 
   // The Gaussians to draw, of those in `range`, nearest first: the first `visible` of `order`, which fills rows.
   setOrder(order, visible, range) {
-    this.fill(this.order, 0, this.gl.RED_INTEGER, order);
+    this.fill("order", 0, order);
     [this.visible, this.range] = [visible, range];
   }
 

@@ -70,7 +70,7 @@ class Viewer {
       const [, table, chunk] = part.match(/(\D+)(\d+)/), first = chunk * scene.chunk;
       const texels = table === "gaussians" ? 2 : scene.harmonics;
       const numbers = await unpack(await partText(part), texels, renderer.width);
-      renderer.add(table, first, texels, numbers);
+      renderer.fill(table, first * texels, numbers);
       if (table === "gaussians") this.addMeans(first, new Float32Array(numbers.buffer));
       this.missing--;
       this.show();
@@ -189,13 +189,6 @@ class Viewer {
     if (!this.renderer.ready) requestAnimationFrame(() => this.watch());
   }
 
-  // Of the last sort and of the last frame [ms], the share of the canvas's pixels in a row that it had, and how many
-  // Gaussians it was made of.
-  get times() {
-    const { frameTime, detail, drawn } = this.renderer;
-    return { sort: this.sortTime, frame: frameTime, detail, drawn };
-  }
-
   // What the hand does: `dx`, `dy` in px of the page.
   orbit(dx, dy) {
     const angle = Math.PI / Math.min(this.canvas.clientWidth, this.canvas.clientHeight);
@@ -267,7 +260,11 @@ try {
   const first = viewer.step(0).then(() => say(scene.count ? "" : "This model holds no Gaussians."));
   const all = viewer.load(scene.parts.slice(scene.before));
   window.warpSplat = {
-    cameras: scene.cameras, get times() { return viewer.times; },
+    cameras: scene.cameras,
+    get times() { // docs/page.md says of what
+      const { frameTime, detail, drawn } = viewer.renderer;
+      return { sort: viewer.sortTime, frame: frameTime, detail, drawn };
+    },
     setCamera: (camera) => all.then(() => viewer.setCamera(camera)),
   };
   await Promise.allSettled([first, all]);

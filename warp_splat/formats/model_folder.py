@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 import json
 import os
-import re
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -109,12 +108,10 @@ def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     Raises:
         InputError: if there is no such iteration.
     """
-    matches = (
-        re.fullmatch(r"iteration_(\d+)", path.parent.name) for path in ply_path(folder, 0).parents[1].glob("*/*.ply")
-    )
     if not Path(folder).is_dir():
         raise InputError(f"{folder}: expected the folder of a trained model, found no such folder; check the path.")
-    saved = sorted({int(match[1]) for match in matches if match and ply_path(folder, int(match[1])).is_file()})
+    names = (path.name.removeprefix("iteration_") for path in (Path(folder) / "point_cloud").glob("iteration_*"))
+    saved = sorted({int(name) for name in names if name.isdecimal() and ply_path(folder, int(name)).is_file()})
     if not saved:
         raise InputError(f"{folder}: expected point_cloud/iteration_*/*.ply, found none; is it a model folder?")
     if iteration == -1:
