@@ -13,9 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.ply_container import PlyTables, columns_of, write_tables
+from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import Unexpected
-from warp_splat.formats.splats import SH_C0, SplatArrays, clipped, from_smallest_three, logit, sigmoid, smallest_three
+from warp_splat.formats.splats import (
+    SH_C0,
+    SplatArrays,
+    SplatFile,
+    clipped,
+    from_smallest_three,
+    logit,
+    sigmoid,
+    smallest_three,
+)
 from warp_splat.text import Report
 
 CHUNK = 256  # Gaussians that share their ranges
@@ -40,18 +49,18 @@ def is_compressed(tables: PlyTables) -> bool:
     return "vertex" in tables.elements and WORDS[0] in tables.elements["vertex"].properties
 
 
-def write_compressed(path: str | Path, splats: SplatArrays, comments: list[str], report: Report) -> None:
+def save_compressed_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
     """Write Gaussians; near ones should follow each other, since ranges of chunks are small then.
 
     Args:
         path: the file to write.
-        splats: the Gaussians.
-        comments: of the header.
+        file: the Gaussians.
         report: called with a part of a sentence for each kind of value that the format cannot hold.
 
     Raises:
         InputError: if the file cannot be written.
     """
+    splats = file.splats
     count, coefficients, _ = splats.sh.shape
     scales = clipped("log scale", splats.scales, *SCALES, report)
     harmonics = clipped("harmonics", splats.sh[:, 1:], *HARMONICS, report)
@@ -73,7 +82,7 @@ def write_compressed(path: str | Path, splats: SplatArrays, comments: list[str],
         steps = np.clip(np.floor(HARMONIC_STEPS * harmonics) + 128, 0, 255).astype(np.uint8)
         rows = np.ascontiguousarray(steps.transpose(0, 2, 1)).reshape(count, 3 * (coefficients - 1))
         tables["sh"] = rows.view([(f"f_rest_{index}", "u1") for index in range(rows.shape[1])])[:, 0]
-    write_tables(path, tables, comments)
+    write_tables(path, tables, [ANTIALIASED] * file.antialiased)
 
 
 def read_compressed(tables: PlyTables) -> SplatArrays:

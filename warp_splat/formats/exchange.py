@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from warp_splat.errors import InputError
+from warp_splat.formats.compressed_ply import save_compressed_ply
 from warp_splat.formats.gltf import load_gltf, save_gltf
-from warp_splat.formats.ply import load_ply, save_compressed_ply, save_ply
+from warp_splat.formats.ply import load_ply, save_ply
 from warp_splat.formats.sog import load_sog, save_sog
 from warp_splat.formats.splat32 import load_splat, save_splat
 from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows

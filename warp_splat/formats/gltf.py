@@ -18,7 +18,7 @@ from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.reading import Unexpected, entries_of, reading
 from warp_splat.formats.splats import (
     COEFFICIENTS,
     LOG_SCALES,
@@ -89,7 +89,7 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
     """
     with reading(path, "a glTF 2.0 file of Gaussians (KHR_gaussian_splatting)"):
         document = Document(path)
-        required = document.entries("extensionsRequired")
+        required = entries_of(document.json, "extensionsRequired")
         unknown = [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]
         if unknown:
             raise Unexpected(f"one that needs the extension {unknown[0]!r:.80}; export it without")

@@ -57,7 +57,7 @@ class Document:
             else:
                 text = source.read()
         self.json = json_object(text)
-        count = len(self.entries("buffers"))
+        count = len(entries_of(self.json, "buffers"))
         if count > MOST_BUFFERS:
             raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
         entries = [self.entry("buffers", index) for index in range(count)]
@@ -67,10 +67,6 @@ class Document:
     def data_bytes(self) -> int:
         """Bytes of all buffers, those that are one file counted once."""
         return sum({buffer.path: buffer.length for buffer in self.buffers}.values())
-
-    def entries(self, key: str) -> list:
-        """A list of the JSON, empty if it has none."""
-        return entries_of(self.json, key)
 
     def entry(self, kind: str, index: Any) -> dict:
         """The object ``index`` of the list ``kind`` of the JSON."""
@@ -111,7 +107,7 @@ class Document:
 
     def placed_meshes(self) -> list[tuple[dict, np.ndarray]]:
         """The meshes of the scene, each with the matrix [4, 4] from its coordinates to the world's."""
-        nodes = self.entries("nodes")
+        nodes = entries_of(self.json, "nodes")
         if "scenes" in self.json:
             roots = entries_of(self.entry("scenes", self.json.get("scene", 0)), "nodes")
         else:  # a library of meshes: all that nobody else places

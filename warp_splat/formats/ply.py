@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.formats.compressed_ply import is_compressed, read_compressed, write_compressed
-from warp_splat.formats.ply_container import PlyTables, columns_of, write_tables
+from warp_splat.formats.compressed_ply import is_compressed, read_compressed
+from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 from warp_splat.text import Report
@@ -28,7 +28,6 @@ GRAY = 127  # of points without colors
 REST_COUNTS = (0, 9, 24, 45)  # f_rest properties at SH degree 0, 1, 2, 3
 
 EXPECTED = "a PLY file with an element 'vertex'"
-ANTIALIASED = "SplatRenderMode: mip"  # the comment that Brush and splat-transform write and read
 ANTIALIASED_READ = {ANTIALIASED, "antialiased 1"}  # the second is Postshot's
 
 
@@ -52,20 +51,6 @@ def save_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
     table = np.concatenate(columns, axis=1, dtype="<f4")
     rows = table.view([(name, "<f4") for name in names])[:, 0]
     write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased)
-
-
-def save_compressed_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
-    """Write Gaussians as a compressed PLY file, in the given order, in which near ones should follow each other.
-
-    Args:
-        path: the file to write.
-        file: the Gaussians.
-        report: called with a part of a sentence for each kind of value that the format cannot hold.
-
-    Raises:
-        InputError: if the file cannot be written.
-    """
-    write_compressed(path, file.splats, [ANTIALIASED] * file.antialiased, report)
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

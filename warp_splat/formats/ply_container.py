@@ -23,6 +23,7 @@ TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4"
 TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 TYPES |= {"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
 LIST = "list"  # in place of a NumPy type
+ANTIALIASED = "SplatRenderMode: mip"  # the comment that Brush and splat-transform write and read
 TYPES_WRITTEN = {"f4": "float", "u1": "uchar", "u4": "uint"}
 
 

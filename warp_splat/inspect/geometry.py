@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -42,9 +43,9 @@ class Measured:
         return {name: float(np.median(errors)) for name, errors in self.errors.items()}
 
 
-def sample(items: list, count: int) -> list:
-    """At most ``count`` of the items, evenly."""
-    return items[:: -(-len(items) // count)] if items else []
+def sample(items: Any, count: int) -> Any:
+    """At most ``count`` of the items of a list or an array, evenly."""
+    return items[:: max(1, -(-len(items) // count))]
 
 
 def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding]:
@@ -92,7 +93,7 @@ def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
     """Points in each image, points in no image, cameras all at one place, sides that nobody photographed."""
     if not subject.photos or not len(subject.points):
         return
-    points = np.array(sample(list(subject.points), POINTS))
+    points = sample(subject.points, POINTS)
     counts = np.zeros(len(points), int)
     scale = len(subject.points) / len(points)
     for photo in subject.photos:
@@ -142,7 +143,7 @@ def check_axes(subject: Subject) -> Iterator[Finding]:
     """How many points the images would show if the poses were read in other conventions."""
     if not subject.photos or not len(subject.points):
         return
-    points = np.array(sample(list(subject.points), 2000))
+    points = sample(subject.points, 2000)
     photos = sample(subject.photos, VIEWS)
     count = lambda turn: sum(np.count_nonzero(visible(turn(photo.camera), points)) for photo in photos)  # noqa: E731
     seen = {name: count(turn) for name, turn in TURNS.items()}

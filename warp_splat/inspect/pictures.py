@@ -91,7 +91,7 @@ def _on_photos(subject: Subject, measured: Measured) -> Figure:
             dots = axes.scatter(*pixels.T, c=errors[:DOTS], s=2, cmap="plasma", vmin=0, vmax=MOST)
             title = f"{photo.name}: median {np.median(errors):.2f} px"
         else:
-            points = np.array(sample(list(subject.points[visible(photo.camera, subject.points)]), DOTS)).reshape(-1, 3)
+            points = sample(subject.points[visible(photo.camera, subject.points)], DOTS)
             pixels = photo.camera.pixels(points @ photo.camera.rotation.T + photo.camera.translation)
             axes.scatter(*pixels.T * small.shape[1] / photo.camera.width, c=ORANGE, s=1.5)
             title = photo.name
@@ -108,7 +108,7 @@ def _map(subject: Subject) -> Figure:
     """Across the plane in which the cameras spread most, and from its side."""
     centers = np.array([photo.camera.center for photo in subject.photos])
     forward = np.array([photo.camera.forward for photo in subject.photos])
-    points = np.array(sample(list(subject.points), MAPPED))
+    points = sample(subject.points, MAPPED)
     middle = np.median(points, axis=0)
     _, _, axes_of_spread = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=True)
     reach = 1.3 * np.percentile(np.linalg.norm(np.concatenate([centers, points]) - middle, axis=1), 95)

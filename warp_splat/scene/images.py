@@ -123,10 +123,7 @@ def read_pixels(path: Path, background: float) -> LoadedImage:
     """
     file = _open(path)
     spec = file.spec()
-    pixels = file.read_image(oiio.FLOAT)
-    error = _text(file.geterror)  # a JPEG that is cut short still gives pixels: gray ones
-    if pixels is None or error:
-        raise _unreadable(path, error)
+    pixels = _decoded(path, file, oiio.FLOAT)
     if not np.isfinite(pixels).all():
         raise _unreadable(path, "pixels that are NaN or infinite")
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
@@ -160,7 +157,7 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
             f"got {found[0]} x {found[1]}; draw it on the photograph, or remove it."
         )
     bright = ((brightness > 0.5 * brightness.max()) != invert).astype(np.float32)
-    return bright if found == size else _resize(bright[..., None], *size)[..., 0]
+    return bright if found == size else _resampled(oiio.ImageBufAlgo.resize, bright[..., None], *size)[..., 0]
 
 
 def read_numbers(path: Path) -> np.ndarray:
@@ -173,10 +170,7 @@ def read_numbers(path: Path) -> np.ndarray:
     kind = file.spec().format
     if kind.basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
         raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
-    numbers = file.read_image(0, 0, 0, 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
-    error = _text(file.geterror)
-    if numbers is None or error:
-        raise _unreadable(path, error)
+    numbers = _decoded(path, file, 0, 0, 0, 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
 
 
@@ -193,9 +187,8 @@ def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     """
     padded = np.pad(image, ((WARP_PAD, WARP_PAD), (WARP_PAD, WARP_PAD), (0, 0)), "edge")
     st = (sampling + WARP_PAD) / (padded.shape[1], padded.shape[0])
-    roi = _roi(st.shape[1], st.shape[0], image.shape[2])  # without it the result has the size of the source
-    warped = oiio.ImageBufAlgo.st_warp(_buffer(padded), _buffer(st), "catmull-rom", roi=roi, nthreads=1)
-    return _pixels(warped)[1:-1, 1:-1]
+    height, width, _ = st.shape
+    return _resampled(oiio.ImageBufAlgo.st_warp, padded, width, height, _buffer(st), "catmull-rom")[1:-1, 1:-1]
 
 
 def load_views(photos: list[Photo], resolution: int, white_background: bool, invert_masks: bool = False) -> list[View]:
@@ -220,7 +213,7 @@ def load_views(photos: list[Photo], resolution: int, white_background: bool, inv
         if photo.sampling is not None:
             image = undistort(image, photo.sampling())
         if (camera.height, camera.width) != image.shape[:2]:
-            image = _resize(image, camera.width, camera.height)
+            image = _resampled(oiio.ImageBufAlgo.resize, image, camera.width, camera.height)
         color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
         alpha = None if pixels.alpha is None else _quantized(image[..., 3])
         mask = None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8)
@@ -247,6 +240,14 @@ def _open(path: Path) -> oiio.ImageInput:
     return file
 
 
+def _decoded(path: Path, file: oiio.ImageInput, *what) -> np.ndarray:
+    pixels = file.read_image(*what)
+    error = _text(file.geterror)  # a JPEG that is cut short still gives pixels: gray ones
+    if pixels is None or error:
+        raise _unreadable(path, error)
+    return pixels
+
+
 def _text(get: Callable[..., str], *arguments: str) -> str:
     """What ``get`` returns; damaged files hold bytes that are no text."""
     try:
@@ -263,16 +264,12 @@ def _buffer(array: np.ndarray) -> oiio.ImageBuf:
     return oiio.ImageBuf(np.ascontiguousarray(array, np.float32))  # refuses arrays in Fortran's order
 
 
-def _roi(width: int, height: int, channels: int) -> oiio.ROI:
-    return oiio.ROI(0, width, 0, height, 0, 1, 0, channels)
-
-
-def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    roi = _roi(width, height, image.shape[2])
-    return _pixels(oiio.ImageBufAlgo.resize(_buffer(image), roi=roi, nthreads=1))
-
-
-def _pixels(buffer: oiio.ImageBuf) -> np.ndarray:
-    if buffer.has_error:
-        raise RuntimeError(f"OpenImageIO: {buffer.geterror()}")
-    return np.asarray(buffer.get_pixels(oiio.FLOAT))
+def _resampled(
+    operation: Callable[..., oiio.ImageBuf], image: np.ndarray, width: int, height: int, *rest
+) -> np.ndarray:
+    """What an operation of OpenImageIO makes of ``image`` [H, W, C]: [height, width, C]."""
+    roi = oiio.ROI(0, width, 0, height, 0, 1, 0, image.shape[2])  # without it, of the size of the source
+    found = operation(_buffer(image), *rest, roi=roi, nthreads=1)
+    if found.has_error:
+        raise RuntimeError(f"OpenImageIO: {found.geterror()}")
+    return np.asarray(found.get_pixels(oiio.FLOAT))
