@@ -22,7 +22,8 @@ from warp_splat.export_html.command import export_html
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.png import load_png
-from warp_splat.formats.splats import SplatArrays, SplatFile, logit, sigmoid, sizes, unit_quats
+from warp_splat.formats.splats import SplatArrays, SplatFile, sizes
+from warp_splat.formats.stored import logit, sigmoid, unit_quats
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from browser import browser_page

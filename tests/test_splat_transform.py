@@ -17,7 +17,8 @@ from scipy.spatial import KDTree
 from splat_files import covariances, glb_attributes, some_file
 
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
-from warp_splat.formats.splats import SplatArrays, SplatFile, sigmoid
+from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.stored import sigmoid
 
 COMMAND = shlex.split(os.environ.get("WARP_SPLAT_TRANSFORM", "")) or [shutil.which("splat-transform") or ""]
 HALF_TURN = ("-r", "180,0,0")

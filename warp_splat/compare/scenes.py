@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.formats.splats import SH_C0
+from warp_splat.formats.stored import SH_C0
 
 
 def make_camera(

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, NEAR
-from warp_splat.formats.splats import LOG_SCALES, SplatArrays, logit, sigmoid, sizes, unit_quats
+from warp_splat.formats.splats import SplatArrays, sizes
+from warp_splat.formats.stored import LOG_SCALES, logit, sigmoid, unit_quats
 
 POWER = 0.4  # of a Gaussian's importance: its weight where sets are cut in halves; measured: 0.25 and 0.5 are alike
 ALONE = 10  # one group of so many is a single one of the largest, which would swallow its neighbors: up to 0.9 dB

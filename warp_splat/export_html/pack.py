@@ -21,7 +21,8 @@ import gzip
 import numpy as np
 
 from warp_splat.config import ALPHA_MIN
-from warp_splat.formats.splats import SplatArrays, sigmoid, sizes, unit_quats
+from warp_splat.formats.splats import SplatArrays, sizes
+from warp_splat.formats.stored import sigmoid, unit_quats
 
 ROUNDED_BITS = 6  # of the 23 of a position's mantissa
 LOG_STEPS = 256  # of scales, per factor e

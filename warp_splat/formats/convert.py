@@ -10,7 +10,8 @@ from warp_splat.config import ConvertConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_environment
-from warp_splat.formats.splats import COEFFICIENTS, LOG_SCALES, SH_C0, SplatArrays, SplatFile, sigmoid, unit_quats
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
+from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 
 ROUNDING = 1e-6  # smaller changes, as a share of the largest value, are those of float32
 

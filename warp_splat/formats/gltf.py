@@ -19,20 +19,8 @@ from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
 from warp_splat.formats.reading import Unexpected, entries_of, reading
-from warp_splat.formats.splats import (
-    COEFFICIENTS,
-    LOG_SCALES,
-    SH_C0,
-    SplatArrays,
-    SplatFile,
-    clipped,
-    frame,
-    log_scales,
-    logit,
-    sigmoid,
-    turned,
-    unit_quats,
-)
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
+from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
 NAME = "KHR_gaussian_splatting"

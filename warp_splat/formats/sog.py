@@ -30,15 +30,8 @@ from warp_splat.formats.reading import (
     reading,
     whole_number,
 )
-from warp_splat.formats.splats import (
-    COEFFICIENTS,
-    SplatArrays,
-    SplatFile,
-    from_smallest_three,
-    logit,
-    sigmoid,
-    smallest_three,
-)
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
+from warp_splat.formats.stored import from_smallest_three, logit, sigmoid, smallest_three
 from warp_splat.text import Report
 
 META = "meta.json"

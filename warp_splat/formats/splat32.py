@@ -13,17 +13,8 @@ import numpy as np
 
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, reading
-from warp_splat.formats.splats import (
-    LOG_SCALES,
-    SH_C0,
-    SplatArrays,
-    SplatFile,
-    clipped,
-    log_scales,
-    logit,
-    sigmoid,
-    unit_quats,
-)
+from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

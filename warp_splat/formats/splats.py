@@ -1,4 +1,4 @@
-"""Gaussians in memory, as every file format reads and writes them; what formats share: activations, axes.
+"""Gaussians in memory, as every file format reads and writes them, and their axes.
 
 The frame is that of the scene's files, as trained (COLMAP: x right, y down, z forward). Formats with axes of their own
 turn the Gaussians on writing and back on reading (:func:`turned`).
@@ -11,12 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.formats.stored import sigmoid
 from warp_splat.text import Report
 
 COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
-SH_C0 = 0.28209479177387814  # color = SH_C0 * (coefficient of degree 0) + 0.5
-LOG_SCALES = (-87.0, 88.0)  # exp() of these, and of what lies between, is a normal number in float32
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # than one of four
 AXIS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 
 
@@ -59,61 +57,10 @@ def finite_rows(splats: SplatArrays, path, report: Report) -> SplatArrays:
     return SplatArrays(*(array[finite] for array in splats))
 
 
-def sigmoid(logits: np.ndarray) -> np.ndarray:
-    """Opacities 0..1 from logits."""
-    with np.errstate(over="ignore"):
-        return 1.0 / (1.0 + np.exp(-logits))
-
-
-def logit(opacities: np.ndarray) -> np.ndarray:
-    """Logits from opacities; 0 and 1, to which formats round, give the last finite ones of float32: -87 and 16.6."""
-    info = np.finfo(np.float32)
-    inside = np.clip(opacities.astype(np.float64), info.tiny, 1.0 - info.epsneg)
-    return np.log(inside / (1.0 - inside)).astype(np.float32)
-
-
-def log_scales(scales: np.ndarray) -> np.ndarray:
-    """Logarithms of standard deviations; 0 (a flat Gaussian) gives the last finite one, less gives NaN."""
-    with np.errstate(invalid="ignore"):
-        return np.log(np.where(scales == 0, np.finfo(np.float32).tiny, scales)).astype(np.float32)
-
-
-def unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions of unit length, w x y z; the identity for those of no length, as the renderer takes them."""
-    quats = quats.astype(np.float64)
-    norms = np.linalg.norm(quats, axis=1, keepdims=True)
-    return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0]).astype(np.float32)
-
-
 def sizes(splats: SplatArrays) -> np.ndarray:
     """Opacity times the area of the largest section [N]: what can be said of a Gaussian without any camera."""
     areas = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
     return sigmoid(splats.opacities.astype(np.float64)) * np.exp(np.minimum(areas, 700.0))
-
-
-def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of w x y z is largest [N], and the others [N, 3] in that order, as -0.5..0.5, where it is positive."""
-    unit = unit_quats(quats).astype(np.float64)
-    largest = np.abs(unit).argmax(axis=1)
-    unit *= np.where(unit[np.arange(len(unit)), largest] < 0, -1, 1)[:, None]
-    return largest, np.take_along_axis(unit, OTHERS[largest], axis=1) * np.sqrt(0.5)
-
-
-def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The rotations [N, 4] w x y z of :func:`smallest_three`."""
-    quats = np.zeros((len(others), 4))
-    np.put_along_axis(quats, OTHERS[largest], others * np.sqrt(2), axis=1)
-    quats[np.arange(len(quats)), largest] = np.sqrt(np.maximum(0, 1 - (quats * quats).sum(axis=1)))
-    return quats.astype(np.float32)
-
-
-def clipped(what: str, values: np.ndarray, low: float, high: float, report: Report) -> np.ndarray:
-    """``values`` [N, ...] moved into a format's range; ``report`` is told of how many Gaussians if there are any."""
-    outside = (values < low) | (values > high)
-    if outside.any():
-        rows = np.count_nonzero(outside.any(axis=tuple(range(1, values.ndim))))
-        report(f"{what} of {rows} of {len(values)} Gaussians moved into {low:.4g}..{high:.4g}")
-    return np.clip(values, low, high)
 
 
 def frame(letters: str) -> np.ndarray:

@@ -22,18 +22,8 @@ import numpy as np
 
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.reading import Unexpected, check_expansion, reading
-from warp_splat.formats.splats import (
-    COEFFICIENTS,
-    OTHERS,
-    SplatArrays,
-    SplatFile,
-    clipped,
-    frame,
-    logit,
-    sigmoid,
-    turned,
-    unit_quats,
-)
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
+from warp_splat.formats.stored import OTHERS, clipped, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
 MAGIC = b"NGSP"

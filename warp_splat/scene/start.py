@@ -10,7 +10,8 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.ply import GRAY
-from warp_splat.formats.splats import SH_C0, SplatFile
+from warp_splat.formats.splats import SplatFile
+from warp_splat.formats.stored import SH_C0
 from warp_splat.scene.types import spread_of, visible
 from warp_splat.text import Report
 

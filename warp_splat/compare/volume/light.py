@@ -28,7 +28,7 @@ from scipy.special import erf, exprel
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
 from warp_splat.errors import InputError
-from warp_splat.formats.splats import SH_C0
+from warp_splat.formats.stored import SH_C0
 
 REACH = 9.0  # standard deviations beyond which a Gaussian is nothing: exp(-81 / 2) = 3e-18
 NODES = 16  # of Gauss and Legendre, in each panel of the truth

@@ -24,7 +24,7 @@ from warp_splat.compare.volume.light import Volume
 from warp_splat.config import PROJECTIONS, RasterOptions
 from warp_splat.evaluation import report
 from warp_splat.formats.atomic import write_csv
-from warp_splat.formats.splats import SH_C0
+from warp_splat.formats.stored import SH_C0
 from warp_splat.lenses import Lens
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
