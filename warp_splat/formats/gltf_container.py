@@ -190,7 +190,7 @@ def _matrix(node: dict) -> np.ndarray:
     """The transform [4, 4] of a node."""
     if "matrix" in node:
         return numbers_of(node, "matrix", 16).reshape(4, 4).T
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - most files have none
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - slow to load, and other formats do without
 
     node = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1], **node}
     quat = numbers_of(node, "rotation", 4)
