@@ -4,27 +4,21 @@
 const MOVING = 200; // ms after the last input until the image is drawn in full detail
 const FRAME = 50; // ms that a frame should take while moving; its detail is chosen so
 const PATIENCE = 5; // times of a frame between pictures while the page loads: a slow card must not hold that up
+const LOOK = 10; // ms between looks for a part that is on its way
 const element = (id) => document.getElementById(id);
 const say = (text) => { element("message").textContent = text; };
 
 // The text of a part, once the browser has read past it; it is megabytes, and leaves the page.
-function partText(id) {
-  return new Promise((resolve, reject) => {
-    const look = () => {
-      const found = element(id);
-      if (found?.nextSibling) {
-        observer.disconnect();
-        found.remove();
-        resolve(found.textContent);
-      } else if (document.readyState !== "loading") {
-        reject(new Error("This page ends too early: copy or load it again."));
-      }
-    };
-    const observer = new MutationObserver(look);
-    observer.observe(document.body, { childList: true });
-    document.addEventListener("DOMContentLoaded", look);
-    look();
-  });
+async function partText(id) {
+  for (;;) {
+    const found = element(id);
+    if (found?.nextSibling) {
+      found.remove();
+      return found.textContent;
+    }
+    if (document.readyState !== "loading") throw new Error("This page ends too early: copy or load it again.");
+    await new Promise((resolve) => setTimeout(resolve, LOOK));
+  }
 }
 
 // A part as numbers for whole rows of `width` texels, from what pack.py made of it.

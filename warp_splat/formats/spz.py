@@ -12,7 +12,7 @@ Own code: the one Python package of its authors is not on PyPI, and no other is 
 from __future__ import annotations
 
 import gzip
-import io
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -100,12 +100,12 @@ def load_spz(path: str | Path, report: Report = print) -> SplatFile:
         InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
     """
     with reading(path, "an SPZ file of version 2, 3 or 4"), open(path, "rb") as source:
-        start = source.read(4)
+        start, file_bytes = source.read(4), os.fstat(source.fileno()).st_size
         source.seek(0)
         if start == MAGIC:
-            packed = _read_zstd(source)
+            packed = _read_zstd(source, file_bytes)
         elif start[:2] == b"\x1f\x8b":
-            packed = _read_gzip(source)
+            packed = _read_gzip(source, file_bytes)
         else:
             raise Unexpected(f"a file that begins with {start!r}; it may be another format, or cut short")
         splats = _unpack(packed)
@@ -175,34 +175,28 @@ def _sizes(version: int, count: int, degree: int, file_bytes: int) -> list[int]:
     return [count * row for row in per_row]
 
 
-def _read_gzip(source: BinaryIO) -> _Packed:
-    data = source.read()
+def _read_gzip(source: BinaryIO, file_bytes: int) -> _Packed:
     try:
-        stream = zlib.decompressobj(wbits=31)
-        start = stream.decompress(data, HEADER.size)
-        if len(start) < HEADER.size or start[:4] != MAGIC:
-            raise Unexpected("a gzip file of something else")
-        _, version, count, degree, fraction_bits, flags, _ = HEADER.unpack(start)
-        if version not in (2, 3):
-            raise Unexpected(f"version {version} in a gzip file")
-        sizes = _sizes(version, count, degree, len(data))
-        body = io.BytesIO(stream.decompress(stream.unconsumed_tail, sum(sizes) + EXTENSION_BYTES))
-    except zlib.error as error:
+        with gzip.GzipFile(fileobj=source) as stream:
+            start = stream.read(HEADER.size)
+            if len(start) < HEADER.size or start[:4] != MAGIC:
+                raise Unexpected("a gzip file of something else")
+            _, version, count, degree, fraction_bits, flags, _ = HEADER.unpack(start)
+            if version not in (2, 3):
+                raise Unexpected(f"version {version} in a gzip file")
+            streams = [_exactly(stream, size) for size in _sizes(version, count, degree, file_bytes)]
+            records = stream.read(EXTENSION_BYTES)  # extensions of version 3 come last
+            if stream.read(1):
+                raise ValueError("the gzip stream goes on after its last Gaussian")
+    except (zlib.error, EOFError, gzip.BadGzipFile) as error:
         raise ValueError(str(error)) from error
-    if not stream.eof:
-        raise ValueError("the gzip stream goes on after its last Gaussian, or has no end")
-    streams = [_exactly(body, size) for size in sizes]
-    records = body.read()  # extensions of version 3 come last
     return _Packed(streams, version, degree, fraction_bits, bool(flags & FLAG_ANTIALIASED), _find_axes(records))
 
 
-def _read_zstd(source: BinaryIO) -> _Packed:
+def _read_zstd(source: BinaryIO, file_bytes: int) -> _Packed:
     import zstandard  # noqa: PLC0415 - only files of version 4 need it
 
-    file_bytes = source.seek(0, io.SEEK_END)
-    source.seek(0)
-    start = _exactly(source, HEADER4.size)
-    _, version, count, degree, fraction_bits, flags, streams, table = HEADER4.unpack(start)
+    _, version, count, degree, fraction_bits, flags, streams, table = HEADER4.unpack(_exactly(source, HEADER4.size))
     if version != 4:
         raise Unexpected(f"version {version}; export it as version 3 or 4")
     sizes = _sizes(version, count, degree, file_bytes)

@@ -59,13 +59,12 @@ def check_names(subject: Subject) -> Iterator[Finding]:
     for photo in subject.photos:
         stems[str(Path(photo.name).with_suffix("")).lower()].append(photo.name)
         copies[hashlib.sha256(photo.path.read_bytes()).digest()].append(photo.name)
-    once = True
-    for what, groups in (("the same name but for ending or case", stems), ("the same bytes", copies)):
-        twice = [" = ".join(names) for names in groups.values() if len(names) > 1]
-        if twice:
-            once = False
-            yield Finding("duplicates", "warning", f"{len(twice)} groups of images have {what}: {few(twice)}.")
-    if once and subject.photos:
+    kinds = {"the same name but for ending or case": stems, "the same bytes": copies}
+    twice = {kind: [" = ".join(n) for n in groups.values() if len(n) > 1] for kind, groups in kinds.items()}
+    for kind, names in twice.items():
+        if names:
+            yield Finding("duplicates", "warning", f"{len(names)} groups of images have {kind}: {few(names)}.")
+    if subject.photos and not any(twice.values()):
         yield Finding("duplicates", "ok", "no image occurs twice.")
     if subject.model is not None and subject.root.is_dir():
         known = {subject.model.image(i).name for i in subject.model.reg_image_ids()}
