@@ -224,6 +224,8 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     """
 
     def parse(entries: list[dict]) -> list[tuple[str, Camera]]:
+        if not isinstance(entries, list):
+            raise Unexpected("other JSON")
         try:
             return [(str(entry["img_name"]), _camera(entry)) for entry in entries]
         except InputError as error:
