@@ -97,7 +97,6 @@ def test_layered_scenes_are_as_deep_as_they_say():
 def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     monkeypatch.setattr(knobs, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
-    monkeypatch.setattr(plots, "KNOB_STYLES", {"t_min": ("k", "o"), "alpha_min": ("b", "s")})
     scenes = [workloads.layered(10), workload()]
     measured, lines = adjoints.run_adjoints(scenes, ["stepwise"], lambda _: None), []
     rows = adjoints.records(measured)
@@ -118,13 +117,13 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     assert by_name["degree1", "stepwise", "means"]["cosine"] == pytest.approx(1, abs=1e-6)
     assert by_name["degree1", "central differences", "opacities"]["relative_error"] < 0.05
     assert by_name["degree1", "central differences", "opacities"]["note"].endswith("extrapolated")
-    lines += plots.adjoint_table(measured).splitlines()
+    lines += adjoints.adjoint_table(measured).splitlines()
     plots.plot_errors(tmp_path / "errors.png", measured)
     plots.plot_memory(tmp_path / "memory.png", measured)
     plots.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
     turned = knobs.run_knobs(scenes, lambda _: None)
     plots.plot_knobs(tmp_path / "knobs.png", turned)
-    lines += plots.knob_table(turned).splitlines()
+    lines += adjoints.knob_table(turned).splitlines()
     assert len({len(line) for line in lines}) == 2  # two tables, every line as long as its header
     exact = {item.variant: item.image_error for item in turned if item.scene == "degree1"}
     assert exact["alpha_min 0"] < 1e-5 < exact["alpha_min 0.003922 *"] and exact["t_min 0.0001 *"] < 1e-3
@@ -149,7 +148,7 @@ def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
         assert item.worst[1] < 1e-5 and item.image_error < 1e-5, item.variant
         assert item.memory == (None if item.variant == adjoints.TAPE else 7)
         assert len(item.forward) == len(item.backward) == 2
-    assert plots.adjoint_table(measured).count("\n") == 1 + len(measured)
+    assert adjoints.adjoint_table(measured).count("\n") == 1 + len(measured)
 
 
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
@@ -158,7 +157,7 @@ def test_stored_that_does_not_fit_is_a_row(monkeypatch):
     measured = adjoints.run_adjoints([workload()], ["stored"], lambda _: None)
     row = next(item for item in measured if item.variant == "stored")
     assert "transmittances" in row.note and not row.backward
-    assert "stored" in plots.adjoint_table(measured)
+    assert "stored" in adjoints.adjoint_table(measured)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,10 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
+from warp_splat.compare import through_lenses
 from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.volume import light as physics
-from warp_splat.compare.volume import measure, media, through_lenses
+from warp_splat.compare.volume import measure, media
 from warp_splat.compare.volume.light import Volume
 from warp_splat.errors import InputError
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+import string
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from warp_splat.errors import InputError
 
@@ -38,3 +40,20 @@ def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> st
         rule = "-" * (width - 1) + (":" if to_right else "-")
         columns.append([f"{cell:{'>' if to_right else '<'}{width}}" for cell in (head, rule, *cells)])
     return "\n".join(f"| {' | '.join(line)} |" for line in zip(*columns, strict=True))
+
+
+def table_of(records: Iterable[Mapping], columns: Mapping[str, str | Callable[[Mapping], object]]) -> str:
+    """A table of records, by header: what :meth:`str.format` makes of one, or a function of it.
+
+    A cell whose number is missing, None or NaN, is "-".
+    """
+    return format_table(list(columns), [[_cell(record, column) for column in columns.values()] for record in records])
+
+
+def _cell(record: Mapping, column: str | Callable[[Mapping], object]) -> object:
+    if callable(column):
+        return column(record)
+    names = [name for _, name, _, _ in string.Formatter().parse(column) if name]
+    values = [record.get(name) for name in names]
+    missing = any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values)
+    return "-" if missing else column.format(**record)

@@ -16,21 +16,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.compare.on_tape import differentiate_on_tape, gradients_on_tape
-from warp_splat.compare.trained import CAPS
-from warp_splat.compare.truth import Error, Truth, compute_truth, errors_of, gradients_of
-from warp_splat.compare.workloads import Workload
+from warp_splat.compare.truth import TAPE, Error, Truth, compute_truth, differentiate, errors_of, gradients_of
+from warp_splat.compare.workloads import CAPS, Workload
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
-from warp_splat.raster.data import Gaussians
 from warp_splat.runtime import timers
+from warp_splat.text import table_of
 
 ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
 REPEATS = 5
 BUDGET = 12.0  # s for the repeats of a workload; slow ones get fewer
 DIFFERENCES = 12  # parameters at which central differences are computed
-TAPE = "tape"  # variant on Warp's tape
 STEP = 3e-3  # of central differences, relative to the opacity or what is left to 1
 
 
@@ -70,12 +67,16 @@ class Measurement:
         found = [(name, known[name]) for name in known if name != "background"]
         return max(found, key=lambda item: item[1]) if found else ("-", float("nan"))
 
+    @property
+    def both(self) -> float:
+        """Seconds of forward and backward pass."""
+        return (median(self.forward) or 0.0) + (median(self.backward) or 0.0)
+
 
 def variants_of(modes: Sequence[str], device: torch.device) -> list[Variant]:
     """The modes asked for and what only the comparison has, as far as ``device`` has it."""
     of_the_cpu = ON_CPU if device.type == "cpu" else ()
-    found = [Variant(mode, mode) for mode in dict.fromkeys(("manual", *modes, *of_the_cpu))]
-    found.append(Variant(TAPE, "manual"))
+    found = [Variant(mode, mode) for mode in dict.fromkeys(("manual", *modes, *of_the_cpu, TAPE))]
     return found + [Variant(f"cap {cap}", "manual", {"max_steps": cap}) for cap in CAPS]
 
 
@@ -99,10 +100,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     result = Measurement(workload.name, variant.name, len(workload.gaussians.means))
     options = variant.options(workload)
     try:
-        if variant.name == TAPE:
-            image, gradients = gradients_on_tape(workload, truth)
-        else:
-            image, gradients = gradients_of(workload, truth, variant.adjoint, options)
+        image, gradients = gradients_of(workload, truth, variant.adjoint, options)
     except InputError as error:  # stored refuses what does not fit
         result.extrapolated = True
         result.note = str(error)
@@ -111,7 +109,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
     if variant.name != TAPE:  # whose arrays are Warp's
-        result.memory = peak_of(lambda: _differentiate(workload, variant), workload.device)
+        result.memory = peak_of(lambda: differentiate(workload, variant.adjoint, options), workload.device)
     return result
 
 
@@ -123,7 +121,7 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
     while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
         for variant in runnable:
             with timers.profile() as stages:
-                _differentiate(workload, variant)
+                differentiate(workload, variant.adjoint, variant.options(workload))
             stages_of[variant].append(dict(stages))
         rounds += 1
     for variant, result in runnable.items():
@@ -131,16 +129,6 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
         result.forward = [stages["blend"] + stages.get("tape", 0.0) for stages in measured]
         result.backward = [stages["adjoint of blend"] + stages.get("adjoint of tape", 0.0) for stages in measured]
         result.stages = {name: float(np.median([stages[name] for stages in measured])) for name in measured[0]}
-
-
-def _differentiate(workload: Workload, variant: Variant) -> None:
-    """A forward and a backward pass over the whole image."""
-    if variant.name == TAPE:
-        differentiate_on_tape(workload)
-        return
-    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
-    out = render(leaves, workload.camera, workload.background, variant.options(workload), variant.adjoint)
-    out.image.backward(torch.ones_like(out.image))
 
 
 def peak_of(run: Callable[[], object], device: torch.device) -> int:
@@ -179,7 +167,7 @@ def central_differences(workload: Workload, truth: Truth) -> Measurement:
         result.backward = [float(np.median(seconds)) * count]
         result.extrapolated = True
         result.note = f"{1e3 * float(np.median(seconds)):.1f} ms per parameter, times {count}: extrapolated"
-        result.errors = {"opacities": Error(error, float("nan"), float("nan"), float("nan"))}
+        result.errors = {"opacities": Error(error)}
     return result
 
 
@@ -198,12 +186,58 @@ def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:
         times = {"forward": item.forward, "backward": item.backward}
         ways = (("seconds", median), ("spread", half_range))
         seconds = {f"{name}_{what}": way(values) for name, values in times.items() for what, way in ways}
-        for parameter, error in (item.errors or {"": Error(*[float("nan")] * 4)}).items():
+        for parameter, error in (item.errors or {"": Error()}).items():
             what = {"scene": item.scene, "variant": item.variant, "gaussians": item.gaussians, "parameter": parameter}
             errors = {"relative_error": error.relative, "largest_error": error.largest, "cosine": error.cosine}
             errors |= {"bias": error.bias, "image_error": item.image_error}
             rows.append({**what, **errors, **seconds, "peak_memory": item.memory, "note": item.note})
     return rows
+
+
+def adjoint_table(measurements: Sequence[Measurement]) -> str:
+    """A row per scene and variant: the worst parameter's error, times, memory."""
+    manual = {item.scene: item for item in measurements if item.variant == "manual"}
+    found = []
+    for item in measurements:
+        (name, error), memory = item.worst, item.memory and item.memory / 2**20
+        ratio = (median(item.backward) or 0.0) / (median(manual[item.scene].backward) or 1.0)
+        relative = f"{ratio:.2f}" if ratio < 100 else f"{ratio:.0e}"
+        shown = {"error": error, "of": name, "memory": memory, "relative": relative if item.backward else None}
+        found.append({**_shown(item), **shown})
+    errors = {"scene": "{scene}", "variant": "{variant}", "error": "{error:.1e}", "of": "{of}"}
+    times = {"forward ms": "{forward}", "backward ms": "{backward}", "x manual": "{relative}"}
+    return table_of(found, {**errors, **times, "peak MiB": "{memory:.1f}"})
+
+
+def knob_table(measurements: Sequence[Measurement]) -> str:
+    """A row per scene and setting: image and gradient error against everything blended, times against the default."""
+    found = []
+    for item in measurements:
+        name, error = item.worst
+        relative = item.both / default_of(measurements, item).both
+        found.append({**_shown(item), "image": item.image_error, "error": error, "of": name, "relative": relative})
+    errors = {"image error": "{image:.1e}", "gradient error": "{error:.1e}", "of": "{of}"}
+    times = {"forward ms": "{forward}", "backward ms": "{backward}", "x default": "{relative:.2f}"}
+    return table_of(found, {"scene": "{scene}", "setting": "{variant}", **errors, **times})
+
+
+def default_of(measurements: Sequence[Measurement], item: Measurement) -> Measurement:
+    """The same knob at its default, on the same scene."""
+    knob = item.variant.split()[0]
+    here = (other for other in measurements if other.scene == item.scene and other.variant.split()[0] == knob)
+    return next(other for other in here if other.variant.endswith("*"))
+
+
+def _shown(item: Measurement) -> dict[str, str]:
+    backward = _milliseconds(item.backward) + " extrapolated" * item.extrapolated
+    return {"scene": item.scene, "variant": item.variant, "forward": _milliseconds(item.forward), "backward": backward}
+
+
+def _milliseconds(seconds: Sequence[float]) -> str:
+    if not seconds:
+        return "-"
+    value, around = 1e3 * (median(seconds) or 0.0), 1e3 * (half_range(seconds) or 0.0)
+    return f"{value:.2f} ± {around:.2f}" if len(seconds) > 1 else f"{value:.1e}"
 
 
 def median(seconds: Sequence[float]) -> float | None:

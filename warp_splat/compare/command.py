@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from warp_splat.compare import adjoints, knobs, plots, trained
+from warp_splat.compare import adjoints, knobs, plots, through_lenses, trained
 from warp_splat.compare.stability import cases
-from warp_splat.compare.volume import measure, through_lenses
+from warp_splat.compare.volume import measure
 from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
@@ -81,14 +81,14 @@ def _compare_pixel_loops(
     print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
     workloads = all_workloads(scenes, device, say)
     measured = adjoints.run_adjoints(workloads, config.modes, say)
-    say(f"\n{plots.adjoint_table(measured)}\n")
+    say(f"\n{adjoints.adjoint_table(measured)}\n")
     _write(out, "adjoints", measured)
     plots.plot_errors(out / "adjoints.png", measured)
     plots.plot_memory(out / "memory.png", measured)
     plots.plot_stages(out / "stages.png", measured, config.modes)
     _check_directions(workloads, out, say)
     turned = knobs.run_knobs(_for_knobs(workloads), say)
-    say(f"\n{plots.knob_table(turned)}\n")
+    say(f"\n{adjoints.knob_table(turned)}\n")
     _write(out, "knobs", turned)
     plots.plot_knobs(out / "knobs.png", turned)
 

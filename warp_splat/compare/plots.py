@@ -1,18 +1,21 @@
-"""Tables and plots of adjoints and knobs: error against run time, memory against depth complexity, share of stages."""
+"""Every plot of the comparison: error against run time, growth of errors, shares of stages, maps of errors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator, NullLocator
 
-from warp_splat.compare.adjoints import Measurement, half_range, median
+from warp_splat.compare.adjoints import Measurement, default_of
 from warp_splat.compare.knobs import KNOBS
 from warp_splat.compare.workloads import CANDIDATES
 from warp_splat.evaluation import report
-from warp_splat.text import format_table
 
 #: Color and marker of a variant.
 STYLES = {
@@ -28,83 +31,92 @@ STYLES = {
     "cap 128": ("#56B4E9", "3"),
     "central differences": ("#999999", "P"),
 }
-KNOB_STYLES = dict(zip(KNOBS, [(color, marker) for color, marker in STYLES.values()][:5], strict=True))
 LEAST = 1e-8  # shown instead of an error of 0 on a logarithmic axis
+MOST_ERROR = 0.3  # of maps
 STAGES = ("project", "bin", "blend", "adjoint of blend", "adjoint of project")
 
 
-def adjoint_table(measurements: Sequence[Measurement]) -> str:
-    """A row per scene and variant: the worst parameter's error, times, memory."""
-    rows = []
-    for item in measurements:
-        manual = next(other for other in measurements if (other.scene, other.variant) == (item.scene, "manual"))
-        ratio = (median(item.backward) or 0.0) / (median(manual.backward) or 1.0) if item.backward else None
-        name, error = item.worst if item.errors else ("-", None)
-        times = (_milliseconds(item.forward), _milliseconds(item.backward) + " extrapolated" * item.extrapolated)
-        relative = _number(ratio, "{:.2f}" if ratio and ratio < 100 else "{:.0e}")
-        memory = _number(item.memory and item.memory / 2**20, "{:.1f}")
-        rows.append((item.scene, item.variant, _number(error, "{:.1e}"), name, *times, relative, memory))
-    headers = ("scene", "variant", "error", "of", "forward ms", "backward ms", "x manual", "peak MiB")
-    return format_table(headers, rows)
+@dataclass
+class Panel:
+    """A plot beside others.
+
+    Args:
+        title: what is drawn upward.
+        x: what is drawn to the right.
+        lines: what :meth:`line` was given.
+        notes: point, text, offset [points of type], alignment.
+        limits: of the axes, in matplotlib's words; logarithmic without.
+        ticks: 1, 2, 5, 10 along x.
+    """
+
+    title: str
+    x: str
+    lines: list[tuple[str, Any, Any, dict[str, Any]]] = field(default_factory=list)
+    notes: list[tuple[tuple[float, float], str, tuple[float, float], str]] = field(default_factory=list)
+    limits: dict[str, Any] = field(default_factory=dict)
+    ticks: bool = False
+
+    def line(self, name: str, x: Any, y: Any, **style: Any) -> None:
+        """A curve, or a point, by its name in the legend ("" for none) and a style in matplotlib's words."""
+        self.lines.append((name, x, y, style))
+
+    def marks(self, name: str, x: Any, y: Any, look: tuple[str, str], **style: Any) -> None:
+        """Likewise with markers: color and marker; joined only if ``ls`` says how."""
+        self.line(name, x, y, **{"color": look[0], "marker": look[1], "markersize": 5, "ls": "", **style})
 
 
-def knob_table(measurements: Sequence[Measurement]) -> str:
-    """A row per scene and setting: image and gradient error against everything blended, times against the default."""
-    rows = []
-    for item in measurements:
-        default = _default(measurements, item)
-        name, error = item.worst
-        times = _milliseconds(item.forward), _milliseconds(item.backward), f"{_both(item) / _both(default):.2f}"
-        rows.append((item.scene, item.variant, f"{item.image_error:.1e}", f"{error:.1e}", name, *times))
-    headers = ("scene", "setting", "image error", "gradient error", "of", "forward ms", "backward ms", "x default")
-    return format_table(headers, rows)
+def draw(path: Path, panels: Sequence[Panel], columns: int, height: float, y: str = "", **shared: Any) -> None:
+    """Panels in rows of ``height`` inches under one legend."""
+    figure, grid = report.new_panels(0.8 + height * -(-len(panels) // columns), -(-len(panels) // columns), columns)
+    handles = {}
+    for axes, panel in zip_longest(np.ravel(grid), panels):
+        if panel is None:
+            axes.set_axis_off()
+            continue
+        report.plain_axes(axes, panel.title, panel.x)
+        for name, along, values, style in panel.lines:
+            line = axes.plot(along, values, **style)[0]
+            handles |= {name: line} if name else {}
+        for note in panel.notes:
+            report.label_point(axes, *note)
+        axes.set(**{"xscale": "log", "yscale": "log", **shared, **panel.limits})
+        if panel.ticks:
+            axes.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=NullLocator())
+            axes.xaxis.set_major_formatter("{x:g}")
+    figure.supylabel(y, fontsize=9, color=report.INK)
+    look = {"loc": "outside lower center", "ncols": 5, "fontsize": 8, "frameon": False}
+    figure.legend(list(handles.values()), list(handles), **look)
+    report.save_figure(figure, path)
 
 
 def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
     """Error of the worst gradient against the time of forward and backward pass, a panel per scene."""
-    scenes = list(dict.fromkeys(item.scene for item in measurements))
-    rows = -(-len(scenes) // 3)
-    figure, grid = report.new_panels(0.8 + 2.0 * rows, rows, 3, sharey=True)
-    handles = {}
-    for axes, scene in zip(grid.flat, scenes, strict=False):
-        report.plain_axes(axes, scene, "forward and backward [ms]")
+    panels = []
+    for scene in dict.fromkeys(item.scene for item in measurements):
         here = [item for item in measurements if item.scene == scene and item.backward and item.errors]
+        times = [1e3 * item.both for item in here if not item.extrapolated]
+        limits = {"xlim": (0.7 * min(times), 1.5 * max(times)), "ylim": (LEAST, 3.0)}
+        panel = Panel(scene, "forward and backward [ms]", limits=limits, ticks=True)
         for item in here:
-            error = max(item.worst[1], LEAST)
+            place = 1e3 * item.both, max(item.worst[1], LEAST)
             if item.extrapolated:  # too far to the right to be drawn
-                axes.annotate(f"differences, {_both(item):.0e} s ▸", (1, error), xycoords=("axes fraction", "data"),
-                              ha="right", va="center", fontsize=7, color=STYLES[item.variant][0])  # fmt: skip
-                continue
-            color, marker = STYLES[item.variant]
-            line = axes.loglog(1e3 * _both(item), error, marker, color=color, markersize=6, linestyle="none")[0]
-            handles[item.variant] = line
-        drawn = [1e3 * _both(item) for item in here if not item.extrapolated]
-        axes.set_xlim(0.7 * min(drawn), 1.5 * max(drawn))
-        axes.set_ylim(LEAST, 3.0)
-        _plain_ticks(axes)
-    for axes in grid.flat[len(scenes) :]:
-        axes.set_axis_off()
-    figure.supylabel("relative error of the worst gradient", fontsize=9, color=report.INK)
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-    report.save_figure(figure, path)
+                at = (limits["xlim"][1], place[1])
+                panel.notes.append((at, f"differences, {item.both:.0e} s ▸", (0, -3), "right"))
+            else:
+                panel.marks(item.variant, *place, STYLES[item.variant])
+        panels.append(panel)
+    draw(path, panels, 3, 2.0, "relative error of the worst gradient")
 
 
 def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
     """Peak memory against depth complexity, a line per variant."""
-    figure, axes = report.new_panels(2.8, width=report.WIDTH / 2)
-    report.plain_axes(axes, "peak memory of a pass [MiB]", "candidates per pixel")
-    for variant in dict.fromkeys(item.variant for item in measurements):
-        points = [
-            (candidates, item.memory / 2**20)
-            for candidates in CANDIDATES
-            for item in measurements
-            if (item.scene, item.variant) == (f"{candidates} layers", variant) and item.memory
-        ]
-        if points and not variant.startswith("cap"):
-            color, marker = STYLES[variant]
-            axes.loglog(*np.array(points).T, marker=marker, color=color, linewidth=1.2, markersize=5, label=variant)
-    axes.legend(fontsize=8, frameon=False)
-    report.save_figure(figure, path)
+    panel = Panel("peak memory of a pass [MiB]", "candidates per pixel")
+    of = {(item.scene, item.variant): item.memory for item in measurements if item.memory}
+    for variant in dict.fromkeys(item.variant for item in measurements if not item.variant.startswith("cap")):
+        points = [(n, of[key] / 2**20) for n in CANDIDATES if (key := (f"{n} layers", variant)) in of]
+        if points:
+            panel.marks(variant, *np.array(points).T, STYLES[variant], ls="-", linewidth=1.2)
+    draw(path, [panel], 1, 2.8)
 
 
 def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence[str]) -> None:
@@ -112,17 +124,15 @@ def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence
     chosen = [item for item in measurements if item.variant in modes and item.stages]
     figure, axes = report.new_panels(0.8 + 0.2 * len(chosen))
     report.plain_axes(axes, "share of each stage of rendering and differentiating")
+    seconds = np.array([[item.stages.get(stage, 0.0) for stage in STAGES] for item in chosen])
+    share = seconds / seconds.sum(1, keepdims=True)
+    left = np.cumsum(share, 1) - share
     labels = [f"{item.scene}: {item.variant}" for item in chosen]
-    totals = np.array([sum(item.stages.get(stage, 0.0) for stage in STAGES) for item in chosen])
-    left = np.zeros(len(chosen))
-    for stage, color in zip(STAGES, ("#56B4E9", "#999999", report.BLUE, report.ORANGE, "#E69F00"), strict=True):
-        share = np.array([item.stages.get(stage, 0.0) for item in chosen]) / totals
-        axes.barh(labels, share, left=left, color=color, height=0.75, label=stage)
-        left += share
+    for place, color in enumerate(("#56B4E9", "#999999", report.BLUE, report.ORANGE, "#E69F00")):
+        axes.barh(labels, share[:, place], left=left[:, place], color=color, height=0.75, label=STAGES[place])
+    axes.set(xlim=(0, 1), ymargin=0.01)
     axes.invert_yaxis()
     axes.grid(False)
-    axes.set_xlim(0, 1)
-    axes.margins(y=0.01)
     axes.tick_params(axis="y", labelsize=7, length=0)
     figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
     report.save_figure(figure, path)
@@ -130,53 +140,47 @@ def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence
 
 def plot_knobs(path: Path, measurements: Sequence[Measurement]) -> None:
     """Error of image and gradient against time, relative to the default, a row per scene."""
-    scenes = list(dict.fromkeys(item.scene for item in measurements))
-    figure, grid = report.new_panels(0.5 + 2.8 * len(scenes), len(scenes), 2)
-    handles = {}
-    for row, scene in zip(grid, scenes, strict=True):
+    panels = []
+    for scene in dict.fromkeys(item.scene for item in measurements):
         here = [item for item in measurements if item.scene == scene]
-        for axes, what in zip(row, ("image", "gradient"), strict=True):
-            report.plain_axes(axes, f"{scene}: error of the {what}", "time of the pixel loop, default (*) = 1")
-            for knob, (color, marker) in KNOB_STYLES.items():
+        for what in ("image", "gradient"):
+            panel = Panel(f"{scene}: error of the {what}", "time of the pixel loop, default (*) = 1", ticks=True)
+            for knob, style in zip(KNOBS, STYLES.values(), strict=False):
                 turned = [item for item in here if item.variant.startswith(f"{knob} ")]
-                times = [_both(item) / _both(_default(here, item)) for item in turned]
-                errors = [item.image_error if what == "image" else item.worst[1] for item in turned]
+                times = [item.both / default_of(here, item).both for item in turned]
+                errors = [(item.image_error or 0.0) if what == "image" else item.worst[1] for item in turned]
                 errors = [max(error, LEAST) for error in errors]
-                handles[knob] = axes.loglog(times, errors, marker, ls="-", color=color, lw=0.8, markersize=4)[0]
+                panel.marks(knob, times, errors, style, ls="-", lw=0.8)
                 for item, *place in zip(turned, times, errors, strict=True):
                     if place[0] > 1.2 or place[1] > 1e-5:  # the others lie on one spot
-                        name = item.variant.removeprefix(f"{knob} ")
-                        axes.annotate(name, place, (3, 3), textcoords="offset points", fontsize=6, color=color)
-            _plain_ticks(axes)
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+                        panel.notes.append((tuple(place), item.variant.removeprefix(f"{knob} "), (3, 3), "left"))
+            panels.append(panel)
+    draw(path, panels, 2, 2.8)
+
+
+def plot_maps(
+    path: Path, rows: Mapping[str, Sequence[tuple[str, np.ndarray, np.ndarray | None]]], height: float, least: float
+) -> None:
+    """Draw images in rows: a title, the truth, and what is to be compared with it, or None for the truth itself."""
+    figure = report.new_figure(report.WIDTH, height, layout="compressed")
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
+    grid = figure.subplots(len(rows), max(len(row) for row in rows.values()))
+    shown = None
+    for line, (cells, (name, row)) in enumerate(zip(grid, rows.items(), strict=True)):
+        cells[0].set_ylabel(name, fontsize=7, color=report.INK)
+        for axes, (title, truth, found) in zip(cells, row, strict=True):
+            if found is None:
+                axes.imshow(np.nan_to_num(truth, nan=1.0).clip(0, 1))
+            else:
+                error = np.abs(found - truth).mean(-1)
+                shown = axes.imshow(error.clip(least), cmap="inferno", norm=LogNorm(least, MOST_ERROR))
+                mean = np.nanmean(error)
+                axes.set_xlabel(f"{mean:.1e}" if mean > 1e-12 else "exact", fontsize=7, color=report.INK, labelpad=1)
+            if not line:
+                axes.set_title(title, fontsize=7, fontweight="bold", color=report.INK)
+            axes.set(xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+    bar = figure.colorbar(shown, ax=grid, orientation="horizontal", fraction=0.05, aspect=70, extend="both")
+    bar.set_label("|error|, mean of the channels (colors 0 to 1); under each map its mean", fontsize=8)
+    bar.ax.tick_params(labelsize=8, labelcolor=report.INK)
     report.save_figure(figure, path)
-
-
-def _default(measurements: Sequence[Measurement], item: Measurement) -> Measurement:
-    """The same knob at its default, on the same scene."""
-    knob = item.variant.split()[0]
-    here = (other for other in measurements if other.scene == item.scene and other.variant.split()[0] == knob)
-    return next(other for other in here if other.variant.endswith("*"))
-
-
-def _plain_ticks(axes) -> None:
-    """1, 2, 5, 10 along a logarithmic x axis."""
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
-
-
-def _both(item: Measurement) -> float:
-    """Seconds of forward and backward pass."""
-    return (median(item.forward) or 0.0) + (median(item.backward) or 0.0)
-
-
-def _number(value: float | None, pattern: str) -> str:
-    return "-" if value is None else pattern.format(value)
-
-
-def _milliseconds(seconds: Sequence[float]) -> str:
-    if not seconds:
-        return "-"
-    value, around = 1e3 * (median(seconds) or 0.0), 1e3 * (half_range(seconds) or 0.0)
-    return f"{value:.2f} ± {around:.2f}" if len(seconds) > 1 else f"{value:.1e}"

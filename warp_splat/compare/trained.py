@@ -12,6 +12,7 @@ up every 100 steps, the rate of the means at its end at step 300. PSNR is measur
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +24,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.compare.workloads import SHORT
+from warp_splat.compare import plots
+from warp_splat.compare.workloads import CAPS, SHORT
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import psnr, ssim
@@ -32,26 +34,26 @@ from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.scene import Scene, View
-from warp_splat.text import format_table
+from warp_splat.text import table_of
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 SEEDS = (0, 1, 2)
-CAPS = (2048, 512, 128)  # the thesis's first; the last is pictured
 EVALUATIONS, VIEWS = 12, 8
 COMPARED = (1, 10, 99)  # steps after which parameters are compared; step 100 densifies
 STYLES = ((report.BLUE, "-"), (report.ORANGE, "--"), (report.GREEN, "-."), ("#CC79A7", ":"))  # curves may coincide
-COLUMNS = (  # header, key of a summary's record, format
-    ("PSNR [dB]", "psnr", ".2f"),
-    ("std over seeds", "psnr_std", ".2f"),
-    ("against manual", "psnr_against_manual", "+.2f"),
-    ("SSIM", "ssim", ".3f"),
-    ("Gaussians", "gaussians", ".0f"),
-    ("it/s", "iterations_per_second", ".1f"),
-    ("slowdown", "slowdown", ".2f"),
-    ("longest list", "longest_list", ".0f"),
-    ("lists cut", "lists_cut", ".1%"),
-)
+COLUMNS = {
+    "variant": lambda record: record["variant"] + " (refused)" * bool(record["refused"]),
+    "PSNR [dB]": "{psnr:.2f}",
+    "std over seeds": "{psnr_std:.2f}",
+    "against manual": "{psnr_against_manual:+.2f}",
+    "SSIM": "{ssim:.3f}",
+    "Gaussians": "{gaussians:.0f}",
+    "it/s": "{iterations_per_second:.1f}",
+    "slowdown": "{slowdown:.2f}",
+    "longest list": "{longest_list:.0f}",
+    "lists cut": "{lists_cut:.1%}",
+}
 
 
 @dataclass
@@ -108,7 +110,7 @@ def run_trainings(
         found = train_all(loaded, name, variants, names, schedule, say)
         results["summary"] += (rows := summarize(found))
         results["equality"][name] = equality = compare_modes(found, names)
-        say(f"\n{_table(rows)}\n\n{_verdict(equality) if equality else ''}")
+        say(f"\n{table_of(rows, COLUMNS)}\n\n{_verdict(equality) if equality else ''}")
         plot_cap(out / "training_cap.jpg", _views(loaded), found)
         runs += found
     results["runs"] = [{key: value for key, value in vars(r).items() if key != "pictures"} for r in runs]
@@ -227,12 +229,6 @@ def summarize(runs: Sequence[Trained]) -> list[dict[str, Any]]:
     return records
 
 
-def _table(records: Sequence[Mapping[str, Any]]) -> str:
-    cells = [["-" if math.isnan(r[key]) else format(r[key], form) for _, key, form in COLUMNS] for r in records]
-    rows = [[r["variant"] + " (refused)" * bool(r["refused"]), *row] for r, row in zip(records, cells, strict=True)]
-    return format_table(["variant", *(header for header, *_ in COLUMNS)], rows)
-
-
 def compare_modes(runs: Sequence[Trained], modes: Sequence[str]) -> dict[str, Any]:
     """How far modes and how far seeds lie apart; without the modes refused, and empty if that leaves fewer than two."""
     runs = [r for r in runs if r.variant not in {r.variant for r in runs if r.refused}]
@@ -258,29 +254,28 @@ def compare_modes(runs: Sequence[Trained], modes: Sequence[str]) -> dict[str, An
 
 
 def _verdict(equality: Mapping[str, Any]) -> str:
-    rows = [[d["steps"], d["between"], f"{d['largest']:.1e}", f"{d['rms']:.1e}"] for d in equality["parameters"]]
-    return (
-        f"At the end modes differ {equality['modes_differ']} seeds do: the standard deviation of PSNR is "
-        f"{equality['psnr_std_over_modes']:.3f} dB over modes and {equality['psnr_std_over_seeds']:.3f} dB over seeds; "
-        f"the modes' means lie within {equality['range_of_mean_psnr']:.3f} dB. Before the first densification:\n\n"
-    ) + format_table(["steps", "parameters between", "largest difference", "rms difference"], rows)
+    said = (
+        "At the end modes differ {modes_differ} seeds do: the standard deviation of PSNR is {psnr_std_over_modes:.3f} "
+        "dB over modes and {psnr_std_over_seeds:.3f} dB over seeds; the modes' means lie within "
+        "{range_of_mean_psnr:.3f} dB. Before the first densification:\n\n"
+    ).format(**equality)
+    columns = {"steps": "{steps}", "parameters between": "{between}", "largest difference": "{largest:.1e}"}
+    return said + table_of(equality["parameters"], {**columns, "rms difference": "{rms:.1e}"})
 
 
 def plot_modes(path: Path, runs: Sequence[Trained], modes: Sequence[str]) -> None:
-    """Draw PSNR over iterations and over seconds of training steps, by scene: mean and range of the seeds."""
-    scenes = list(dict.fromkeys(r.scene for r in runs))
-    figure, grid = report.new_panels(0.5 + 2.8 * len(scenes), len(scenes), 2, sharey="row")
-    for row, scene in zip(grid, scenes, strict=True):
-        for axes, key in zip(row, ("iteration", "seconds"), strict=True):
-            report.plain_axes(axes, f"{scene}: test PSNR [dB]", key)
-            for mode, (color, dash) in zip(modes, STYLES, strict=False):
-                histories = [r.history for r in runs if (r.scene, r.variant, r.refused) == (scene, mode, "")]
-                if histories:
-                    x, y = (np.array([[record[k] for record in h] for h in histories]) for k in (key, "psnr"))
-                    axes.fill_between(x.mean(0), y.min(0), y.max(0), color=color, alpha=0.15, linewidth=0)
-                    axes.plot(x.mean(0), y.mean(0), dash, color=color, linewidth=1.8, label=mode)
-    figure.legend(handles=grid[0, 0].get_lines(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    report.save_figure(figure, path)
+    """Draw PSNR over iterations and over seconds of training steps, by scene: each seed thin, their mean bold."""
+    panels = []
+    for scene, key in itertools.product(dict.fromkeys(r.scene for r in runs), ("iteration", "seconds")):
+        panels.append(panel := plots.Panel(f"{scene}: test PSNR [dB]", key))
+        for mode, (color, dash) in zip(modes, STYLES, strict=False):
+            histories = [r.history for r in runs if (r.scene, r.variant, r.refused) == (scene, mode, "")]
+            curves = [[[record[k] for record in history] for k in (key, "psnr")] for history in histories]
+            for x, y in curves:
+                panel.line("", x, y, color=color, lw=0.5, alpha=0.5)
+            if curves:
+                panel.line(mode, *np.mean(curves, 0), ls=dash, color=color, lw=1.8)
+    plots.draw(path, panels, 2, 2.8, xscale="linear", yscale="linear")
 
 
 def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Trained]) -> None:

@@ -1,4 +1,4 @@
-"""Images and gradients of a workload in float64, and how far others are from them."""
+"""Images and gradients of a workload in float64 and by the renderer, and how far they are apart."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import warp as wp
 
+from warp_splat import tape
 from warp_splat.compare import oracle
 from warp_splat.compare.workloads import Workload
 from warp_splat.config import RasterOptions
@@ -15,6 +17,7 @@ from warp_splat.raster.data import Gaussians
 
 ZERO = 1e-12  # norm of a gradient that is rounding only, as that of the rotation of a ball
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh", "background", "means2d")
+TAPE = "tape"  # beside the modes of the adjoint: manual, on Warp's tape
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +34,10 @@ class Truth:
 class Error:
     """Distance of a gradient from the truth."""
 
-    relative: float  # L2 of the difference over L2 of the truth
-    largest: float  # of the entries of the difference, over the largest of the truth
-    cosine: float
-    bias: float  # mean difference over mean magnitude of the truth, signed
+    relative: float = float("nan")  # L2 of the difference over L2 of the truth
+    largest: float = float("nan")  # of the entries of the difference, over the largest of the truth
+    cosine: float = float("nan")
+    bias: float = float("nan")  # mean difference over mean magnitude of the truth, signed
 
 
 def for_oracle(options: RasterOptions) -> dict[str, Any]:
@@ -43,18 +46,22 @@ def for_oracle(options: RasterOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in names}
 
 
+def random_upstream(shape: torch.Size, fragile: torch.Tensor) -> torch.Tensor:
+    """A random upstream gradient of an image, float32; 0 at the pixels that hang on a rounding."""
+    weights = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    weights[fragile] = 0.0
+    return weights
+
+
 def compute_truth(workload: Workload) -> Truth:
     """Float64 image and gradients at the workload's pixels."""
-    options = workload.options
     means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double().cpu() for tensor in workload.gaussians)
     leaves = [means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), workload.background.double().cpu()]
     leaves = [leaf.clone().requires_grad_() for leaf in leaves]
-    out = oracle.exact_render(*leaves[:5], workload.camera, leaves[5], **for_oracle(options), pixels=workload.pixels)
-    weights = torch.randn(out.image.shape, generator=torch.Generator().manual_seed(1))
-    weights[out.fragile] = 0.0
-    out.means2d.retain_grad()
-    (out.image * weights).sum().backward()
-    gradients = [leaf.grad for leaf in leaves] + [out.means2d.grad]
+    options = for_oracle(workload.options)
+    out = oracle.exact_render(*leaves[:5], workload.camera, leaves[5], **options, pixels=workload.pixels)
+    weights = random_upstream(out.image.shape, out.fragile)
+    gradients = torch.autograd.grad((out.image * weights).sum(), [*leaves, out.means2d])
     return Truth(out.image.detach(), weights, ~out.fragile, dict(zip(PARAMETERS, gradients, strict=True)))
 
 
@@ -63,19 +70,47 @@ def gradients_of(
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The renderer's image [P, 3] at the workload's pixels, and its gradients for the truth's upstream gradient.
 
-    All on the host.
+    All on the host. :data:`TAPE` tells nothing of the 2D means.
     """
+    rows, columns = workload.pixels.T
+    upstream = workload.background.new_zeros(workload.camera.height, workload.camera.width, 3)
+    upstream[rows, columns] = truth.weights.to(upstream)
+    if adjoint == TAPE:
+        image, found = differentiate_on_tape(workload, upstream)
+        return image[rows, columns].cpu(), {name: grad.cpu() for name, grad in found.items()}
     leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
     background = workload.background.clone().requires_grad_()
     out = render(leaves, workload.camera, background, options, adjoint)
-    out.means2d.retain_grad()
-    rows, columns = workload.pixels.T
-    seen = out.image[rows, columns]
-    (seen * truth.weights.to(seen.device)).sum().backward()
-    found = Gaussians(*(leaf.grad for leaf in leaves))
-    sh = torch.cat([found.sh_dc, found.sh_rest], 1)
-    gradients = [found.means, found.quats, found.scales, found.opacities, sh, background.grad, out.means2d.grad]
-    return seen.detach().cpu(), {name: grad.cpu() for name, grad in zip(PARAMETERS, gradients, strict=True)}
+    found = torch.autograd.grad(out.image, [*leaves, background, out.means2d], upstream)
+    gradients = [*found[:4], torch.cat(found[4:6], 1), *found[6:]]
+    named = {name: grad.cpu() for name, grad in zip(PARAMETERS, gradients, strict=True)}
+    return out.image.detach()[rows, columns].cpu(), named
+
+
+def differentiate(workload: Workload, adjoint: str, options: RasterOptions) -> None:
+    """A forward and a backward pass over the whole image, to be timed."""
+    if adjoint == TAPE:
+        differentiate_on_tape(workload)
+        return
+    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
+    out = render(leaves, workload.camera, workload.background, options, adjoint)
+    out.image.backward(torch.ones_like(out.image))
+
+
+def differentiate_on_tape(
+    workload: Workload, upstream: torch.Tensor | None = None
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """The image [H, W, 3], and the gradients by parameter for the upstream gradient [H, W, 3], or for ones."""
+    means, quats, scales, opacities, *sh = workload.gaussians
+    given = dict(
+        zip(PARAMETERS, (means, quats, scales, opacities, torch.cat(sh, 1), workload.background), strict=False)
+    )
+    arrays = {name: wp.from_torch(tensor.clone(), requires_grad=True) for name, tensor in given.items()}
+    with wp.Tape() as recorded:
+        out = tape.rasterize(**arrays, camera=workload.camera, options=workload.options)
+    ones = wp.full_like(out.image, wp.vec3(1.0), requires_grad=False)
+    recorded.backward(grads={out.image: ones if upstream is None else wp.from_torch(upstream, wp.vec3)})
+    return wp.to_torch(out.image, requires_grad=False), {name: wp.to_torch(arrays[name].grad) for name in arrays}
 
 
 def errors_of(found: dict[str, torch.Tensor], truth: Truth) -> dict[str, Error]:
@@ -87,7 +122,7 @@ def error_of(found: torch.Tensor, exact: torch.Tensor) -> Error:
     """How far ``found`` is from ``exact``; NaN where the truth is zero but for rounding."""
     found, exact = found.double().flatten(), exact.flatten()
     if exact.norm() < ZERO:
-        return Error(*[float("nan")] * 4)
+        return Error()
     difference = found - exact
     return Error(
         relative=float(difference.norm() / exact.norm()),

@@ -34,6 +34,7 @@ SHORT: dict[str, Any] = {
 CANDIDATES = (10, 100, 1000, 10_000)  # per pixel of the layered scenes
 LAYERED_SIZE = 96  # px
 STAGES = (0, 100, 300)  # steps of the short schedule after which a scene in training is measured
+CAPS = (2048, 512, 128)  # on the entries of a list that a pixel looks at: the thesis's first; the last is pictured
 SAMPLES = 192  # pixels at which float64 is computed
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from warp_splat.compare import plots
 from warp_splat.compare.stability import arithmetic, pixel_loop, shapes
 from warp_splat.compare.stability.verdict import EPS, Case, Outcome
 from warp_splat.evaluation import report
@@ -19,7 +20,6 @@ from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.text import format_table
 
 CASES = (*pixel_loop.CASES, *shapes.CASES, *arithmetic.CASES)
-MARKERS = ("o", "s", "^", "D")
 NO_MODE = ""  # of a case that involves no adjoint
 
 
@@ -103,41 +103,20 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
 
 def plot(path: Path, rows: Sequence[Row]) -> None:
     """Draw the growth of rounding along a chain against its bound, and the error of two formulas for a determinant."""
-    figure, grid = report.new_panels(3.2, 1, 2)
-    _plot_chains(grid[0, 0], {row.case.name: row for row in rows})
-    _plot_determinant(grid[0, 1])
-    for axes in grid[0]:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.minorticks_off()
-    report.save_figure(figure, path)
-
-
-def _plot_chains(axes, rows: dict[str, Row]) -> None:
-    report.plain_axes(axes, "error of gradients and of T, n layers", "n")
-    chains = {layers: rows[f"chain_{layers}"].outcomes for layers in pixel_loop.CHAINS}
-    lengths = list(chains)
-    axes.plot(lengths, [layers * EPS for layers in lengths], color=report.INK, linewidth=1.0, linestyle="--")
-    report.label_point(axes, (lengths[-1], lengths[-1] * EPS), "n eps", (0, 5), "right")
-    modes = list(chains[lengths[0]])
-    colors = (report.BLUE, report.ORANGE, report.GREEN, report.INK)
-    for place, (mode, color, marker) in enumerate(zip(modes, colors, MARKERS, strict=False)):
+    chain = plots.Panel("error of gradients and of T, n layers", "n")
+    outcomes = {row.case.name: row.outcomes for row in rows}
+    lengths, modes = list(pixel_loop.CHAINS), list(outcomes[f"chain_{pixel_loop.CHAINS[0]}"])
+    chain.line("n eps", lengths, [n * EPS for n in lengths], color=report.INK, lw=1.0, ls="--")
+    for place, mode in enumerate(modes):
         # side by side, or equal errors would hide each other
-        shifted = [layers * 1.25 ** (place - 0.5 * (len(modes) - 1)) for layers in lengths]
-        errors = [chains[layers][mode].gradient_error for layers in lengths]
-        axes.plot(shifted, errors, color=color, marker=marker, markersize=5, linestyle="", label=mode)
-    recovered = [arithmetic.recovery_error(layers) for layers in lengths]
-    axes.plot(lengths, recovered, color="#999999", linewidth=1.2, label="T recovered")
-    axes.legend(frameon=False, fontsize=9, labelcolor=report.INK, loc="upper left")
-
-
-def _plot_determinant(axes) -> None:
-    report.plain_axes(axes, "error of det, worst of all angles", "scale ratio of the needle")
-    errors = arithmetic.determinant_errors()
-    ratios = arithmetic.RATIOS
-    axes.plot(ratios, errors["usual"], color=report.ORANGE, marker="s", markersize=4)
-    axes.plot(ratios, errors["ours"], color=report.BLUE, marker="o", markersize=4)
-    report.label_point(axes, (ratios[-5], errors["usual"][-5]), "a c - b²", (-8, 6), "right")
-    report.label_point(axes, (ratios[-1], errors["ours"][-1]), "sum of squares", (0, 7), "right")
-    axes.axhline(1.0, color=report.INK, linewidth=1.0, linestyle="--")
-    report.label_point(axes, (ratios[0], 1.0), "no digit right", (0, 4), "left")
+        shifted = [n * 1.25 ** (place - 0.5 * (len(modes) - 1)) for n in lengths]
+        chain.marks(mode, shifted, [outcomes[f"chain_{n}"][mode].gradient_error for n in lengths], plots.STYLES[mode])
+    recovered = [arithmetic.recovery_error(n) for n in lengths]
+    chain.line("T recovered", lengths, recovered, color="#999999", lw=1.2)
+    needle = plots.Panel("error of det, worst of all angles", "scale ratio of the needle")
+    for name, errors in arithmetic.determinant_errors().items():
+        label, style = {"usual": ("a c - b²", "stepwise"), "ours": ("sum of squares", "manual")}[name]
+        needle.marks(label, arithmetic.RATIOS, errors, plots.STYLES[style], ls="-")
+    needle.line("", arithmetic.RATIOS, [1.0] * len(arithmetic.RATIOS), color=report.INK, ls="--")
+    needle.notes.append(((arithmetic.RATIOS[0], 1.0), "no digit right", (0, 4), "left"))
+    plots.draw(path, [chain, needle], 2, 2.8)

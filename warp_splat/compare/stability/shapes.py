@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
+from warp_splat.camera import Camera
 from warp_splat.compare.scenes import cloud, facing, look, tensors, to_world
 from warp_splat.compare.stability.verdict import Problem, rendered
 from warp_splat.config import NEAR, RasterOptions
@@ -69,12 +71,6 @@ def quat_norms(norm: float) -> Problem:
     return Problem(tensors(arrays))
 
 
-def far_world() -> Problem:
-    """Means and camera a million units from the origin, where float32 steps by 1/16."""
-    camera = look(center=(1e6, -1e6, 1e6))
-    return Problem(tensors(cloud(34, 60, camera, depth=(50.0, 400.0))), camera)
-
-
 def at_depths(depth: np.ndarray, opacity: tuple[float, float] = (0.05, 0.5)) -> Problem:
     """Gaussians at these depths, along the world's axes so that depths are exact; those up to ``NEAR`` are left out."""
     camera = look(seed=None)
@@ -83,26 +79,11 @@ def at_depths(depth: np.ndarray, opacity: tuple[float, float] = (0.05, 0.5)) -> 
     return Problem(gaussians, camera, left_out=tuple(np.flatnonzero(near).tolist()))
 
 
-def all_depths() -> Problem:
-    """From 1e-6 to 1e6."""
-    return at_depths(np.random.default_rng(0).permutation(np.logspace(-6, 6, 60)))
-
-
 def near_plane() -> Problem:
     """On the near plane, and float32's next numbers on either side of it."""
     plane = np.float32(NEAR)
     sides = [np.nextafter(plane, np.float32(side)) for side in (0, 1)]
     return at_depths(np.tile([plane, *sides], 10).astype(np.float64), opacity=(0.01, 0.1))
-
-
-def behind() -> Problem:
-    """On both sides of the camera."""
-    return at_depths(np.random.default_rng(1).permutation(np.linspace(-30, 30, 60)))
-
-
-def equal_depths() -> Problem:
-    """One depth for all."""
-    return at_depths(np.full(60, 4.0))
 
 
 def not_finite() -> Problem:
@@ -124,16 +105,9 @@ def enclosed(options: RasterOptions) -> Problem:
     return Problem(tensors(arrays), camera, options, left_out=tuple(range(8)))
 
 
-def field_of_view(degrees: float, options: RasterOptions) -> Problem:
-    """A camera that sees this wide."""
-    camera = look(fov=degrees)
-    return Problem(tensors(cloud(37, 60, camera)), camera, options)
-
-
-def outside_principal() -> Problem:
-    """A principal point three image widths off the image."""
-    camera = look(cx=-70.0, cy=65.0)
-    return Problem(tensors(cloud(38, 60, camera)), camera)
+def seen_by(camera: Camera, seed: int, options: RasterOptions | None = None, **ranges) -> Problem:
+    """Ordinary Gaussians that an odd camera sees."""
+    return Problem(tensors(cloud(seed, 60, camera, **ranges)), camera, options or RasterOptions())
 
 
 def size(width: int, height: int) -> Problem:
@@ -141,10 +115,8 @@ def size(width: int, height: int) -> Problem:
     longest = max(width, height)
     fov = 2 * np.degrees(np.arctan(width / longest * np.tan(np.radians(25))))
     camera = look(width, height, fov)
-    opacity = (0.05, 0.5)
-    return Problem(
-        tensors(cloud(39, 20, camera, sigma=(1, 1 + longest / 20), opacity=opacity)), camera, conditioned=True
-    )
+    arrays = cloud(39, 20, camera, sigma=(1, 1 + longest / 20), opacity=(0.05, 0.5))
+    return Problem(tensors(arrays), camera, conditioned=True)
 
 
 def beside() -> Problem:
@@ -160,51 +132,52 @@ def beside() -> Problem:
 
 
 AFFINE, ELLIPSOID = RasterOptions(), RasterOptions(projection="ellipsoid")
-CASES = (
-    *(
-        rendered(f"{kind}_1e{power}", "shape", claim, partial(stretched, power, kind == "pancake"))
-        for claim in ["scale ratio at every angle: as in float64"]
-        for kind in ("needle", "pancake")
-        for power in RATIOS
-    ),
-    rendered("needle_10000px", "shape", "ratio 1e8, 10,000 px long", partial(stretched, 8, False, 1e4)),
-    rendered(
-        "needle_antialiased",
-        "shape",
-        "ratio 1e4, 300 px long, antialiased: the ratio of determinants has no cancellation",
-        partial(stretched, 4, False, 300.0, RasterOptions(antialiasing=True)),
-    ),
-    rendered("log_scales_100", "shape", "+100: left out and counted; -100: a point, as in float64", extreme_logs),
-    rendered("scales_1e38", "shape", "too large to square: left out and counted", too_large),
-    rendered("quats_0", "shape", "no direction: left out and counted", zero_quats),
-    *(
-        rendered(f"quats_{norm:g}", "shape", claim, partial(quat_norms, norm))
-        for claim in ["normalized; gradients beyond 3.4e38 dropped and counted"]
-        for norm in QUAT_NORMS
-    ),
-    rendered("not_finite", "shape", "NaN and infinity in any parameter: left out and counted", not_finite),
-    rendered("far_1e6", "camera", "means and camera 1e6 from the origin: as in float64", far_world),
-    rendered("depth_1e-6_1e6", "camera", "up to 0.2 left out, the rest as in float64", all_depths),
-    rendered("near_plane", "camera", "at 0.2 and before left out, after drawn", near_plane),
-    rendered("behind", "camera", "left out", behind),
-    rendered("equal_depths", "camera", "ordered by index", equal_depths),
-    rendered("inside", "camera", "drawn or left out by the center's depth alone", partial(enclosed, AFFINE)),
-    rendered(
-        "inside_ellipsoid",
-        "camera",
-        "left out too where the ellipsoid of three sigma reaches the camera's plane: no outline",
-        partial(enclosed, ELLIPSOID),
-    ),
-    *(
-        rendered(f"fov_{degrees}{kind}", "camera", "as in float64", partial(field_of_view, degrees, options))
-        for kind, options, angles in (("", AFFINE, (1, 90, 150, 170)), ("_ellipsoid", ELLIPSOID, (1, 90, 150)))
-        for degrees in angles
-    ),
-    rendered("principal_outside", "camera", "as in float64", outside_principal),
-    rendered("beside", "camera", "the Jacobian's slope is clamped: as in float64", beside),
-    *(
-        rendered(f"size_{width}x{height}", "camera", claim, partial(size, width, height))
-        for claim in ["as in float64, within the problem's condition"]
-        for width, height in ((1, 1), (1, 20_000), (20_000, 1))
-    ),
-)
+RATIO = "scale ratio at every angle: as in float64"
+NORM = "normalized; gradients beyond 3.4e38 dropped and counted"
+SIZE = "as in float64, within the problem's condition"
+FAR, OFF = {"center": (1e6, -1e6, 1e6)}, {"cx": -70.0, "cy": 65.0}  # from the origin; three widths beside the image
+FIELDS = {"": (AFFINE, (1, 90, 150, 170)), "_ellipsoid": (ELLIPSOID, (1, 90, 150))}  # of view, degrees
+#: By group: what is stated of each problem.
+TABLE: dict[str, dict[str, tuple[str, Callable[[], Problem]]]] = {
+    "shape": {
+        **{f"needle_1e{power}": (RATIO, partial(stretched, power, False)) for power in RATIOS},
+        **{f"pancake_1e{power}": (RATIO, partial(stretched, power, True)) for power in RATIOS},
+        "needle_10000px": ("ratio 1e8, 10,000 px long", partial(stretched, 8, False, 1e4)),
+        "needle_antialiased": (
+            "ratio 1e4, 300 px long, antialiased: the ratio of determinants has no cancellation",
+            partial(stretched, 4, False, 300.0, RasterOptions(antialiasing=True)),
+        ),
+        "log_scales_100": ("+100: left out and counted; -100: a point, as in float64", extreme_logs),
+        "scales_1e38": ("too large to square: left out and counted", too_large),
+        "quats_0": ("no direction: left out and counted", zero_quats),
+        **{f"quats_{norm:g}": (NORM, partial(quat_norms, norm)) for norm in QUAT_NORMS},
+        "not_finite": ("NaN and infinity in any parameter: left out and counted", not_finite),
+    },
+    "camera": {
+        "far_1e6": (
+            "means and camera 1e6 from the origin: as in float64",
+            lambda: seen_by(look(**FAR), 34, depth=(50.0, 400.0)),
+        ),
+        "depth_1e-6_1e6": (
+            "up to 0.2 left out, the rest as in float64",
+            lambda: at_depths(np.random.default_rng(0).permutation(np.logspace(-6, 6, 60))),
+        ),
+        "near_plane": ("at 0.2 and before left out, after drawn", near_plane),
+        "behind": ("left out", lambda: at_depths(np.random.default_rng(1).permutation(np.linspace(-30, 30, 60)))),
+        "equal_depths": ("ordered by index", lambda: at_depths(np.full(60, 4.0))),
+        "inside": ("drawn or left out by the center's depth alone", partial(enclosed, AFFINE)),
+        "inside_ellipsoid": (
+            "left out too where the ellipsoid of three sigma reaches the camera's plane: no outline",
+            partial(enclosed, ELLIPSOID),
+        ),
+        **{
+            f"fov_{degrees}{kind}": ("as in float64", partial(seen_by, look(fov=degrees), 37, options))
+            for kind, (options, angles) in FIELDS.items()
+            for degrees in angles
+        },
+        "principal_outside": ("as in float64", lambda: seen_by(look(**OFF), 38)),
+        "beside": ("the Jacobian's slope is clamped: as in float64", beside),
+        **{f"size_{w}x{h}": (SIZE, partial(size, w, h)) for w, h in ((1, 1), (1, 20_000), (20_000, 1))},
+    },
+}
+CASES = tuple(rendered(name, group, *case) for group, cases in TABLE.items() for name, case in cases.items())

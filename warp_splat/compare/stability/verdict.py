@@ -70,12 +70,18 @@ class Outcome:
     """What was measured, and every statement that did not hold."""
 
     says: str  # float64
-    value_error: float
-    value_limit: float
-    gradient_error: float | None  # None where there is no gradient
-    gradient_limit: float
-    counted: str
-    failures: tuple[str, ...]
+    value_error: float = 0.0
+    value_limit: float = 0.0
+    gradient_error: float | None = None  # None where there is no gradient
+    gradient_limit: float = 0.0
+    counted: str = "-"
+    failures: tuple[str, ...] = ()
+
+
+def bounded(says: str, what: str, error: float, limit: float, counted: str = "-") -> Outcome:
+    """That one error is below its limit."""
+    failures = () if error < limit else (f"{what} off by {error:.1e} > {limit:.1e}",)
+    return Outcome(says, error, limit, counted=counted, failures=failures)
 
 
 @dataclass(frozen=True)
@@ -124,13 +130,10 @@ def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> Gaussians:
 
 def draw_case(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> api.RenderOutput:
     """The package's render; without the checks of arguments, as in training, where something is left out."""
-    gaussians = activated(problem, leaves)
+    gaussians, rest = activated(problem, leaves), (problem.camera, leaves["background"])
     if problem.invalid:
-        return api.render(gaussians, problem.camera, leaves["background"], problem.options, mode)
-    means, quats, scales, opacities, sh_dc, sh_rest = gaussians
-    return api.rasterize(
-        means, quats, scales, opacities, (sh_dc, sh_rest), problem.camera, leaves["background"], mode, problem.options
-    )
+        return api.render(gaussians, *rest, problem.options, mode)
+    return api.rasterize(*gaussians[:4], gaussians[4:], *rest, mode, problem.options)
 
 
 def draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Render:
@@ -179,16 +182,9 @@ def truth(build: Callable[[], Problem]) -> Expected:
     says = _summary(out.image.detach(), gradients)
     for name in problem.gaussians:
         gradients[name][overflows] = 0
-    return Expected(
-        problem,
-        says,
-        replace(out, image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach()),
-        upstream,
-        gradients,
-        overflows,
-        max(IMAGE_LIMIT, moved_image),
-        {name: max(problem.gradient_limit, moved.get(name, 0.0)) for name in gradients},
-    )
+    out = replace(out, image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach())
+    limits = {name: max(problem.gradient_limit, moved.get(name, 0.0)) for name in gradients}
+    return Expected(problem, says, out, upstream, gradients, overflows, max(IMAGE_LIMIT, moved_image), limits)
 
 
 def _condition(problem: Problem, out, upstream, gradients) -> tuple[float, dict[str, float]]:
@@ -262,18 +258,12 @@ def judge(expected: Expected, mode: str) -> Outcome:
     hidden = out.radii[list(problem.left_out)]
     demand(not hidden.any(), "drawn although it should be left out")
     demand(out.invalid == problem.invalid, f"counted {out.invalid} invalid, not {problem.invalid}")
-    dropped = int(expected.overflows.sum())
-    demand(out.dropped.gaussians == dropped, f"dropped gradients of {out.dropped.gaussians} Gaussians, not {dropped}")
+    dropped, dropped_now = int(expected.overflows.sum()), out.dropped.gaussians
+    demand(dropped_now == dropped, f"dropped gradients of {dropped_now} Gaussians, not {dropped}")
     demand(out.dropped.pixels == 0, f"dropped {out.dropped.pixels} pixels")
-    return Outcome(
-        expected.says,
-        value_error,
-        expected.image_limit,
-        errors[worst],
-        expected.gradient_limits[worst],
-        count_text(culled=int((out.radii == 0).sum()), invalid=out.invalid, dropped=out.dropped.gaussians),
-        tuple(failures),
-    )
+    counted = count_text(culled=int((out.radii == 0).sum()), invalid=out.invalid, dropped=dropped_now)
+    gradient = errors[worst], expected.gradient_limits[worst]
+    return Outcome(expected.says, value_error, expected.image_limit, *gradient, counted, tuple(failures))
 
 
 def count_text(**counts: int) -> str:

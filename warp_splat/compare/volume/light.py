@@ -71,6 +71,11 @@ class Volume:
         if (self.scales <= 0).any() or (self.densities < 0).any() or not self.quats.any(axis=1).all():
             raise InputError("Volume: expected positive scales, densities of 0 or more, and no quaternion of norm 0.")
 
+    def splats(self, opacities: np.ndarray) -> list[torch.Tensor]:
+        """Means, quaternions, scales, ``opacities`` [N] and harmonics, as a renderer takes them; float64."""
+        arrays = [self.means, self.quats, self.scales, opacities, ((self.colors - 0.5) / SH_C0)[:, None]]
+        return [torch.from_numpy(np.ascontiguousarray(array)) for array in arrays]
+
 
 @dataclass(frozen=True, eq=False)
 class Profile:
@@ -193,15 +198,15 @@ def _march(keep: np.ndarray, light: np.ndarray, background: np.ndarray) -> np.nd
     return radiance
 
 
+def pixel_centers(camera: Camera) -> np.ndarray:
+    """Of every pixel, [H * W, 2] px, row by row."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([x.ravel(), y.ravel()], 1)
+
+
 def camera_rays(camera: Camera) -> np.ndarray:
     """Unit directions in the world through the pixel centers, [H * W, 3]; NaN where a lens sees nothing."""
-    if camera.lens:
-        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        return camera.rays(np.stack([x.ravel(), y.ravel()], 1)) @ camera.rotation
-    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    directions = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], -1).reshape(-1, 3)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True) @ camera.rotation
+    return camera.rays(pixel_centers(camera)) @ camera.rotation
 
 
 def render_volume(volume: Volume, camera: Camera, panels: int = 64) -> np.ndarray:
@@ -234,8 +239,7 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
     peak = peak_depths(volume, camera)
     exact = ray_profile(volume, camera.center, camera_rays(camera)).depths()
     opacities = -np.expm1(-peak)
-    scene = [volume.means, volume.quats, volume.scales, opacities, ((volume.colors - 0.5) / SH_C0)[:, None]]
-    scene = [torch.from_numpy(np.ascontiguousarray(array)) for array in scene]
+    scene = volume.splats(opacities)
     order = np.argsort(volume.means @ camera.forward, kind="stable")
 
     def footprint(projection: str, blur: float) -> np.ndarray:
@@ -257,8 +261,7 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
 def falloff_at(splats: oracle.Splats, camera: Camera, blur: float) -> np.ndarray:
     """exp(-d' cov2d^-1 d / 2) at each pixel, [H * W, N], with ``blur`` px^2 in place of the oracle's."""
     covariance = splats.cov2d.numpy() + (blur - oracle.BLUR) * np.eye(2)
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    offset, sharp = np.stack([x, y], -1).reshape(-1, 1, 2) - splats.means2d.numpy(), np.linalg.inv(covariance)
+    offset, sharp = pixel_centers(camera)[:, None] - splats.means2d.numpy(), np.linalg.inv(covariance)
     around = camera.lens is not None and camera.lens.family.around
     falloff = 0.0
     for shift in (0, camera.width, -camera.width) if around else (0,):  # a panorama's copies

@@ -5,6 +5,7 @@ The physics is :mod:`warp_splat.compare.volume.light`; here are the media and sc
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,11 +13,23 @@ from typing import Any
 
 import numpy as np
 
+from warp_splat.compare import plots
 from warp_splat.compare.volume import light as physics
 from warp_splat.compare.volume import media
-from warp_splat.compare.volume.maps import plot_integrators, plot_maps
+from warp_splat.evaluation.report import INK
 from warp_splat.formats.atomic import write_csv, write_json
-from warp_splat.text import format_table
+from warp_splat.text import format_table, table_of
+
+SHOWN = (8, 64, 512, 4096)  # samples, in the table of the integrators
+LIMITS = {
+    **{"medium": "{medium}", "integrator": "{method}"},
+    "theory (constant tau)": lambda record: "none" if np.isinf(record["theory"]) else f"{record['theory']:.3f}",
+    "measured": lambda record: "none found" if np.isinf(record["measured"]) else f"{record['measured']:.3f}",
+}
+LADDER = {
+    **{"scene": "{scene}", "rung": "{rung}", "mean error": "{mean:.1e}", "max error": "{max:.1e}"},
+    **{"PSNR [dB]": "{psnr:.1f}", "changes": "{parent}", "own mean": "{own_mean:.1e}", "own max": "{own_max:.1e}"},
+}
 
 
 def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
@@ -37,17 +50,26 @@ def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[
     say(f"Error of C(0), the largest of {media.RAYS} rays, by samples per ray (and run time for all rays)\n")
     say(_integrator_table(integrators))
     say("\nLargest stable tau ds, tau at its peak\n")
-    say(_limit_table(limits))
+    say(table_of(limits, LIMITS))
     images, ladder = measure_ladder()
     say("\nSplatting against the truth (colors 0 to 1; 300 dB is exact); own: against the rung that it changes\n")
-    say(_ladder_table(ladder))
+    say(table_of(ladder, LADDER))
     doubt = max(record["truth_error"] for record in integrators + ladder)
     say(f"\nThe truths change by at most {doubt:.1e} when their panels are doubled.")
     results = {"integrators": integrators, "limits": limits, "ladder": ladder}
     write_json(out / "volume.json", results)
-    _write_csv(out / "volume.csv", results)
+    flat = [{"table": table, **record} for table, records in results.items() for record in records]
+    curves = ("tau_ds", "errors")  # in the JSON only
+    write_csv(out / "volume.csv", [{key: row[key] for key in row if key not in curves} for row in flat])
     plot_integrators(out / "volume_stiff.png", integrators, limits)
-    plot_maps(out / "volume_maps.png", {name: images[name] for name in media.PICTURED})
+    maps = {
+        name.replace(" at", "\nat"): [
+            ("truth", images[name]["truth"], None),
+            *((rung, images[name]["truth"], images[name][rung]) for rung in media.PARENT),
+        ]
+        for name in media.PICTURED
+    }
+    plots.plot_maps(out / "volume_maps.png", maps, 4.2, media.LEAST_ERROR)
     return results
 
 
@@ -56,30 +78,22 @@ def measure_integrators() -> list[dict[str, Any]]:
     records = []
     for optical_depth in media.OPTICAL_DEPTHS:
         profile, volume = media.stiff_medium(optical_depth)
-        medium = profile.medium(volume.colors)
-        truth = physics.integrate_exact(profile, volume.colors, volume.background, 128)
-        doubled = physics.integrate_exact(profile, volume.colors, volume.background, 256)
-        seconds: dict[tuple[str, int], list[float]] = {
-            (name, count): [] for name in media.METHODS for count in media.SAMPLES
-        }
-        radiance = {}
-        for _ in range(media.REPEATS):  # interleaved, so that a disturbance meets all alike
-            for (name, count), times in seconds.items():
-                radiance[name, count] = _integrate(name, medium, count, volume.background)  # memory and caches ready
-                start = time.perf_counter()
-                _integrate(name, medium, count, volume.background)
-                times.append(time.perf_counter() - start)
-        records += [
-            {
-                **{"optical_depth": optical_depth, "method": name, "samples": count},
-                "peak_tau_ds": _peak(profile) * media.FAR * media.METHODS[name][1] / count,
-                "error": _error(radiance[name, count], truth),
-                "stable": _error(radiance[name, count], truth) < media.UNSTABLE,
-                "seconds": float(np.median(times)),
-                "truth_error": _error(truth, doubled),
-            }
-            for (name, count), times in seconds.items()
-        ]
+        medium, peak = profile.medium(volume.colors), _peak(profile)
+        truth, doubled = (physics.integrate_exact(profile, volume.colors, volume.background, n) for n in (128, 256))
+        ways = list(itertools.product(media.METHODS, media.SAMPLES))
+        seconds, radiance = {way: [] for way in ways}, {}
+        for _, (name, count), warm in itertools.product(range(media.REPEATS), ways, (False, True)):
+            # interleaved, so that a disturbance meets all alike; the first time makes memory and caches ready
+            integrate, evaluations, *_ = media.METHODS[name]
+            start = time.perf_counter()
+            radiance[name, count] = integrate(medium, 0.0, media.FAR, count // evaluations, volume.background)
+            seconds[name, count] += [time.perf_counter() - start] * warm
+        for name, count in ways:
+            error = _error(radiance[name, count], truth)
+            found = {"optical_depth": optical_depth, "method": name, "samples": count}
+            found |= {"peak_tau_ds": peak * media.FAR * media.METHODS[name][1] / count, "error": error}
+            found |= {"stable": error < media.UNSTABLE, "seconds": float(np.median(seconds[name, count]))}
+            records.append({**found, "truth_error": _error(truth, doubled)})
     return records
 
 
@@ -106,11 +120,6 @@ def measure_limits() -> list[dict[str, Any]]:
             medium_name = f"Gaussians, optical depth {media.plain(optical_depth)}"
             records.append({"medium": medium_name, "method": name, "theory": theory, **found})
     return records
-
-
-def _integrate(name: str, medium: physics.Medium, samples: int, background: np.ndarray) -> np.ndarray:
-    integrate, evaluations, *_ = media.METHODS[name]
-    return integrate(medium, 0.0, media.FAR, samples // evaluations, background)
 
 
 def _error(radiance: np.ndarray, truth: np.ndarray) -> float:
@@ -160,50 +169,35 @@ def measure_ladder() -> tuple[dict[str, dict[str, np.ndarray]], list[dict[str, A
 
 
 def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
-    shown = (8, 64, 512, 4096)
-    cells = {(r["optical_depth"], r["method"], r["samples"]): r for r in records}
-
-    def cell(record: Mapping[str, Any]) -> str:
-        error = f"{record['error']:.1e}" if record["stable"] else "unstable"
-        return f"{error} ({1e3 * record['seconds']:.2g} ms)"
-
-    rows = [
-        [media.plain(depth), name, *(cell(cells[depth, name, count]) for count in shown)]
-        for depth in media.OPTICAL_DEPTHS
-        for name in media.METHODS
-    ]
-    return format_table(["optical depth", "integrator", *(f"{count} samples" for count in shown)], rows)
+    rows: dict[tuple[str, str], list[str]] = {}
+    for r in records:
+        if r["samples"] in SHOWN:
+            error = f"{r['error']:.1e}" if r["stable"] else "unstable"
+            row = rows.setdefault((media.plain(r["optical_depth"]), r["method"]), [])
+            row.append(f"{error} ({1e3 * r['seconds']:.2g} ms)")
+    headers = ["optical depth", "integrator", *(f"{count} samples" for count in SHOWN)]
+    return format_table(headers, [[*key, *cells] for key, cells in rows.items()])
 
 
-def _limit_table(records: Sequence[Mapping[str, Any]]) -> str:
-    def cell(value: float) -> str:
-        return "none found" if np.isinf(value) else f"{value:.3f}"
-
-    rows = [
-        [r["medium"], r["method"], "none" if np.isinf(r["theory"]) else cell(r["theory"]), cell(r["measured"])]
-        for r in records
-    ]
-    return format_table(["medium", "integrator", "theory (constant tau)", "measured"], rows)
-
-
-def _ladder_table(records: Sequence[Mapping[str, Any]]) -> str:
-    def cells(r: Mapping[str, Any], *keys: str) -> list[str]:
-        return [f"{r[key]:.1e}" for key in keys]
-
-    quality = [[f"{r['psnr']:.1f}", r["parent"]] for r in records]
-    rows = [
-        [r["scene"], r["rung"], *cells(r, "mean", "max"), *middle, *cells(r, "own_mean", "own_max")]
-        for r, middle in zip(records, quality, strict=True)
-    ]
-    headers = ["scene", "rung", "mean error", "max error", "PSNR [dB]", "changes", "own mean", "own max"]
-    return format_table(headers, rows)
-
-
-def _write_csv(path: Path, results: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
-    """All records in one table, a column for each number that any of them has; the curves are in the JSON only."""
-    rows = [
-        {"table": table, **{key: value for key, value in record.items() if not isinstance(value, list)}}
-        for table, records in results.items()
-        for record in records
-    ]
-    write_csv(path, rows)
+def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limits: Sequence[Mapping[str, Any]]) -> None:
+    """Draw error against run time, a panel for each optical depth, and error against tau ds around the limits."""
+    panels = []
+    for optical_depth in media.OPTICAL_DEPTHS:
+        title, x = f"optical depth {media.plain(optical_depth)}", f"run time for {media.RAYS} rays [ms]"
+        panels.append(panel := plots.Panel(title, x))
+        for place, (name, (*_, color, marker)) in enumerate(media.METHODS.items()):
+            for stable in (True, False):
+                chosen = [r for r in integrators if (r["optical_depth"], r["method"]) == (optical_depth, name)]
+                chosen = [r for r in chosen if r["stable"] == stable]
+                # crosses in rows of their own, above every error
+                errors = [r["error"] if stable else 6.0 * 10**place for r in chosen]
+                label, marks = (name, marker) if stable else ("unstable: error above 1", "x")
+                seconds, line = [1e3 * r["seconds"] for r in chosen], {"ls": "-", "lw": 1.4} if stable else {}
+                panel.marks(label, seconds, errors, (color, marks), **line)
+    title = f"step limit at {media.plain(media.LIMIT_DEPTHS[-1])}"
+    panels.append(panel := plots.Panel(title, "tau ds at the peak of tau", ticks=True))
+    for record in limits[-len(media.METHODS) :]:  # those of the densest medium
+        theory, color = record["theory"], media.METHODS[record["method"]][3]
+        panel.line("", record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, lw=1.4)
+        panel.line("stability limit for constant tau", [theory] * 2, [1e-16, 1e3], color=INK, lw=1, ls="--")
+    plots.draw(path, panels, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
