@@ -5,27 +5,21 @@ Checks first that the modes agree, then times in one run, interleaved; prints an
     python benchmarks/adjoints.py [--out docs/benchmarks]
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 import torch
 from blend import Lanes
-from common import interleaved_medians, machine, write_table
+from common import REPEATS, interleaved, parse, with_threads, write_table
 from made_up import blend_scene
 
 from warp_splat.compare.adjoints import peak_of
 from warp_splat.config import ADJOINTS
-from warp_splat.runtime import launch, pool
+from warp_splat.runtime import launch
 
 MODES = (*ADJOINTS, "generated")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for adjoints.md and adjoints.json")
-    parser.add_argument("--repeats", type=int, default=7)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, REPEATS)
     launch.prepare("cpu", 0)
     scene = blend_scene()
     upstream = torch.from_numpy(np.random.default_rng(1).normal(size=(scene.height, scene.width, 3)).astype(np.float32))
@@ -45,20 +39,13 @@ def main() -> None:
     if max(agreement.values()) > 1e-5:
         raise SystemExit(f"the modes disagree: {agreement}")
 
-    def with_threads(count: int, run):
-        def timed():
-            pool.set_threads(count)
-            run()
-
-        return timed
-
     runs = {
         (mode, kind, count): with_threads(count, getattr(driver, kind))
         for mode, driver in drivers.items()
         for count in (1, 2)
         for kind in ("forward", "adjoint")
     }
-    medians = interleaved_medians(runs, arguments.repeats)
+    medians = interleaved(runs, arguments.repeats)
     rows = [
         (
             mode,
@@ -79,7 +66,6 @@ def main() -> None:
         "seconds": {" ".join(map(str, key)): value for key, value in medians.items()},
         "peak_bytes": memory,
         "relative_difference": agreement,
-        "machine": machine(),
     }
     write_table("adjoints", arguments.out, headers, rows, note, data)
 

@@ -7,7 +7,6 @@ machine. It needs Debian's or Ubuntu's apt-get, and uv. Runs ``benchmarks/proces
 compares array by array. ``benchmarks/vectors.py`` reads the objects that Warp compiled for both.
 """
 
-import argparse
 import hashlib
 import os
 import shutil
@@ -17,7 +16,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-from common import write_table
+from common import option, parse, write_table
 
 from warp_splat.config import ADJOINTS
 
@@ -116,12 +115,12 @@ def _output(*command: object, **environment: str) -> str:
 
 def main() -> None:
     """Print which arrays are equal; exit code 1 if one is not."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--root", type=Path, default=DEFAULT_ROOT, help="folder of the emulated machine")
-    parser.add_argument("--steps", type=int, default=50, help="of training")
-    parser.add_argument("--adjoints", nargs="*", default=list(ADJOINTS), help="of the blend")
-    parser.add_argument("--out", type=Path, help="folder for the table")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("--root", type=Path, default=DEFAULT_ROOT, help="folder of the emulated machine"),
+        option("--steps", type=int, default=50, help="of training"),
+        option("--adjoints", nargs="*", default=list(ADJOINTS), help="of the blend"),
+    )
     make_root(arguments.root)
     arrays = run_both(arguments.root, "--steps", arguments.steps, "--adjoints", *arguments.adjoints)
     rows = compare(arrays["here"], arrays["ARM"])

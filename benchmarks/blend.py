@@ -5,13 +5,10 @@ Checks first that image and gradients agree, then times in one run, interleaved;
     python benchmarks/blend.py [--out docs/benchmarks]
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 import torch
 import warp as wp
-from common import interleaved_medians, machine, write_table
+from common import interleaved, option, parse, with_threads, write_table
 from made_up import BlendScene, blend_scene
 from scalar_blend import adj_blend, blend, vec9
 
@@ -21,7 +18,7 @@ from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.bin import balanced_slices
 from warp_splat.raster.blend import blend as blend_splats
 from warp_splat.raster.data import Bins, Splats2D
-from warp_splat.runtime import launch, pool
+from warp_splat.runtime import launch
 
 
 class Lanes:
@@ -94,10 +91,7 @@ def compare(lanes: Lanes, scalar: Scalar) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for blend.md and blend.json")
-    parser.add_argument("--repeats", type=int, default=5)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("--repeats", type=int, default=5))
     launch.prepare("cpu", 0)
     scene = blend_scene()
     upstream = torch.from_numpy(np.random.default_rng(1).normal(size=(scene.height, scene.width, 3)).astype(np.float32))
@@ -107,19 +101,12 @@ def main() -> None:
         driver.adjoint()
     compare(lanes, scalar)
 
-    def with_threads(count: int, run):
-        def timed():
-            pool.set_threads(count)
-            run()
-
-        return timed
-
     runs = {"scalar forward": scalar.forward, "scalar adjoint": scalar.adjoint}
     for count in (1, 2):
         plural = "s" if count > 1 else ""
         runs[f"lanes forward, {count} thread{plural}"] = with_threads(count, lanes.forward)
         runs[f"lanes adjoint, {count} thread{plural}"] = with_threads(count, lanes.adjoint)
-    medians = interleaved_medians(runs, arguments.repeats)
+    medians = interleaved(runs, arguments.repeats)
     work = len(scene.instances) * 256
     rows = []
     for name, seconds in medians.items():
@@ -131,7 +118,7 @@ def main() -> None:
     for kind in ("forward", "adjoint"):
         ratio = medians[f"lanes {kind}, 1 thread"] / medians[f"lanes {kind}, 2 threads"]
         note += f" {kind.capitalize()}: two threads {ratio:.2f} times one."
-    write_table("blend", arguments.out, headers, rows, note, {"seconds": medians, "machine": machine()})
+    write_table("blend", arguments.out, headers, rows, note, {"seconds": medians})
 
 
 if __name__ == "__main__":

@@ -7,13 +7,12 @@ cx and cy, too (2 % of the width and height off).
     python benchmarks/camera_photos.py -m output/fox -m output/church [--out docs/benchmarks]
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 import torch
 from cameras import ANGLE, LEVELS, SHIFT, ZOOM, direction
-from common import machine, write_table
+from common import TRAINED, parse, write_table
 
 from warp_splat import Camera, CameraParameters
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
@@ -108,21 +107,18 @@ def plot(runs: dict[tuple[str, str, str], list[list[float]]], path: Path) -> Non
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-m", "--model", type=Path, action="append", required=True, help="a model; may come again")
-    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for the plot")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, TRAINED)
     launch.prepare("cpu", 1)
     torch.set_num_threads(1)
     runs = {}
-    for model in arguments.model:
+    for model in arguments.models:
         runs |= follow_all(model)
     rows = []
     for key, run in runs.items():
         degrees, *shares = run[-1]
         rows.append((*key, f"{degrees:.3f}°", *(f"{share:.3f} %" for share in shares)))
     note = "Distance from the cameras of structure from motion; places as shares of the extent."
-    data = {"last": {" | ".join(key): run[-1] for key, run in runs.items()}, "machine": machine()}
+    data = {"last": {" | ".join(key): run[-1] for key, run in runs.items()}}
     if arguments.out:
         plot(runs, arguments.out / "camera_photos.png")
     write_table("camera_photos", arguments.out, HEADERS, rows, note, data)

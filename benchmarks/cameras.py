@@ -6,7 +6,6 @@ and follows the gradients of its pose and of fx and fy until it sees the picture
     python benchmarks/cameras.py [--out docs/benchmarks]
 """
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from common import machine, write_table
+from common import parse, write_table
 from made_up import steps_of
 from step import synthetic
 
@@ -196,9 +195,7 @@ def plot(runs: list[list[tuple[float, float, float]]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for the plot")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__)
     launch.prepare("cpu", 1)
     rows = [row for projection in PROJECTIONS for row in error_rows(projection)]
     runs = [recover(seed) for seed in range(SEEDS)]
@@ -213,7 +210,7 @@ def main() -> None:
     trainer = synthetic(COUNT, 980, 545)
     prices = {name: measure_price(trainer, *changed) for name, changed in PRICED.items()}
     last = {name: [run[-1][column] for run in runs] for column, name in enumerate(SHOWN)}
-    data = {"last": last, "reached": reached, "lenses": lenses, "prices": prices, "machine": machine()}
+    data = {"last": last, "reached": reached, "lenses": lenses, "prices": prices}
     note = f"Gradients of a random loss on the cube of seed 0 at {SIZE} x {SIZE} px, relative to those in float64."
     if arguments.out:
         plot(runs, arguments.out / "cameras.png")

@@ -6,18 +6,14 @@ A run whose results are there already is not repeated; `--given` trains nothing 
         --limit 50000 --parts floaters --models output/captures [-r 2] [--seeds 0 1 2] [--out docs/benchmarks]
 """
 
-import argparse
 import json
 import statistics
-import subprocess
-import sys
 from pathlib import Path
 
-from common import machine, write_table
+from common import MODELS, option, parse, run_training, write_table
 
 from warp_splat.formats.png import load_png
 
-ROOT = Path(__file__).parents[1]
 METRICS = {"PSNR": 2, "CC_PSNR": 2, "SSIM": 4, "FLIP": 4}  # and how many decimals
 EMBEDDED = "embedded"  # has defaults of its own if no scene is given
 HEADERS = ("scene", "pixels", "parts", "seeds", *METRICS, "PSNR of the worst view", "Gaussians")
@@ -25,16 +21,13 @@ HEADERS = ("scene", "pixels", "parts", "seeds", *METRICS, "PSNR of the worst vie
 
 def run(model: Path, flags: list, given: bool) -> dict | None:
     """Train, if that has not been done and may be; the metrics, the worst view's PSNR, and the size."""
-    if not (model / "results.json").is_file():
-        if given:
-            return None
-        command = [sys.executable, "-m", "warp_splat", "train", "--eval", "--preset", "fast", "--quiet", "-m", model]
-        subprocess.run([*command, *flags], check=True, cwd=ROOT)
-    results, views = (json.loads((model / f"{name}.json").read_text()) for name in ("results", "per_view"))
-    last = max(results, key=lambda name: int(name.removeprefix("ours_")))
-    height, width, _ = load_png(model / "test" / last / "gt" / "00000.png").shape
-    kept = {name: results[last][name] for name in (*METRICS, "gaussians", "sha256")}
-    return {**kept, "worst": min(views[last]["PSNR"].values()), "pixels": f"{width}x{height}"}
+    if given and not (model / "results.json").is_file():
+        return None
+    results = run_training(model, ["--eval", "--preset", "fast", "--quiet", *flags])
+    worst = min(json.loads((model / "per_view.json").read_text())[f"ours_{results['iterations']}"]["PSNR"].values())
+    height, width, _ = load_png(next(model.glob(f"test/ours_{results['iterations']}/gt/00000.png"))).shape
+    kept = {name: results[name] for name in (*METRICS, "gaussians", "sha256")}
+    return {**kept, "worst": worst, "pixels": f"{width}x{height}"}
 
 
 def row_of(scene: str, parts: str, found: list[dict]) -> tuple:
@@ -50,18 +43,16 @@ def row_of(scene: str, parts: str, found: list[dict]) -> tuple:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "-s", "--scene", type=Path, action="append", required=True, help="a scene, or embedded; may come again"
+    arguments = parse(
+        __doc__,
+        option("-s", "--scene", type=Path, action="append", required=True, help="a scene, or embedded; may come again"),
+        option("--limit", type=int, action="append", required=True, help="--max_gaussians of each scene"),
+        option("--parts", action="append", default=[], help="as of train.py; may come again"),
+        option("-r", "--resolution", default="2", help="as of train.py"),
+        option("--seeds", type=int, nargs="+", default=[0, 1, 2]),
+        option("--given", action="store_true", help="train nothing"),
+        MODELS,
     )
-    parser.add_argument("--limit", type=int, action="append", required=True, help="--max_gaussians of each scene")
-    parser.add_argument("--parts", action="append", default=[], help="as of train.py; may come again")
-    parser.add_argument("-r", "--resolution", default="2", help="as of train.py")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--given", action="store_true", help="train nothing")
-    parser.add_argument("--models", type=Path, required=True, help="folder for the models")
-    parser.add_argument("--out", type=Path, help="folder for captures.md and captures.json")
-    arguments = parser.parse_args()
     rows, runs = [], {}
     for scene, limit in zip(arguments.scene, arguments.limit, strict=True):
         for parts in ("", *arguments.parts):
@@ -77,7 +68,7 @@ def main() -> None:
             if found:
                 rows.append(row_of(scene.name, parts or "none", found))
     note = "Held-out views, dB where it says PSNR; mean ± standard deviation over the seeds."
-    write_table("captures", arguments.out, HEADERS, rows, note, {"runs": runs, "machine": machine()})
+    write_table("captures", arguments.out, HEADERS, rows, note, {"runs": runs})
 
 
 if __name__ == "__main__":

@@ -7,12 +7,10 @@ torch's tensors, with and without what goes in, comes out, and their gradients. 
     python benchmarks/channels.py [--out docs/benchmarks]
 """
 
-import argparse
 import time
-from pathlib import Path
 
 import torch
-from common import machine, write_table
+from common import REPEATS, option, parse, write_table
 from made_up import cameras, make_gaussians
 
 from warp_splat.compare.adjoints import peak_of
@@ -34,11 +32,11 @@ SHOWN = ("features", "normals", "median_depth", "strongest_weights", "depth")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for channels.md and channels.json")
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--most", type=int, default=max(FEATURES), help="leave out more channels than this")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        REPEATS,
+        option("--most", type=int, default=max(FEATURES), help="leave out more channels than this"),
+    )
     device = prepare("cpu", 1)
     torch.manual_seed(0)
     (camera,) = cameras(*SIZE, 1)
@@ -74,9 +72,7 @@ def main() -> None:
         f"{COUNT} Gaussians, {SIZE[0]} x {SIZE[1]} px, one thread, processor time, whole calls. In between: without "
         "what goes in, comes out, and their gradients."
     )
-    write_table(
-        "channels", arguments.out, headers, table, note, {"seconds": least, "bytes": memory, "machine": machine()}
-    )
+    write_table("channels", arguments.out, headers, table, note, {"seconds": least, "bytes": memory})
 
 
 def once(gaussians: Gaussians, camera, options: RasterOptions, count: int) -> tuple[float, float, int]:

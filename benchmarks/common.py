@@ -1,40 +1,88 @@
-"""What the benchmarks share: timing, the machine's name, and tables."""
+"""What the benchmarks share: the command line, trainings, timing, the machine's name, and tables."""
 
+import argparse
 import json
 import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 
 from warp_splat.evaluation.report import machine
+from warp_splat.runtime import pool
 from warp_splat.text import format_table
 
+ROOT = Path(__file__).parents[1]
 
-def interleaved_medians(runs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+
+def option(*names: str, **how):
+    """As :meth:`argparse.ArgumentParser.add_argument` takes it."""
+    return names, how
+
+
+REPEATS = option("--repeats", type=int, default=7)
+MODELS = option("--models", type=Path, required=True, help="folder for the models")
+TRAINED = option("-m", "--models", type=Path, action="append", required=True, help="a trained model; may come again")
+PHOTOGRAPHS = option("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
+
+
+def parse(doc: str | None, *options: tuple) -> argparse.Namespace:
+    """The command line of a program with this docstring: its options, and --out."""
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    for names, how in options:
+        parser.add_argument(*names, **how)
+    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for plots")
+    return parser.parse_args()
+
+
+def run_training(model: Path, flags: Iterable) -> dict:
+    """The results of the last iteration; trains only if they are not there."""
+    if not (model / "results.json").is_file():
+        command = [sys.executable, "-m", "warp_splat", "train", "-m", model, *map(str, flags)]
+        subprocess.run(command, check=True, cwd=ROOT)
+    results = json.loads((model / "results.json").read_text())
+    return results[max(results, key=lambda name: int(name.removeprefix("ours_")))]
+
+
+def with_threads(count: int, run: Callable[[], object]) -> Callable[[], None]:
+    """``run`` on so many threads."""
+
+    def timed() -> None:
+        pool.set_threads(count)
+        run()
+
+    return timed
+
+
+def interleaved(
+    runs: Mapping[Hashable, Callable[[], object]], repeats: int, clock=time.perf_counter, of=statistics.median
+) -> dict:
     """Median seconds of each run; rounds over all runs, so that a change of the machine's pace hits them alike."""
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    seconds: dict = {name: [] for name in runs}
     for run in runs.values():
         run()
     for _ in range(repeats):
         for name, run in runs.items():
-            start = time.perf_counter()
+            start = clock()
             run()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in seconds.items()}
+            seconds[name].append(clock() - start)
+    return {name: of(values) for name, values in seconds.items()}
 
 
 def write_table(
-    name: str, out: Path | None, headers: Sequence, rows: Sequence[Sequence], note: str, data: dict
+    name: str, out: Path | None, headers: Sequence, rows: Sequence[Sequence], note: str, data: Mapping | None = None
 ) -> None:
-    """Print a table, and write it to ``<out>/<name>.md`` and ``.json`` if a folder is given."""
+    """Print a table; if a folder is given, write it to ``<out>/<name>.md``, and ``data`` or the rows to ``.json``."""
     table = format_table(headers, rows)
     print(f"\n{table}\n\n{note}\n{machine()}")
+    measured = {**({"headers": headers, "rows": rows} if data is None else data), "machine": machine()}
     if out:
         out.mkdir(parents=True, exist_ok=True)
         (out / f"{name}.md").write_text(f"{table}\n\n{note} Measured by `benchmarks/{name}.py` on {machine()}.\n")
-        (out / f"{name}.json").write_text(json.dumps(data, indent=1) + "\n")
+        (out / f"{name}.json").write_text(json.dumps(measured, indent=1) + "\n")
 
 
 def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:

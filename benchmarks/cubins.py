@@ -7,7 +7,6 @@ threads that fit on a multiprocessor at once. The loop is the longest one withou
 machine code; of a blend, that is what a warp does for a tile instance at most.
 """
 
-import argparse
 import json
 import re
 import subprocess
@@ -16,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 import warp as wp
-from common import write_table
+from common import parse, write_table
 
 from warp_splat.config import ADJOINTS, STRONGEST_MOST
 from warp_splat.kernels import sh_colors
@@ -159,9 +158,7 @@ def occupancy(record: dict) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for cubins.md and cubins.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__)
     tool = cuobjdump()
     if tool is None:
         raise SystemExit("cuobjdump is missing: it comes with triton, a dependency of torch on Linux.")

@@ -3,11 +3,10 @@
 ``python benchmarks/derivatives.py --out docs/benchmarks`` writes the table.
 """
 
-import argparse
 import ast
 from pathlib import Path
 
-from common import write_table
+from common import parse, write_table
 
 KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
 
@@ -83,13 +82,11 @@ class _Specialize(ast.NodeTransformer):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for derivatives.md and .json")
     counts = {mode: derivative_lines(mode) for mode in RULES}
     rows = [[mode, *lines, sum(lines)] for mode, lines in counts.items()]
     note = "Lines of Python that state a derivative or an inverse, and that restate the loop or carry values."
     data = {mode: {"rules": rules, "plumbing": plumbing} for mode, (rules, plumbing) in counts.items()}
-    write_table("derivatives", parser.parse_args().out, ["mode", "rules", "plumbing", "lines"], rows, note, data)
+    write_table("derivatives", parse(__doc__).out, ["mode", "rules", "plumbing", "lines"], rows, note, data)
 
 
 if __name__ == "__main__":

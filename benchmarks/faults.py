@@ -6,7 +6,6 @@ clean scene it has. Photographs are small, so that a training takes a minute.
     python benchmarks/faults.py [--seed 0] [--out docs/benchmarks]
 """
 
-import argparse
 import sys
 import tempfile
 import time
@@ -15,15 +14,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from common import machine, write_table
+from common import option, parse, write_table
+from made_up import short_trainer, take_steps
 
 from warp_splat.color import from_srgb
-from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
-from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
@@ -45,17 +43,10 @@ HEADERS = ("fault", "options", "PSNR, clean", "with", "PSNR, faulty", "with", "r
 
 def train(scene: Scene, seed: int, **options) -> tuple[Trainer, float]:
     """A training on one thread, and the PSNR of held-out views."""
-    values = {**EMBEDDED_DEFAULTS[""], **PRESETS["fast"], **EMBEDDED_DEFAULTS["fast"]} | {"eval": True, "coarse": 1}
-    whole = values["iterations"]
-    for name, value in values.items():
-        if type(value) is int and name.endswith(("iterations", "_steps", "_iter", "sh_interval")):
-            values[name] = value * STEPS // whole
-    values |= {"max_gaussians": GAUSSIANS, "device": "cpu", "seed": seed, **options}
-    trainer = Trainer(scene, TrainConfig(**values))
-    for iteration in range(1, STEPS + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+    trainer = short_trainer(
+        scene, STEPS, {"max_gaussians": GAUSSIANS, "seed": seed, "eval": True, "coarse": 1} | options
+    )
+    take_steps(trainer, STEPS)
     return trainer, trainer.evaluate(scene.test)
 
 
@@ -95,10 +86,7 @@ def errors_of_sky(trainer: Trainer) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="folder for faults.md and faults.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("--seed", type=int, default=0))
     launch.prepare("cpu", 1)
     clean = load_scene(embedded_scene(), eval=True, resolution=RESOLUTION, report=str)
     rows, started, untouched = [], time.perf_counter(), train(clean, arguments.seed)[1]
@@ -117,7 +105,7 @@ def main() -> None:
             rows.append((fault, told, *figures, share, f"{100 * np.median(errors):.1f} %, {100 * errors.max():.1f} %"))
             print(*rows[-1], f"{time.perf_counter() - started:.0f} s", flush=True)
     note = f"dB of held-out views; {STEPS} steps, an edge of 66 px, seed {arguments.seed}. Errors are those of light."
-    write_table("faults", arguments.out, HEADERS, rows, note, {"rows": rows, "machine": machine()})
+    write_table("faults", arguments.out, HEADERS, rows, note, {"rows": rows})
 
 
 if __name__ == "__main__":

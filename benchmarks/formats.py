@@ -5,13 +5,12 @@ Half a minute for each model of 80,000 Gaussians on two cores.
     python benchmarks/formats.py -s SCENE -m MODEL [-s SCENE -m MODEL ...] [--out docs/benchmarks]
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
-from common import machine, write_table
+from common import TRAINED, option, parse, write_table
 
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import FORMATS, load_gaussians, save_gaussians
@@ -64,17 +63,15 @@ def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-s", "--scenes", type=Path, action="append", required=True, help="one for each model")
-    parser.add_argument("-m", "--models", type=Path, action="append", required=True, help="folders of trained models")
-    parser.add_argument("--out", type=Path, help="folder for formats.md and formats.json")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__, option("-s", "--scenes", type=Path, action="append", required=True, help="one for each model"), TRAINED
+    )
     launch.prepare("cpu", 0)
     with tempfile.TemporaryDirectory() as folder:
         pairs = zip(arguments.scenes, arguments.models, strict=True)
         rows = [row for scene, model in pairs for row in measure(scene, model, Path(folder))]
     note = "Renders of the held-out views as 8-bit pictures, of all formats against those of the `.ply`."
-    write_table("formats", arguments.out, HEADERS, rows, note, {"headers": HEADERS, "rows": rows, "machine": machine()})
+    write_table("formats", arguments.out, HEADERS, rows, note)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ error against time; what the host needs for a step; whole training against the C
 imported; kernels by ncu, if it is installed. Times are medians. What the time does not suffice for is listed.
 """
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -27,6 +26,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
+from common import option, parse
 from gpu_blends import measure_blends
 from gpu_results import Results
 from gpu_steps import measure_errors, measure_modes, measure_orbit, measure_step
@@ -176,15 +176,15 @@ def measure(results: Results, device: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for gpu.md and gpu.json")
-    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--seconds", type=float, default=450, help="after which nothing new is begun (default: 450)")
-    parser.add_argument("--save-expected", type=Path, help="write the CPU's results to this file, and stop")
-    parser.add_argument("--expected", type=Path, help="compare with the results in this file")
-    parser.add_argument("--only", default="", help="one check or measurement, by its name; prints rows for its parent")
-    parser.add_argument("--small", action="store_true", help="one small case and nothing else, for the sanitizer")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("--device", choices=("cuda", "cpu"), default="cuda"),
+        option("--seconds", type=float, default=450, help="after which nothing new is begun (default: 450)"),
+        option("--save-expected", type=Path, help="write the CPU's results to this file, and stop"),
+        option("--expected", type=Path, help="compare with the results in this file"),
+        option("--only", default="", help="one check or measurement, by its name; prints rows for its parent"),
+        option("--small", action="store_true", help="one small case and nothing else, for the sanitizer"),
+    )
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler tells when it starts and stops
     device, case = arguments.device, CHECKED
     try:

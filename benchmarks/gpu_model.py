@@ -8,13 +8,13 @@ warps by four per cycle and multiprocessor. Launches and operations of torch are
 in fibers. With a result of ``gpu.py``, its stages stand beside the model's.
 """
 
-import argparse
 import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from common import option, parse
 from gpu_counts import LAUNCHES, OPERATIONS, REST, WAITS, Scene, count_scene, count_step
 from gpu_steps import STAGES
 from made_up import cameras, make_crowd, make_gaussians
@@ -185,11 +185,11 @@ def measured_rows(path: Path, card: Card, scenes: dict[str, Scene]) -> list[list
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for the tables, as .md and .json")
-    parser.add_argument("--measured", type=Path, help="what gpu.py wrote, to be compared")
-    parser.add_argument("--card", choices=CARDS, default="H200", help="on which that was (default: H200)")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("--measured", type=Path, help="what gpu.py wrote, to be compared"),
+        option("--card", choices=CARDS, default="H200", help="on which that was (default: H200)"),
+    )
     launch.prepare("cpu", 0)
     counts = count_step()
     scenes = {

@@ -7,13 +7,13 @@ Gaussians of degree 3; both take turns.
     python benchmarks/half_moments.py --models output/halves [-s path/to/fox] [--out docs/benchmarks]
 """
 
-import argparse
+import itertools
 import statistics
 import time
 from pathlib import Path
 
 import torch
-from common import write_table
+from common import MODELS, interleaved, parse, write_table
 from preset import run
 
 from warp_splat.runtime import launch
@@ -41,25 +41,17 @@ def qualities(models: Path, scenes: dict[str, list[str]]) -> dict[str, dict[str,
 def time_steps() -> dict[str, float]:
     """Least seconds of a step."""
     launch.prepare("cpu", 1)
-    numbers, found = [[1e-3, 1e-15, 1.0, 0.9, 0.1, 0.999, 0.001]] * len(WIDTHS), dict.fromkeys(KINDS, float("inf"))
+    numbers, steps = [[1e-3, 1e-15, 1.0, 0.9, 0.1, 0.999, 0.001]] * len(WIDTHS), itertools.count()
     tables = {}
     for kind, dtype in zip(KINDS, (torch.float32, HALF), strict=True):
         rows = [[torch.randn(COUNT, width), 1e-4 * torch.randn(COUNT, width)] for width in WIDTHS]
         tables[kind] = [[*row, *(torch.zeros_like(row[0], dtype=dtype) for _ in range(2))] for row in rows]
-    for number in range(-2, ROUNDS):
-        for kind in KINDS:
-            start = time.thread_time()
-            move(tables[kind], numbers, COUNT, None, number)
-            found[kind] = min(found[kind], time.thread_time() - start) if number >= 0 else found[kind]
-    return found
+    runs = {kind: lambda table=table: move(table, numbers, COUNT, None, next(steps)) for kind, table in tables.items()}
+    return interleaved(runs, ROUNDS, time.thread_time, min)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--models", type=Path, required=True, help="folder for the models")
-    parser.add_argument("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
-    parser.add_argument("--out", type=Path, help="folder for half_moments.md and half_moments.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, MODELS, PHOTOGRAPHS)
     scenes = {"embedded": FLAGS}
     if arguments.scene:
         scenes["quarter"] = ["-s", f"{arguments.scene.resolve()}", *PHOTOGRAPHS]

@@ -6,7 +6,6 @@ Each pixel of a photograph is the light along rays that its lens sees; no pictur
 same steps. Both are judged on the lens's own pixels of views that were held out: the one that was undistorted, too.
 """
 
-import argparse
 import contextlib
 import json
 import subprocess
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import warp as wp
-from common import write_table
+from common import option, parse, write_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 from make_scene import TARGET, orbit
@@ -97,11 +96,11 @@ def own_psnr(folder: Path, model: Path) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for lenses.md and lenses.json")
-    parser.add_argument("--iterations", type=int, default=1000, help="of each training")
-    parser.add_argument("--work", type=Path, help="folder for scene and models; default: removed afterwards")
-    given = parser.parse_args()
+    given = parse(
+        __doc__,
+        option("--iterations", type=int, default=1000, help="of each training"),
+        option("--work", type=Path, help="folder for scene and models; default: removed afterwards"),
+    )
     with contextlib.ExitStack() as stack:
         work = given.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         scene = work / "scene"

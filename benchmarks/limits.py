@@ -9,11 +9,9 @@ here. On AVX-512 the machine code is 512 bits wide throughout (``python benchmar
     python benchmarks/limits.py [--code]
 """
 
-import argparse
 import re
 import subprocess
 import tempfile
-import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -21,6 +19,7 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
+from common import interleaved, option, parse
 
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.simd import LANES, vec16
@@ -85,13 +84,7 @@ def _rate(threads: int) -> float:
 
 def _least(run) -> float:
     """Seconds of the fastest of some runs, after one that does not count."""
-    run()
-    times = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    return interleaved({"": run}, REPEATS, of=min)[""]
 
 
 def machine_code() -> Counter:
@@ -105,13 +98,12 @@ def machine_code() -> Counter:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--code", action="store_true", help="count the instructions of the machine code, too")
+    arguments = parse(__doc__, option("--code", action="store_true", help="count the machine code's instructions, too"))
     launch.prepare("cpu", 0)
     for threads in (1, 2):
         limits = measure_limits(threads)
         print(f"{threads}: {limits.bandwidth / 1e9:.1f} GB/s, {limits.rate / 1e9:.2f} G vector operations/s")
-    if parser.parse_args().code:
+    if arguments.code:
         print(dict(machine_code()))
 
 

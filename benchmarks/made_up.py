@@ -11,6 +11,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import ALPHA_MIN, TILE
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.splat import Splat2D
+from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.rendering.camera_paths import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.options import TrainConfig
@@ -106,6 +107,24 @@ def steps_of(trainer: Trainer) -> Callable[[], None]:
         trainer.update(iteration)
 
     return step
+
+
+def short_trainer(scene: Scene, steps: int, options: dict) -> Trainer:
+    """By ``--preset fast`` of the embedded scene, its schedule shrunk to so many steps."""
+    values = {**EMBEDDED_DEFAULTS[""], **PRESETS["fast"], **EMBEDDED_DEFAULTS["fast"]}
+    whole = values["iterations"]
+    for name, value in values.items():
+        if type(value) is int and name.endswith(("iterations", "_steps", "_iter", "sh_interval")):
+            values[name] = value * steps // whole
+    return Trainer(scene, TrainConfig(**values | {"device": "cpu"} | options))
+
+
+def take_steps(trainer: Trainer, steps: int) -> None:
+    """All but the last update: a set that was changed a moment ago is unsettled."""
+    for iteration in range(1, steps + 1):
+        if iteration > 1:
+            trainer.update(iteration - 1)
+        trainer.differentiate(iteration)
 
 
 class BlendScene(NamedTuple):

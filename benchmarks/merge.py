@@ -5,12 +5,11 @@ A minute for each model of 200,000 Gaussians.
     python benchmarks/merge.py -m MODEL [-m MODEL ...] [--out docs/benchmarks]
 """
 
-import argparse
 import time
 from pathlib import Path
 
 import numpy as np
-from common import machine, write_table
+from common import TRAINED, parse, write_table
 
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html.merge import merged
@@ -51,15 +50,11 @@ def rows_of(model: Path) -> list[tuple]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-m", "--models", type=Path, action="append", required=True, help="folders of trained models")
-    parser.add_argument("--out", type=Path, help="folder for merge.md and merge.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, TRAINED)
     launch.prepare("cpu", 0)
     rows = [row for model in arguments.models for row in rows_of(model)]
     note = f"PSNR of renders against those of all Gaussians, the first {VIEWS} cameras; merged ones have degree 0."
-    data = {"headers": HEADERS, "rows": rows, "machine": machine()}
-    write_table("merge", arguments.out, HEADERS, rows, note, data)
+    write_table("merge", arguments.out, HEADERS, rows, note)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ options that a run stored, without a clock; its model has to be the same file. W
     python benchmarks/minutes.py --models output/minutes [-s path/to/fox] [--out docs/benchmarks]
 """
 
-import argparse
 import json
 import subprocess
 import sys
@@ -16,14 +15,13 @@ import time
 import tomllib
 from pathlib import Path
 
-from common import machine, write_table
+from common import MODELS, PHOTOGRAPHS, ROOT, parse, write_table
 
 from warp_splat.config import CORES
 from warp_splat.formats.png import load_png
 from warp_splat.training.deadline import REACHED
 from warp_splat.training.plan import Reached
 
-ROOT = Path(__file__).parents[1]
 MINUTES = {"embedded": (0.5, 1, 2), "half": (1, 3)}
 DISTURBED, AFTER = ("embedded", 1), 0.4
 HEADERS = ("run", "asked s", "taken s", "off %", "planned", "iterations", "cooldown", "Gaussians", "PSNR dB")
@@ -59,11 +57,7 @@ def row_of(name: str, minutes: float, found: dict) -> tuple:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--models", type=Path, required=True, help="folder for the models")
-    parser.add_argument("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
-    parser.add_argument("--out", type=Path, help="folder for minutes.md and minutes.json; the package's table follows")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, MODELS, PHOTOGRAPHS)
     flags = {"embedded": []}
     if arguments.scene:
         flags["half"] = ["-s", arguments.scene.resolve(), "-r", "2", "--eval"]
@@ -87,7 +81,7 @@ def main() -> None:
         f"Held-out views. The model of the last row is {same} as that of the first. Disturbed: {CORES} other processes "
         f"compute from {AFTER:.0%} of the time on."
     )
-    write_table("minutes", arguments.out, HEADERS, rows, note, {"headers": HEADERS, "rows": rows, "machine": machine()})
+    write_table("minutes", arguments.out, HEADERS, rows, note)
     if arguments.out:
         entries = ",\n ".join(json.dumps(entry._asdict()) for entry in reached)
         REACHED.write_text(f"[{entries}]\n")

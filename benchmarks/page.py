@@ -6,13 +6,12 @@ playwright and a Chromium, as the tests in a browser do (tests/browser.py); its 
     python benchmarks/page.py -m MODEL [--out docs/benchmarks]
 """
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from common import machine, write_table
+from common import option, parse, write_table
 from made_up import make_gaussians
 from scipy.spatial.transform import Rotation
 
@@ -160,18 +159,14 @@ def screen(page, folder: Path) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-m", "--model", type=Path, required=True, help="the folder of a trained model")
-    parser.add_argument("--out", type=Path, help="folder for page.md and page.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("-m", "--model", type=Path, required=True, help="the folder of a trained model"))
     with tempfile.TemporaryDirectory() as folder:
         models = make_models(arguments.model, Path(folder))
         rows = [measure(name, model, Path(folder)) for name, model in models.items()]
     note = (
         f"Chromium, {WIDTH} x {HEIGHT} px, from disk, WebGL in software. dB: PSNR of the screen against that at rest."
     )
-    data = {"headers": HEADERS, "rows": rows, "machine": machine()}
-    write_table("page", arguments.out, HEADERS, rows, note, data)
+    write_table("page", arguments.out, HEADERS, rows, note)
 
 
 if __name__ == "__main__":

@@ -6,18 +6,16 @@ that everything happens at the same step as with one process, after twice as man
     python benchmarks/parallel.py --models output/parallel [--iterations 3000] [--out docs/benchmarks]
 """
 
-import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 
-from common import machine, write_table
+from common import MODELS, ROOT, option, parse, write_table
 
 from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.training.options import TrainConfig
 
-ROOT = Path(__file__).parents[1]
 #: name: processes, threads of each, factor of the schedule
 RUNS = {
     "1 process, 2 threads": (1, 2, 1),
@@ -69,11 +67,11 @@ def run(model: Path, processes: int, threads: int, iterations: int) -> tuple:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--models", type=Path, required=True, help="folder for the models, which holds none yet")
-    parser.add_argument("--iterations", type=int, default=3000, help="images in all but the last run, an even number")
-    parser.add_argument("--out", type=Path, help="folder for parallel.md and parallel.json")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        MODELS,
+        option("--iterations", type=int, default=3000, help="images in all but the last run, an even number"),
+    )
     rows = []
     for number, (name, (processes, threads, factor)) in enumerate(RUNS.items()):
         model = arguments.models.resolve() / str(number)
@@ -82,9 +80,7 @@ def main() -> None:
     note = (
         "Embedded scene, held-out views (every 8th); seconds of steps without evaluations and pictures; one run each."
     )
-    write_table(
-        "parallel", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()}
-    )
+    write_table("parallel", arguments.out, headers, rows, note)
 
 
 if __name__ == "__main__":

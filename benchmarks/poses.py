@@ -7,7 +7,6 @@ half a minute.
     python benchmarks/poses.py [--seed 0] [--out docs/benchmarks]
 """
 
-import argparse
 import sys
 import tempfile
 import time
@@ -15,16 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import machine, write_table
+from common import option, parse, write_table
+from made_up import short_trainer, take_steps
 from scipy.spatial.transform import Rotation
 
 from warp_splat.evaluation.metrics import psnr
-from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene, View
-from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts.pose import Pose
 from warp_splat.training.trainer import Trainer
 
@@ -66,27 +64,15 @@ def aligned_psnr(trainer: Trainer) -> float:
 
 def train(scene: Scene, seed: int, **options) -> tuple[Trainer, float]:
     """A whole training on one thread, and its processor seconds."""
-    values = {**EMBEDDED_DEFAULTS[""], **PRESETS["fast"], **EMBEDDED_DEFAULTS["fast"]}
-    whole = values["iterations"]
-    for name, value in values.items():
-        if type(value) is int and name.endswith(("iterations", "_steps", "_iter", "sh_interval")):
-            values[name] = value * STEPS // whole
-    values |= {"max_gaussians": GAUSSIANS, "device": "cpu", "seed": seed, **options}
-    trainer = Trainer(scene, TrainConfig(**values))
+    trainer = short_trainer(scene, STEPS, {"max_gaussians": GAUSSIANS, "seed": seed, **options})
     trainer.warm_up()
     start = time.process_time()
-    for iteration in range(1, STEPS + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+    take_steps(trainer, STEPS)
     return trainer, time.process_time() - start
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="folder for poses.md and poses.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("--seed", type=int, default=0))
     launch.prepare("cpu", 1)
     torch.set_num_threads(1)
     true = load_scene(embedded_scene(), eval=True, resolution=RESOLUTION, report=str)
@@ -112,7 +98,7 @@ def main() -> None:
         f"PSNR of held-out views in dB; medians of the training cameras after a similarity. {STEPS} steps, "
         f"{GAUSSIANS} Gaussians, an edge of {true.train[0].camera.width} px, seed {arguments.seed}."
     )
-    data = {"runs": runs, "verdicts": [Pose.needed(true).sentence, verdict], "machine": machine()}
+    data = {"runs": runs, "verdicts": [Pose.needed(true).sentence, verdict]}
     write_table("poses", arguments.out, HEADERS, rows, note, data)
 
 

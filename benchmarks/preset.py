@@ -6,17 +6,13 @@ whose results are there already is not repeated. The models of benchmarks/traini
     python benchmarks/preset.py --models output/fox [-s path/to/fox] [--out docs/benchmarks]
 """
 
-import argparse
 import json
-import subprocess
-import sys
 from pathlib import Path
 
-from common import machine, write_table
+from common import MODELS, parse, run_training, write_table
 
 from warp_splat.evaluation.report import BLUE, ORANGE, new_figure, plain_axes, save_figure
 
-ROOT = Path(__file__).parents[1]
 EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}
 PHOTOGRAPHS = {
     "full": ["-r", "1", "--eval", "--iterations", "7000"],
@@ -28,12 +24,7 @@ EARLY = 60  # s
 
 def run(model: Path, flags: list[str]) -> tuple[dict, list[dict]]:
     """Train, if that has not been done; the results of the last iteration and the history."""
-    if not (model / "results.json").is_file():
-        command = [sys.executable, "-m", "warp_splat", "train", "-m", model, *flags]
-        subprocess.run(command, check=True, cwd=ROOT)
-    results = json.loads((model / "results.json").read_text())
-    last = max(results, key=lambda name: int(name.removeprefix("ours_")))
-    return results[last], json.loads((model / "history.json").read_text())
+    return run_training(model, flags), json.loads((model / "history.json").read_text())
 
 
 def row_of(name: str, results: dict, history: list[dict]) -> tuple:
@@ -65,11 +56,7 @@ def plot(path: Path, found: dict[str, list[dict]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--models", type=Path, required=True, help="folder for the models")
-    parser.add_argument("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
-    parser.add_argument("--out", type=Path, help="folder for preset.md, preset.json and preset.png")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, MODELS, PHOTOGRAPHS)
     runs = dict(EMBEDDED)
     if arguments.scene:
         runs |= {name: ["-s", arguments.scene.resolve(), *flags] for name, flags in PHOTOGRAPHS.items()}
@@ -78,7 +65,7 @@ def main() -> None:
     headers = ("run", "iterations", f"PSNR dB by {EARLY} s", "PSNR dB", "SSIM", "s of steps", "wall s", "Gaussians")
     rows = [row_of(name, *results) for name, results in found.items()]
     note = "Held-out views; a few of them in the column of the first minute."
-    write_table("preset", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()})
+    write_table("preset", arguments.out, headers, rows, note)
     if arguments.out:
         plot(arguments.out / "preset.png", {name: history for name, (_, history) in found.items()})
 

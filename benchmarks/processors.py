@@ -15,9 +15,8 @@ import os
 import statistics
 import subprocess
 import sys
-from pathlib import Path
 
-from common import machine, write_table
+from common import machine, option, parse, write_table
 
 #: Of each processor, the environment that makes it; the first is what others are compared with.
 NO_AVX512 = {"ATEN_CPU_CAPABILITY": "avx2"}
@@ -79,12 +78,12 @@ def measure(count: int, rounds: int) -> dict[str, dict[int, dict[str, float]]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, nargs="+", default=[200_000, 1_000_000], help="Gaussians of each size")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json")
-    parser.add_argument("--work", type=int, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("--count", type=int, nargs="+", default=[200_000, 1_000_000], help="Gaussians of each size"),
+        option("--rounds", type=int, default=5),
+        option("--work", type=int, help=argparse.SUPPRESS),
+    )
     if arguments.work:
         work(arguments.work)
         return

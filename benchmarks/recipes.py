@@ -6,7 +6,6 @@ kept in a folder and not repeated; several of these programs may run at once, an
     python benchmarks/recipes.py --runs output/recipes --fox path/to/fox --church path/to/church [--out docs/benchmarks]
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 import work
-from common import machine, write_table
+from common import option, parse, write_table
 
 from warp_splat.evaluation.metrics import psnr, ssim
 from warp_splat.evaluation.perceptual import flip
@@ -217,13 +216,13 @@ NOTE = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=Path, required=True, help="folder for what has been run")
-    parser.add_argument("--fox", type=Path, help="photographs of 540 x 960 px")
-    parser.add_argument("--church", type=Path, help="photographs of 768 x 512 px")
-    parser.add_argument("--only_table", action="store_true", help="train nothing more")
-    parser.add_argument("--out", type=Path, help="folder for recipes.md and recipes.json")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("--runs", type=Path, required=True, help="folder for what has been run"),
+        option("--fox", type=Path, help="photographs of 540 x 960 px"),
+        option("--church", type=Path, help="photographs of 768 x 512 px"),
+        option("--only_table", action="store_true", help="train nothing more"),
+    )
     launch.prepare("cpu", 1)
     arguments.runs.mkdir(parents=True, exist_ok=True)
     given = {"fox": arguments.fox, "church": arguments.church, "embedded": embedded_scene()}
@@ -232,7 +231,7 @@ def main() -> None:
         train_all(arguments.runs, places)
     rows = [row for job in jobs_of() if (row := row_of(arguments.runs, *job))]
     rows.sort(key=lambda row: (list(HALVED).index(row[0]), row[1]))
-    write_table("recipes", arguments.out, HEADERS, rows, NOTE, {"headers": HEADERS, "rows": rows, "machine": machine()})
+    write_table("recipes", arguments.out, HEADERS, rows, NOTE)
 
 
 if __name__ == "__main__":

@@ -5,12 +5,11 @@ The orbit goes around the point that the cameras of the scene look at. About 2 m
     python benchmarks/rendering.py -s SCENE -m point_cloud.ply [more models] [--out docs/benchmarks]
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 import torch
-from common import interleaved_medians, machine, write_table
+from common import interleaved, option, parse, write_table
 
 from warp_splat import rasterize, rasterize_views
 from warp_splat.config import RasterOptions
@@ -41,7 +40,7 @@ def measure(model: GaussianModel, names: list[str], cameras: list, test: list) -
     pictures = {name: make_picture(model, False, OPTIONS[name]) for name in names}
     frames = {name: np.concatenate([picture(camera) for camera in cameras]) for name, picture in pictures.items()}
     runs = {name: lambda picture=picture: [picture(camera) for camera in cameras] for name, picture in pictures.items()}
-    seconds, full, rows = interleaved_medians(runs, ROUNDS), frames[FULL], []
+    seconds, full, rows = interleaved(runs, ROUNDS), frames[FULL], []
     for name, picture in pictures.items():
         error = np.abs(frames[name].astype(int) - full).max()
         quality = np.mean([psnr(picture(view.camera), view.picture, view.mask) for view in test])
@@ -60,16 +59,16 @@ def compare_calls(model: GaussianModel, cameras: list) -> list[tuple]:
             "rasterize": lambda: [rasterize(*gaussians, camera) for camera in cameras],
             "rasterize_views": lambda: rasterize_views(*gaussians, cameras),
         }
-        seconds = interleaved_medians(runs, ROUNDS)
+        seconds = interleaved(runs, ROUNDS)
     return [(name, f"{1e3 * value / len(cameras):.1f}") for name, value in seconds.items()]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-s", "--scene", type=Path, required=True, help="in which every 8th view was held out")
-    parser.add_argument("-m", "--models", type=Path, nargs="+", required=True, help="the first in all options")
-    parser.add_argument("--out", type=Path, help="folder for rendering.md and rendering.json")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("-s", "--scene", type=Path, required=True, help="in which every 8th view was held out"),
+        option("-m", "--models", type=Path, nargs="+", required=True, help="the first in all options"),
+    )
     launch.prepare("cpu", 0)
     scene = load_scene(arguments.scene, eval=True, report=lambda _: None)
     cameras, rows = focus_orbit(scene, FRAMES), []
@@ -86,7 +85,7 @@ def main() -> None:
             f"{pool.get_threads()} threads.",
         )
     )
-    data = {"headers": HEADERS, "rows": rows, "calls": calls, "machine": machine()}
+    data = {"headers": HEADERS, "rows": rows, "calls": calls}
     write_table("rendering", arguments.out, HEADERS, rows, note, data)
 
 

@@ -7,7 +7,6 @@ is left out then, in turns; times are medians. Rates are zero, so that every ste
     python benchmarks/savings.py [-s path/to/fox --models output/fox] [--out docs/benchmarks]
 """
 
-import argparse
 import statistics
 import tempfile
 import time
@@ -20,9 +19,9 @@ from unittest.mock import patch
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from common import machine, write_table
+from common import interleaved, parse, write_table
 from made_up import NEVER, steps_of
-from step import add_arguments, synthetic, trained
+from step import GIVEN, synthetic, trained
 
 from warp_splat.raster import cpu
 from warp_splat.raster.api import render
@@ -184,35 +183,34 @@ def measure_projection(trainer: Trainer) -> list[str]:
     seen = (project(everything, camera, chosen).radii > 0).nonzero()[:, 0]
     count = len(everything.means)
     copied = seen.repeat(-(-count // len(seen)))[:count].sort().values
-    ways = [
-        Gaussians(*(tensor[rows].requires_grad_() for tensor in everything)) for rows in (copied, torch.arange(count))
-    ]
-    found: tuple[list[float], list[float]] = ([], [])
-    for _ in range(ROUNDS * STEPS):
-        for times, gaussians in zip(found, ways, strict=True):
-            start = time.perf_counter()
+
+    def run(rows: torch.Tensor) -> Callable[[], object]:
+        gaussians = Gaussians(*(tensor[rows].requires_grad_() for tensor in everything))
+
+        def once() -> None:
             out = project(gaussians, camera, chosen)[:5]  # what has gradients
             torch.autograd.grad(out, gaussians, [torch.ones_like(tensor) for tensor in out])
-            times.append(time.perf_counter() - start)
+
+        return once
+
+    found = interleaved({"work": run(copied), "spared": run(torch.arange(count))}, ROUNDS * STEPS)
     name = f"projection and adjoint of the {100 - 100 * len(seen) / count:.0f} % of Gaussians not seen (alone)"
-    return row_of(name, statistics.median(found[0]), statistics.median(found[1]), "same image, same gradients")
+    return row_of(name, **found, change="same image, same gradients")
 
 
 def measure_decoding(trainer: Trainer) -> list[str]:
     """A photograph from a JPEG file in every step, against all of them once before the first."""
     step = steps_of(trainer)
-    found: tuple[list[float], list[float]] = ([], [])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "photograph.jpg"
         oiio.ImageBuf(np.ascontiguousarray(trainer.scene.train[0].image)).write(str(path))
-        for _ in range(ROUNDS * STEPS):
-            for times, decodes in zip(found, (True, False), strict=True):
-                start = time.perf_counter()
-                if decodes:
-                    np.rint(255.0 * read_pixels(path, 0.0).color).astype(np.uint8)
-                step()
-                times.append(time.perf_counter() - start)
-    return row_of("decoding the photograph in the step", *map(statistics.median, found), "same image, same gradients")
+
+        def decoding() -> None:
+            np.rint(255.0 * read_pixels(path, 0.0).color).astype(np.uint8)
+            step()
+
+        found = interleaved({"work": decoding, "spared": step}, ROUNDS * STEPS)
+    return row_of("decoding the photograph in the step", **found, change="same image, same gradients")
 
 
 def row_of(name: str, work: float, spared: float, change: str) -> list[str]:
@@ -220,9 +218,7 @@ def row_of(name: str, work: float, spared: float, change: str) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_arguments(parser)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, *GIVEN)
     launch.prepare("cpu", 0)
     if arguments.scene:
         trainer = trained(arguments.scene, arguments.models, "full")
@@ -238,7 +234,7 @@ def main() -> None:
         "rises, nothing is compiled."
     )
     data = [dict(zip(HEADERS, row, strict=True)) for row in rows]
-    write_table("savings", arguments.out, HEADERS, rows, note, {"rows": data, "machine": machine()})
+    write_table("savings", arguments.out, HEADERS, rows, note, {"rows": data})
 
 
 if __name__ == "__main__":

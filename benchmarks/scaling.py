@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import machine, write_table
+from common import ROOT, option, parse, write_table
 from made_up import make_trainer
 
 from warp_splat.config import TILE, RasterOptions
@@ -31,7 +31,6 @@ from warp_splat.text import format_table
 from warp_splat.training.memory import pixel_floats, step_memory
 from warp_splat.training.trainer import Trainer
 
-ROOT = Path(__file__).parents[1]
 MIB = 2**20
 FAINT = -4.5  # logit of the opacities in the sweep of the depth, so low that no pixel saturates
 #: sweep: what varies, and its points (Gaussians, width, height, factor of the Gaussians' size)
@@ -215,12 +214,12 @@ def plot(path: Path, found: dict[str, list[dict]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     choices = (*SWEEPS, "training")
-    parser.add_argument("--sweeps", nargs="+", choices=choices, default=choices, help="others are read from --out")
-    parser.add_argument("--out", type=Path, help="folder for scaling.md, scaling.json and scaling.png")
-    parser.add_argument("--point", type=json.loads, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("--sweeps", nargs="+", choices=choices, default=choices, help="others are read from --out"),
+        option("--point", type=json.loads, help=argparse.SUPPRESS),
+    )
     if arguments.point:
         print(json.dumps(measure(*arguments.point)))
         return
@@ -259,7 +258,7 @@ def report(out: Path | None, found: dict[str, list[dict]]) -> None:
             "`training`: runs of train.py on the embedded scene, with the forecast that they print.",
         )
     )
-    write_table("scaling", out, HEADERS, rows, note, {"points": found, "machine": machine()})
+    write_table("scaling", out, HEADERS, rows, note, {"points": found})
     if out:
         plot(out / "scaling.png", found)
 

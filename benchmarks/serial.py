@@ -12,17 +12,16 @@ the least of several rounds.
     python benchmarks/serial.py [-s path/to/fox --models output/fox] [--out docs/benchmarks]
 """
 
-import argparse
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
 
-from common import machine, write_table
+from common import parse, write_table
 from gpu_steps import STAGES
 from limits import measure_limits
 from made_up import VIEWS, steps_of
-from step import add_arguments, trainers
+from step import GIVEN, trainers
 from work import Counts, count, mean, work_of
 
 from warp_splat.config import CORES, RasterOptions
@@ -128,12 +127,10 @@ def predict(alone: dict, serial: dict, counts: Counts, bandwidth: float, cores: 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_arguments(parser)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, *GIVEN)
     launch.prepare("cpu", 0)
     bandwidth = measure_limits(1).bandwidth
-    rows, notes, data = [], [], {"machine": machine(), "bandwidth": bandwidth}
+    rows, notes, data = [], [], {"bandwidth": bandwidth}
     for name, trainer, rounds in trainers(arguments):
         gaussians = Gaussians(*(tensor.detach() for tensor in trainer.model.activated()))
         counts = mean([count(gaussians, view.camera, RasterOptions()) for view in trainer.scene.train])

@@ -6,7 +6,6 @@ The truth is drawn by the renderer itself, row by row. Beside the two steps that
 and a camera that stands still where its middle row is read.
 """
 
-import argparse
 import functools
 import time
 from dataclasses import replace
@@ -16,7 +15,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from cameras import cube
-from common import write_table
+from common import interleaved, parse, write_table
 
 from warp_splat import Camera, Lens, RasterOptions, Shutter, rasterize
 from warp_splat.evaluation.report import new_panels, save_figure
@@ -74,15 +73,14 @@ def seconds_of(camera: Camera) -> dict[str, float]:
     """Processor seconds of projection and adjoint, the least of some turns."""
     given = [tensor.requires_grad_() for tensor in cube(SEED, TIMED)]
     gaussians = Gaussians(*given[:4], given[4][:, :1], given[4][:, 1:])
-    best = dict.fromkeys(ways(camera), np.inf)
-    for _ in range(TURNS):
-        for name, (seen_by, steps) in ways(camera).items():
-            with with_steps(steps):
-                start = time.process_time()
-                splats = project(gaussians, seen_by, RasterOptions())
-                torch.autograd.grad(splats[:5], gaussians[:5], [torch.ones_like(part) for part in splats[:5]])
-                best[name] = min(best[name], time.process_time() - start)
-    return best
+
+    def once(seen_by: Camera, steps: int) -> None:
+        with with_steps(steps):
+            splats = project(gaussians, seen_by, RasterOptions())
+            torch.autograd.grad(splats[:5], gaussians[:5], [torch.ones_like(part) for part in splats[:5]])
+
+    runs = {name: functools.partial(once, *way) for name, way in ways(camera).items()}
+    return interleaved(runs, TURNS, time.process_time, min)
 
 
 def measured(name: str) -> tuple[list[dict], dict[str, torch.Tensor]]:
@@ -117,9 +115,7 @@ def plot(path: Path, pictures: dict[str, torch.Tensor]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for shutter.md, shutter.json and shutter.png")
-    given = parser.parse_args()
+    given = parse(__doc__)
     records = []
     for name in MOTIONS:
         found, pictures = measured(name)

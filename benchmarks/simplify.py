@@ -3,10 +3,9 @@
 python benchmarks/simplify.py -m MODEL [-m MODEL ...] [--out docs/benchmarks]
 """
 
-import argparse
 from pathlib import Path
 
-from common import machine, write_table
+from common import TRAINED, parse, write_table
 
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.pruning.finished import Opened, open_finished, written_bytes
@@ -45,14 +44,10 @@ def row_of(opened: Opened, kept: str, harmonics: str, splats: SplatArrays, befor
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-m", "--models", type=Path, action="append", required=True, help="folders of trained models")
-    parser.add_argument("--out", type=Path, help="folder for simplify.md and simplify.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, TRAINED)
     rows = [row for model in arguments.models for row in rows_of(model.resolve())]
     note = f"Held-out views; {STEPS} steps of training for what is kept. The harmonics that show: all but 0.02 dB."
-    data = {"headers": HEADERS, "rows": rows, "machine": machine()}
-    write_table("simplify", arguments.out, HEADERS, rows, note, data)
+    write_table("simplify", arguments.out, HEADERS, rows, note)
 
 
 if __name__ == "__main__":

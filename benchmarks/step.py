@@ -12,14 +12,14 @@ threads take turns. Times are medians over the rounds, of a round's mean.
     python benchmarks/step.py [-s path/to/fox --models output/fox] [--out docs/benchmarks]
 """
 
-import argparse
 import statistics
 import time
+from argparse import Namespace
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from common import machine, write_table
+from common import option, parse, write_table
 from gpu_steps import STAGES
 from limits import Limits, measure_limits
 from made_up import VIEWS, make_gaussians, make_scene, steps_of, trainer_on
@@ -34,6 +34,10 @@ from warp_splat.scene import load_scene
 from warp_splat.training.trainer import Trainer
 
 THREADS = (1, 2)
+GIVEN = (
+    option("-s", "--scene", type=Path, help="COLMAP scene of the models"),
+    option("--models", type=Path, help="folder with half/ and full/, as benchmarks/training.py leaves it"),
+)
 TRAINED = {"half": (2, 1000), "full": (1, 3000)}  # name of the model: -r, iteration
 SYNTHETIC = (1_000_000, 980, 545)
 #: Adam does all of its work, and moves nothing. The rate of the means decays exponentially: almost zero.
@@ -41,12 +45,6 @@ AT_REST = {
     **dict.fromkeys(("feature_lr", "opacity_lr", "scaling_lr", "rotation_lr"), 0.0),
     **{"position_lr_init": 1e-37, "position_lr_final": 1e-37},
 }
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-s", "--scene", type=Path, help="COLMAP scene of the models")
-    parser.add_argument("--models", type=Path, help="folder with half/ and full/, as benchmarks/training.py leaves it")
-    parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json")
 
 
 def trained(source: Path, models: Path, name: str) -> Trainer:
@@ -61,7 +59,7 @@ def synthetic(count: int, width: int, height: int) -> Trainer:
     return trainer_on(make_scene(width, height), make_gaussians(count, "cpu"), "cpu", **AT_REST)
 
 
-def trainers(arguments: argparse.Namespace) -> Iterator[tuple[str, Trainer, int]]:
+def trainers(arguments: Namespace) -> Iterator[tuple[str, Trainer, int]]:
     """What to measure, one at a time, and for how many rounds."""
     if arguments.scene:
         for name, rounds in zip(TRAINED, (15, 7), strict=True):
@@ -125,12 +123,10 @@ def describe(name: str, trainer: Trainer, counts: Counts, times: dict[int, dict[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_arguments(parser)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, *GIVEN)
     launch.prepare("cpu", 0)
     limits = {threads: measure_limits(threads) for threads in THREADS}
-    rows, notes, data = [], [], {"machine": machine(), "limits": {k: v._asdict() for k, v in limits.items()}}
+    rows, notes, data = [], [], {"limits": {k: v._asdict() for k, v in limits.items()}}
     for name, trainer, rounds in trainers(arguments):
         gaussians = Gaussians(*(tensor.detach() for tensor in trainer.model.activated()))
         counts = mean([count(gaussians, view.camera, RasterOptions()) for view in trainer.scene.train])

@@ -6,13 +6,11 @@ for bit. Processor time, the least of all rounds. About a minute.
     python benchmarks/tape.py [--out docs/benchmarks]
 """
 
-import argparse
 import time
-from pathlib import Path
 
 import torch
 import warp as wp
-from common import machine, write_table
+from common import option, parse, write_table
 from made_up import cameras, make_gaussians
 
 from warp_splat import rasterize, tape
@@ -47,10 +45,7 @@ def on_tape(given: list[torch.Tensor], camera, upstream: torch.Tensor):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for tape.md and tape.json")
-    parser.add_argument("--repeats", type=int, default=15)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("--repeats", type=int, default=15))
     device = prepare("cpu", 1)
     rows, seconds = [], {}
     for count, size in SCENES:
@@ -76,7 +71,7 @@ def main() -> None:
         *(f"{part} ms: {name}" for part in PARTS for name in ("torch", "tape", "its own part")),
     )
     note = "Whole calls with the checks of their input, one thread, processor time; its own part by the clock."
-    write_table("tape", arguments.out, headers, rows, note, {"seconds": seconds, "machine": machine()})
+    write_table("tape", arguments.out, headers, rows, note, {"seconds": seconds})
 
 
 if __name__ == "__main__":

@@ -6,15 +6,13 @@ already is not repeated.
     python benchmarks/training.py -s path/to/fox --models output/fox [--out docs/benchmarks]
 """
 
-import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 
-from common import machine, write_table
+from common import MODELS, ROOT, option, parse, write_table
 
-ROOT = Path(__file__).parents[1]
 RUNS = {"half": ["-r", "2", "--iterations", "1000"], "full": ["-r", "1", "--iterations", "7000"]}
 STATED = (1000, 3000, 7000)
 
@@ -57,20 +55,14 @@ def rows_of(name: str, model: Path) -> list[tuple]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-s", "--scene", type=Path, required=True)
-    parser.add_argument("--models", type=Path, required=True, help="folder for the two models")
-    parser.add_argument("--out", type=Path, help="folder for training.md and training.json")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("-s", "--scene", type=Path, required=True), MODELS)
     rows = []
     for name, flags in RUNS.items():
         run(arguments.scene.resolve(), (arguments.models / name).resolve(), flags)
         rows += rows_of(name, arguments.models / name)
     headers = ("size", "iteration", "PSNR dB", "SSIM", "s of steps", "it/s", "Gaussians", "wall s", "peak GB")
     note = "Held-out views (every 8th). Wall time holds loading, kernels, evaluations, pictures and plots as well."
-    write_table(
-        "training", arguments.out, headers, rows, note, {"headers": headers, "rows": rows, "machine": machine()}
-    )
+    write_table("training", arguments.out, headers, rows, note)
 
 
 if __name__ == "__main__":

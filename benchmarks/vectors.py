@@ -5,14 +5,13 @@
 Needs llvm-objdump.
 """
 
-import argparse
 import re
 import subprocess
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from arm import DEFAULT_ROOT, kernel_folders
-from common import write_table
+from common import option, parse, write_table
 
 #: Kernels whose loops take the time of a step.
 HOT = ("project", "shade", "adj_shade", "blend", "upstream", "adj_blend", "walk", "ssim", "adam")
@@ -67,10 +66,7 @@ def _count(widths: Iterable[int]) -> tuple[int, int]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--root", type=Path, default=DEFAULT_ROOT, help="folder of the emulated machine")
-    parser.add_argument("--out", type=Path, help="folder for the table")
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("--root", type=Path, default=DEFAULT_ROOT, help="folder of the emulated machine"))
     folders = kernel_folders(arguments.root)
     rows = sorted((kernel, name, *found) for name, at in folders.items() for kernel, *found in vectors(at))
     headers = ["kernel", "processor", "in vectors", "scalar", "inner loop: in vectors", "scalar"]

@@ -6,13 +6,11 @@ hits them alike, and the least of each counts. About 3 minutes.
     python benchmarks/views.py [--threads 2] [--out docs/benchmarks]
 """
 
-import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
-from common import machine, write_table
+from common import REPEATS, option, parse, write_table
 from made_up import cameras, make_gaussians
 
 from warp_splat import rasterize, rasterize_views
@@ -57,11 +55,7 @@ def measure(run: Callable, given: list[torch.Tensor], seen: list[Camera], upstre
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, help="folder for views.md and views.json")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, default=7)
-    arguments = parser.parse_args()
+    arguments = parse(__doc__, option("--threads", type=int, default=2), REPEATS)
     device = prepare("cpu", arguments.threads)
     seen = cameras(*SIZE, VIEWS)
     with torch.no_grad():
@@ -95,7 +89,7 @@ def main() -> None:
         "forward and adjoint, the least of all rounds. Images are equal bit for bit; gradients: relative L2 of the "
         "worst."
     )
-    write_table("views", arguments.out, HEADERS, rows, note, {"seconds": seconds, "machine": machine()})
+    write_table("views", arguments.out, HEADERS, rows, note, {"seconds": seconds})
 
 
 if __name__ == "__main__":
