@@ -9,7 +9,7 @@ import pytest
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.formats.png import load_png, save_png, save_video
-from warp_splat.text import format_table
+from warp_splat.text import format_table, table_of
 
 
 def view(name="0001.jpg", height=60, width=80, gap=8):
@@ -127,6 +127,14 @@ def test_importing_the_report_loads_no_matplotlib():
     modules = "warp_splat.evaluation.report, warp_splat.formats.png"
     program = f"import sys, {modules}; sys.exit(not {{'matplotlib', 'av'}}.isdisjoint(sys.modules))"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_table_of_records():
+    """A template or a function for each column; what is missing is a dash, also where several numbers are asked for."""
+    records = [{"a": 1.25, "b": None}, {"a": float("nan")}, {"a": 2, "b": "x"}]
+    table = table_of(records, {"one": "{a:.1f}", "both": "{a}, {b}", "keys": len})
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert cells[2:] == [["1.2", "-", "2"], ["-", "-", "1"], ["2.0", "2, x", "2"]]
 
 
 def test_format_table():

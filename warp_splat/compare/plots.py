@@ -80,6 +80,7 @@ def draw(path: Path, panels: Sequence[Panel], columns: int, height: float, y: st
         for note in panel.notes:
             report.label_point(axes, *note)
         axes.set(**{"xscale": "log", "yscale": "log", **shared, **panel.limits})
+        axes.minorticks_off()
         if panel.ticks:
             axes.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=NullLocator())
             axes.xaxis.set_major_formatter("{x:g}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,15 @@ def for_oracle(options: RasterOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in names}
 
 
+def draw_exactly(
+    gaussians: Gaussians, camera: Any, background: torch.Tensor, options: RasterOptions, pixels=None
+) -> oracle.Render:
+    """The oracle's render, of float64."""
+    *geometry, sh_dc, sh_rest = gaussians
+    sh = torch.cat([sh_dc, sh_rest], 1)
+    return oracle.exact_render(*geometry, sh, camera, background, **for_oracle(options), pixels=pixels)
+
+
 def random_upstream(shape: torch.Size, fragile: torch.Tensor) -> torch.Tensor:
     """A random upstream gradient of an image, float32; 0 at the pixels that hang on a rounding."""
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(1))
@@ -55,14 +65,18 @@ def random_upstream(shape: torch.Size, fragile: torch.Tensor) -> torch.Tensor:
 
 def compute_truth(workload: Workload) -> Truth:
     """Float64 image and gradients at the workload's pixels."""
-    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double().cpu() for tensor in workload.gaussians)
-    leaves = [means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), workload.background.double().cpu()]
-    leaves = [leaf.clone().requires_grad_() for leaf in leaves]
-    options = for_oracle(workload.options)
-    out = oracle.exact_render(*leaves[:5], workload.camera, leaves[5], **options, pixels=workload.pixels)
+    given = (*workload.gaussians, workload.background)
+    *leaves, background = (tensor.double().cpu().clone().requires_grad_() for tensor in given)
+    out = draw_exactly(Gaussians(*leaves), workload.camera, background, workload.options, workload.pixels)
     weights = random_upstream(out.image.shape, out.fragile)
-    gradients = torch.autograd.grad((out.image * weights).sum(), [*leaves, out.means2d])
-    return Truth(out.image.detach(), weights, ~out.fragile, dict(zip(PARAMETERS, gradients, strict=True)))
+    found = torch.autograd.grad((out.image * weights).sum(), [*leaves, background, out.means2d])
+    return Truth(out.image.detach(), weights, ~out.fragile, _by_parameter(found))
+
+
+def _by_parameter(gradients: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Of a workload's Gaussians, the background and the 2D means; on the host."""
+    *geometry, sh_dc, sh_rest, background, means2d = (gradient.cpu() for gradient in gradients)
+    return dict(zip(PARAMETERS, (*geometry, torch.cat([sh_dc, sh_rest], 1), background, means2d), strict=True))
 
 
 def gradients_of(
@@ -78,13 +92,10 @@ def gradients_of(
     if adjoint == TAPE:
         image, found = differentiate_on_tape(workload, upstream)
         return image[rows, columns].cpu(), {name: grad.cpu() for name, grad in found.items()}
-    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
-    background = workload.background.clone().requires_grad_()
-    out = render(leaves, workload.camera, background, options, adjoint)
+    *leaves, background = (tensor.clone().requires_grad_() for tensor in (*workload.gaussians, workload.background))
+    out = render(Gaussians(*leaves), workload.camera, background, options, adjoint)
     found = torch.autograd.grad(out.image, [*leaves, background, out.means2d], upstream)
-    gradients = [*found[:4], torch.cat(found[4:6], 1), *found[6:]]
-    named = {name: grad.cpu() for name, grad in zip(PARAMETERS, gradients, strict=True)}
-    return out.image.detach()[rows, columns].cpu(), named
+    return out.image.detach()[rows, columns].cpu(), _by_parameter(found)
 
 
 def differentiate(workload: Workload, adjoint: str, options: RasterOptions) -> None:

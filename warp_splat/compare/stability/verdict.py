@@ -21,7 +21,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import look
-from warp_splat.compare.truth import for_oracle
+from warp_splat.compare.truth import draw_exactly
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster import api
@@ -136,11 +136,8 @@ def draw_case(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> a
     return api.rasterize(*gaussians[:4], gaussians[4:], *rest, mode, problem.options)
 
 
-def draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Render:
-    """The oracle's render of all rows given."""
-    *geometry, sh_dc, sh_rest = activated(problem, leaves)
-    sh, options = torch.cat([sh_dc, sh_rest], 1), for_oracle(problem.options)
-    return oracle.exact_render(*geometry, sh, problem.camera, leaves["background"], **options)
+def _draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Render:
+    return draw_exactly(activated(problem, leaves), problem.camera, leaves["background"], problem.options)
 
 
 def gradients_by_name(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -167,7 +164,7 @@ def truth(build: Callable[[], Problem]) -> Expected:
     kept = torch.tensor(sorted(set(range(count)) - set(problem.left_out)), dtype=torch.int64)
     drawn = replace(problem, gaussians={name: rows[kept] for name, rows in problem.gaussians.items()})
     leaves = leaves_of(drawn, torch.float64)
-    out = draw_exactly(drawn, leaves)
+    out = _draw_exactly(drawn, leaves)
     upstream = upstream_of(problem, out.fragile)
     gradients = gradients_by_name(out, tuple(weight.double() for weight in upstream), leaves)
     moved_image, moved = _condition(drawn, out, upstream, gradients) if problem.conditioned else (0.0, {})
@@ -204,7 +201,7 @@ def _condition(problem: Problem, out, upstream, gradients) -> tuple[float, dict[
         lens = {key: float(_nudge(np.float64(getattr(camera, key)), rng)) for key in ("fx", "fy", "cx", "cy")}
         rotation = _nudge(camera.rotation, rng)
         nudged = replace(camera, rotation=rotation, translation=-rotation @ camera.center, **lens)
-        other = draw_exactly(replace(problem, camera=nudged), leaves)
+        other = _draw_exactly(replace(problem, camera=nudged), leaves)
         image = max(image, _pixel_errors(other, out)[~out.fragile].max().item())
         for name, value in gradients_by_name(other, tuple(weight.double() for weight in upstream), leaves).items():
             moved[name] = max(moved[name], relative_error(value, gradients[name], problem.gain))
