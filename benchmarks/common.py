@@ -13,7 +13,7 @@ import torch
 
 from warp_splat.evaluation.report import machine
 from warp_splat.runtime import pool
-from warp_splat.text import format_table
+from warp_splat.text import cells_of, format_table
 
 ROOT = Path(__file__).parents[1]
 
@@ -73,9 +73,14 @@ def interleaved(
 
 
 def write_table(
-    name: str, out: Path | None, headers: Sequence, rows: Sequence[Sequence], note: str, data: Mapping | None = None
+    name: str, out: Path | None, headers: Sequence | Mapping, rows: Sequence, note: str, data: Mapping | None = None
 ) -> None:
-    """Print a table; if a folder is given, write it to ``<out>/<name>.md``, and ``data`` or the rows to ``.json``."""
+    """Print a table; if a folder is given, write it to ``<out>/<name>.md``, and ``data`` or the rows to ``.json``.
+
+    Rows are records if ``headers`` says what is shown of one, as for :func:`warp_splat.text.table_of`.
+    """
+    if isinstance(headers, Mapping):
+        headers, rows = list(headers), cells_of(rows, headers)
     table = format_table(headers, rows)
     print(f"\n{table}\n\n{note}\n{machine()}")
     measured = {**({"headers": headers, "rows": rows} if data is None else data), "machine": machine()}

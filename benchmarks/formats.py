@@ -19,26 +19,20 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.command import load_trained_scene, make_picture, options_of, with_refined_cameras
 from warp_splat.runtime import launch
 
-HEADERS = (
-    "scene",
-    "Gaussians",
-    "format",
-    "bytes each",
-    "of the .ply",
-    "renders to its",
-    "test PSNR dB",
-    "write s",
-    "read s",
-)
+COLUMNS = {
+    **{"scene": "{scene}", "Gaussians": "{count}", "format": "`{ending}`", "bytes each": "{each:.1f}"},
+    **{"of the .ply": "1/{share:.1f}", "renders to its": "{close}", "test PSNR dB": "{quality:.2f}"},
+    **{"write s": "{write:.1f}", "read s": "{read:.1f}"},
+}
 LEFT_OUT = {".gltf"}  # holds what a .glb does
 
 
-def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
-    """A row for each format, the .ply first."""
+def measure(scene_path: Path, model: Path, folder: Path) -> list[dict]:
+    """A record for each format, the .ply first."""
     iteration, file, trained = open_model(model)
     scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None)
     scene = with_refined_cameras(scene, str(model), iteration)
-    first, first_bytes, rows = None, 0, []
+    first, first_bytes, records = None, 0, []
     for ending in (ending for ending in FORMATS if ending not in LEFT_OUT):
         path, start = folder / f"a{ending}", time.perf_counter()
         save_gaussians(path, file, lambda _: None)
@@ -53,13 +47,10 @@ def measure(scene_path: Path, model: Path, folder: Path) -> list[tuple]:
         close = "the same" if same else f"{psnr(np.concatenate(renders), first):.1f} dB"
         pairs = zip(renders, scene.test, strict=True)
         quality = np.mean([psnr(image, view.picture, view.mask) for image, view in pairs])
-        count = len(splats.means)
-        share = f"1/{first_bytes / size:.1f}"
-        times = (f"{written - start:.1f}", f"{read - written:.1f}")
-        rows.append(
-            (scene_path.name, count, f"`{ending}`", f"{size / count:.1f}", share, close, f"{quality:.2f}", *times)
-        )
-    return rows
+        found = {"scene": scene_path.name, "count": len(splats.means), "ending": ending, "close": close}
+        found |= {"each": size / len(splats.means), "share": first_bytes / size, "quality": quality}
+        records.append({**found, "write": written - start, "read": read - written})
+    return records
 
 
 def main() -> None:
@@ -69,9 +60,9 @@ def main() -> None:
     launch.prepare("cpu", 0)
     with tempfile.TemporaryDirectory() as folder:
         pairs = zip(arguments.scenes, arguments.models, strict=True)
-        rows = [row for scene, model in pairs for row in measure(scene, model, Path(folder))]
+        records = [found for scene, model in pairs for found in measure(scene, model, Path(folder))]
     note = "Renders of the held-out views as 8-bit pictures, of all formats against those of the `.ply`."
-    write_table("formats", arguments.out, HEADERS, rows, note)
+    write_table("formats", arguments.out, COLUMNS, records, note)
 
 
 if __name__ == "__main__":

@@ -30,21 +30,12 @@ from browser import browser_page
 MILLION = 1_000_000
 WIDTH, HEIGHT, BAR = 1280, 720, 40  # px
 PROGRAM = b"})();</script>"  # ends what the first picture needs
-HEADERS = (
-    "model",
-    "Gaussians",
-    "page MB",
-    "MB to the first picture",
-    "s to it",
-    "s to all",
-    "drawn in motion",
-    "ms a frame",
-    "pixels in a row",
-    "at rest: ms a frame",
-    "sort ms",
-    "motion dB",
-    "first picture dB",
-)
+COLUMNS = {
+    **{"model": "{name}", "Gaussians": "{count}", "page MB": "{size:.1f}", "MB to the first picture": "{begin:.1f}"},
+    **{"s to it": "{first:.1f}", "s to all": "{all:.1f}", "drawn in motion": "{drawn}", "ms a frame": "{frame:.0f}"},
+    **{"pixels in a row": "{detail:.2f}", "at rest: ms a frame": "{still:.0f}", "sort ms": "{sort:.0f}"},
+    **{"motion dB": "{motion:.1f}", "first picture dB": "{early:.1f}"},
+}
 # the clock stops when the card has drawn: reading a pixel waits for it
 HELP = """
 window.pixel = () => {
@@ -103,7 +94,7 @@ def make_models(model: Path, folder: Path) -> dict[str, Path]:
     return {"trained": model, "trained, split": folder / "split", "made up": folder / "made_up.ply"}
 
 
-def measure(name: str, model: Path, folder: Path) -> tuple:
+def measure(name: str, model: Path, folder: Path) -> dict:
     path = folder / "page.html"
     export_html(ExportHtmlConfig(str(model), str(path)))
     size, first_size = path.stat().st_size, path.read_bytes().index(PROGRAM) + len(PROGRAM)
@@ -123,23 +114,12 @@ def measure(name: str, model: Path, folder: Path) -> tuple:
         page.evaluate("moving = false")
         begin = screen_of_first(page, path, folder)
     frame = [np.median([times["frame"] for times in found]) for found in (motion, rest)]
-    row = (
-        name,
-        rest[-1]["drawn"],
-        f"{size / 1e6:.1f}",
-        f"{first_size / 1e6:.1f}",
-        f"{first / 1e3:.1f}",
-        f"{everything:.1f}",
-        f"{motion[-1]['drawn']}",
-        f"{frame[0]:.0f}",
-        f"{motion[-1]['detail']:.2f}",
-        f"{frame[1]:.0f}",
-        f"{rest[-1]['sort']:.0f}",
-        f"{psnr(moving, still):.1f}",
-        f"{psnr(begin, still):.1f}",
-    )
-    print(*row, flush=True)
-    return row
+    found = {"name": name, "count": rest[-1]["drawn"], "size": size / 1e6, "begin": first_size / 1e6}
+    found |= {"first": first / 1e3, "all": everything, "drawn": motion[-1]["drawn"], "frame": frame[0]}
+    found |= {"detail": motion[-1]["detail"], "still": frame[1], "sort": rest[-1]["sort"]}
+    found |= {"motion": psnr(moving, still), "early": psnr(begin, still)}
+    print(found, flush=True)
+    return found
 
 
 def screen_of_first(page, path: Path, folder: Path) -> np.ndarray:
@@ -162,11 +142,11 @@ def main() -> None:
     arguments = parse(__doc__, option("-m", "--model", type=Path, required=True, help="the folder of a trained model"))
     with tempfile.TemporaryDirectory() as folder:
         models = make_models(arguments.model, Path(folder))
-        rows = [measure(name, model, Path(folder)) for name, model in models.items()]
+        records = [measure(name, model, Path(folder)) for name, model in models.items()]
     note = (
         f"Chromium, {WIDTH} x {HEIGHT} px, from disk, WebGL in software. dB: PSNR of the screen against that at rest."
     )
-    write_table("page", arguments.out, HEADERS, rows, note)
+    write_table("page", arguments.out, COLUMNS, records, note)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,11 @@ RUNS = {
     "2 processes, as many images": (2, 1, 1),
     "2 processes, as many steps": (2, 1, 2),
 }
+COLUMNS = {
+    **{"run": "{run}", "images": "{images}", "steps": "{steps}", "PSNR dB": "{PSNR:.2f}", "SSIM": "{SSIM:.4f}"},
+    **{"s of steps": "{of_steps:.0f}", "images/s": "{speed:.1f}", "ms/step": "{ms:.0f}"},
+    **{"Gaussians": "{gaussians}", "wall s": "{seconds:.0f}"},
+}
 SCHEDULE = (
     "iterations",
     "position_lr_max_steps",
@@ -42,8 +47,8 @@ def flags_of(iterations: int) -> list[str]:
     return [word for pair in schedule for word in pair] + ["--max_gaussians", str(defaults["max_gaussians"]), "--eval"]
 
 
-def run(model: Path, processes: int, threads: int, iterations: int) -> tuple:
-    """Train; a row of the table."""
+def run(model: Path, processes: int, threads: int, iterations: int) -> dict:
+    """Train; a record for the table."""
     start = [sys.executable, "-m"]
     if processes > 1:
         start += ["torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "-m"]
@@ -53,17 +58,8 @@ def run(model: Path, processes: int, threads: int, iterations: int) -> tuple:
     )
     (entry,) = json.loads((model / "results.json").read_text()).values()
     seconds = json.loads((model / "history.json").read_text())[-1]["seconds"]
-    return (
-        iterations,
-        iterations // processes,
-        f"{entry['PSNR']:.2f}",
-        f"{entry['SSIM']:.4f}",
-        f"{seconds:.0f}",
-        f"{iterations / seconds:.1f}",
-        f"{1e3 * seconds * processes / iterations:.0f}",
-        entry["gaussians"],
-        f"{entry['seconds']:.0f}",
-    )
+    given = {"images": iterations, "steps": iterations // processes, "of_steps": seconds, "speed": iterations / seconds}
+    return {**entry, **given, "ms": 1e3 * seconds * processes / iterations}
 
 
 def main() -> None:
@@ -72,15 +68,14 @@ def main() -> None:
         MODELS,
         option("--iterations", type=int, default=3000, help="images in all but the last run, an even number"),
     )
-    rows = []
+    records = []
     for number, (name, (processes, threads, factor)) in enumerate(RUNS.items()):
         model = arguments.models.resolve() / str(number)
-        rows.append((name, *run(model, processes, threads, factor * arguments.iterations)))
-    headers = ("run", "images", "steps", "PSNR dB", "SSIM", "s of steps", "images/s", "ms/step", "Gaussians", "wall s")
+        records.append({"run": name, **run(model, processes, threads, factor * arguments.iterations)})
     note = (
         "Embedded scene, held-out views (every 8th); seconds of steps without evaluations and pictures; one run each."
     )
-    write_table("parallel", arguments.out, headers, rows, note)
+    write_table("parallel", arguments.out, COLUMNS, records, note)
 
 
 if __name__ == "__main__":

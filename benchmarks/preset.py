@@ -20,26 +20,15 @@ PHOTOGRAPHS = {
     **{f"full, fast, seed {seed}": ["-r", "1", "--eval", "--preset", "fast", "--seed", f"{seed}"] for seed in (1, 2)},
 }
 EARLY = 60  # s
+COLUMNS = {
+    **{"run": "{run}", "iterations": "{iterations}", f"PSNR dB by {EARLY} s": "{early:.2f}", "PSNR dB": "{PSNR:.2f}"},
+    **{"SSIM": "{SSIM:.4f}", "s of steps": "{of_steps:.0f}", "wall s": "{seconds:.0f}", "Gaussians": "{gaussians}"},
+}
 
 
 def run(model: Path, flags: list[str]) -> tuple[dict, list[dict]]:
     """Train, if that has not been done; the results of the last iteration and the history."""
     return run_training(model, flags), json.loads((model / "history.json").read_text())
-
-
-def row_of(name: str, results: dict, history: list[dict]) -> tuple:
-    """Quality early and in the end, and what it took."""
-    early = [record["psnr"] for record in history if record["seconds"] <= EARLY]
-    return (
-        name,
-        results["iterations"],
-        f"{max(early):.2f}" if early else "",
-        f"{results['PSNR']:.2f}",
-        f"{results['SSIM']:.4f}",
-        f"{history[-1]['seconds']:.0f}",
-        f"{results['seconds']:.0f}",
-        results["gaussians"],
-    )
 
 
 def plot(path: Path, found: dict[str, list[dict]]) -> None:
@@ -62,10 +51,12 @@ def main() -> None:
         runs |= {name: ["-s", arguments.scene.resolve(), *flags] for name, flags in PHOTOGRAPHS.items()}
     folders = {name: arguments.models / name.replace(",", "").replace(" ", "_") for name in runs}
     found = {name: run(folders[name].resolve(), flags) for name, flags in runs.items()}
-    headers = ("run", "iterations", f"PSNR dB by {EARLY} s", "PSNR dB", "SSIM", "s of steps", "wall s", "Gaussians")
-    rows = [row_of(name, *results) for name, results in found.items()]
+    records = []
+    for name, (results, history) in found.items():
+        early = max((record["psnr"] for record in history if record["seconds"] <= EARLY), default=None)
+        records.append({"run": name, **results, "early": early, "of_steps": history[-1]["seconds"]})
     note = "Held-out views; a few of them in the column of the first minute."
-    write_table("preset", arguments.out, headers, rows, note)
+    write_table("preset", arguments.out, COLUMNS, records, note)
     if arguments.out:
         plot(arguments.out / "preset.png", {name: history for name, (_, history) in found.items()})
 

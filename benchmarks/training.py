@@ -15,6 +15,11 @@ from common import MODELS, ROOT, option, parse, write_table
 
 RUNS = {"half": ["-r", "2", "--iterations", "1000"], "full": ["-r", "1", "--iterations", "7000"]}
 STATED = (1000, 3000, 7000)
+COLUMNS = {
+    **{"size": "{size}", "iteration": "{iteration}", "PSNR dB": "{PSNR:.2f}", "SSIM": "{SSIM:.4f}"},
+    **{"s of steps": "{seconds:.0f}", "it/s": "{speed:.1f}", "Gaussians": "{gaussians}"},
+    **{"wall s": "{wall:.0f}", "peak GB": "{peak:.1f}"},
+}
 
 
 def run(scene: Path, model: Path, flags: list[str]) -> None:
@@ -30,39 +35,27 @@ def run(scene: Path, model: Path, flags: list[str]) -> None:
         subprocess.run([sys.executable, "-m", "warp_splat", *render], check=True, cwd=ROOT)
 
 
-def rows_of(name: str, model: Path) -> list[tuple]:
-    """A row for each stated iteration: quality of the saved model, time until then, speed, memory."""
+def records_of(name: str, model: Path) -> list[dict]:
+    """One for each stated iteration: quality of the saved model, time until then, speed, memory."""
     results = json.loads((model / "results.json").read_text())
     history = {record["iteration"]: record for record in json.loads((model / "history.json").read_text())}
-    rows = []
+    records = []
     for iteration in (iteration for iteration in STATED if f"ours_{iteration}" in results):
         entry, record = results[f"ours_{iteration}"], history[iteration]
-        whole = iteration == max(history)
-        rows.append(
-            (
-                name,
-                iteration,
-                f"{entry['PSNR']:.2f}",
-                f"{entry['SSIM']:.4f}",
-                f"{record['seconds']:.0f}",
-                f"{iteration / record['seconds']:.1f}",
-                record["gaussians"],
-                f"{entry['seconds']:.0f}" if whole else "",
-                f"{entry['peak_memory_mb'] / 1024:.1f}" if whole else "",
-            )
-        )
-    return rows
+        whole = {"wall": entry["seconds"], "peak": entry["peak_memory_mb"] / 1024} if iteration == max(history) else {}
+        speed = iteration / record["seconds"]
+        records.append({"size": name, "iteration": iteration, **entry, **record, "speed": speed, **whole})
+    return records
 
 
 def main() -> None:
     arguments = parse(__doc__, option("-s", "--scene", type=Path, required=True), MODELS)
-    rows = []
+    records = []
     for name, flags in RUNS.items():
         run(arguments.scene.resolve(), (arguments.models / name).resolve(), flags)
-        rows += rows_of(name, arguments.models / name)
-    headers = ("size", "iteration", "PSNR dB", "SSIM", "s of steps", "it/s", "Gaussians", "wall s", "peak GB")
+        records += records_of(name, arguments.models / name)
     note = "Held-out views (every 8th). Wall time holds loading, kernels, evaluations, pictures and plots as well."
-    write_table("training", arguments.out, headers, rows, note)
+    write_table("training", arguments.out, COLUMNS, records, note)
 
 
 if __name__ == "__main__":

@@ -70,6 +70,17 @@ INGREDIENTS = {
 }
 
 
+def camera_gradients() -> str:
+    """What those of a pinhole's pose and intrinsics are off by."""
+    parts = ("rotation", "translation", "focal", "principal")
+    lines = [f"| projection | adjoint | {' | '.join(parts)} |", "| --- | --- |" + " ---: |" * len(parts)]
+    found = [row for row in f.rows("cameras_gradients") if row["camera"] == "pinhole, 90 degrees"]
+    for way in dict.fromkeys((row["projection"], row["mode"]) for row in found):
+        errors = {row["parameter"]: float(row["error"]) for row in found if (row["projection"], row["mode"]) == way}
+        lines.append(f"| {' | '.join((*way, *(f'{errors[part]:.1e}' for part in parts)))} |")
+    return "\n".join(lines)
+
+
 def ingredients() -> str:
     """What recipes are made of: the paper, its claim, the gain here, kept or not."""
     lines = ["| ingredient | paper | gain claimed there | measured here | kept |", "| --- | --- | --- | --- | --- |"]
@@ -97,7 +108,13 @@ def exponentials() -> str:
     return "\n".join([*lines, "| a GPU's instruction, for degrees up to 5 | | 2.4e-07 |"])
 
 
-TABLES = {"modes": modes, "adjoint_times": adjoint_times, "ingredients": ingredients, "exponentials": exponentials}
+TABLES = {
+    "modes": modes,
+    "camera_gradients": camera_gradients,
+    "adjoint_times": adjoint_times,
+    "ingredients": ingredients,
+    "exponentials": exponentials,
+}
 
 
 def sentences() -> dict[str, list[tuple]]:

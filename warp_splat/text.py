@@ -47,7 +47,12 @@ def table_of(records: Iterable[Mapping], columns: Mapping[str, str | Callable[[M
 
     A cell whose number is missing, None or NaN, is "-".
     """
-    return format_table(list(columns), [[_cell(record, column) for column in columns.values()] for record in records])
+    return format_table(list(columns), cells_of(records, columns))
+
+
+def cells_of(records: Iterable[Mapping], columns: Mapping[str, str | Callable[[Mapping], object]]) -> list[list]:
+    """The rows of :func:`table_of`."""
+    return [[_cell(record, column) for column in columns.values()] for record in records]
 
 
 def _cell(record: Mapping, column: str | Callable[[Mapping], object]) -> object:
