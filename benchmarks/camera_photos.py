@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from cameras import ANGLE, LEVELS, SHIFT, ZOOM, direction
+from cameras import ANGLE, SHIFT, ZOOM, compared, descend, direction, distance
 from common import TRAINED, parse, write_table
 
 from warp_splat import Camera, CameraParameters
@@ -33,18 +33,15 @@ TITLES = {"direction [degrees]": 0, "place [% of extent]": 0, "focal length [%]"
 HEADERS = ("scene", "photograph", "free", "direction", "place", "fx, fy", "cx, cy")
 
 
-def distance(camera: Camera, right: Camera, extent: float) -> list[float]:
+def errors_of(camera: Camera, right: Camera, extent: float) -> list[float]:
     """Degrees; shares of the extent, of the focal lengths, and of the size, in per cent."""
-    turn = camera.rotation @ right.rotation.T
-    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    place = np.linalg.norm(camera.center - right.center) / extent
-    focal = max(abs(camera.fx / right.fx - 1), abs(camera.fy / right.fy - 1))
+    degrees, place, focal = distance(camera, right)
     middle = max(abs(camera.cx - right.cx) / right.width, abs(camera.cy - right.cy) / right.height)
-    return [float(np.degrees(np.arcsin(sine))), *(100 * float(value) for value in (place, focal, middle))]
+    return [degrees, *(100 * float(value) for value in (place / extent, focal, middle))]
 
 
 def follow(draw, view, extent: float, free: int, seed: int) -> list[list[float]]:
-    """Before every step and at last: the :func:`distance` from the camera that the scene gives."""
+    """Before every step and at last: the :func:`errors_of` from the camera that the scene gives."""
     generator = np.random.default_rng(seed)
     start = np.concatenate([direction(generator, ANGLE), direction(generator, SHIFT), [ZOOM - 1] * 2, [ASIDE] * 2])
     start[6 + free :] = 0.0
@@ -61,20 +58,15 @@ def follow(draw, view, extent: float, free: int, seed: int) -> list[list[float]]
 
     photo = torch.from_numpy(view.image).float().permute(2, 0, 1) / 255
     for shrink, steps, rate, last in STAGES:
-        target = torch.nn.functional.avg_pool2d(photo, shrink)
-        camera = view.camera.resized(target.shape[2], target.shape[1])
-        adam = torch.optim.Adam([numbers], rate, betas=(0.9, 0.9))
-        scheduler = torch.optim.lr_scheduler.ExponentialLR(adam, (last / rate) ** (1 / steps))
-        for _ in range(steps):
-            errors.append(distance(learned(view.camera).camera, view.camera, extent))
-            difference = draw(learned(camera)).permute(2, 0, 1) - target
-            pooled = [torch.nn.functional.avg_pool2d(difference, level) for level in LEVELS]
-            adam.zero_grad()
-            torch.stack([picture.square().mean() for picture in pooled]).sum().backward()
-            numbers.grad *= kept
-            adam.step()
-            scheduler.step()
-    return [*errors, distance(learned(view.camera).camera, view.camera, extent)]
+        target = torch.nn.functional.avg_pool2d(photo, shrink).permute(1, 2, 0)
+        camera = view.camera.resized(target.shape[1], target.shape[0])
+        errors += descend(
+            numbers,
+            lambda: compared(draw(learned(camera)), target),  # noqa: B023 - called in this round
+            lambda: errors_of(learned(view.camera).camera, view.camera, extent),
+            *(steps, rate, last, kept),
+        )
+    return [*errors, errors_of(learned(view.camera).camera, view.camera, extent)]
 
 
 def follow_all(model: Path) -> dict[tuple[str, str, str], list[list[float]]]:

@@ -7,6 +7,7 @@ and follows the gradients of its pose and of fx and fy until it sees the picture
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -71,20 +72,33 @@ def recover(seed: int, steps: int = STEPS) -> list[tuple[float, float, float]]:
         target = rasterize(*gaussians, right).image
     wrong = np.concatenate([direction(generator, ANGLE), direction(generator, SHIFT)])
     numbers = torch.tensor([*wrong, np.log(ZOOM), np.log(ZOOM)], requires_grad=True)
-    adam = torch.optim.Adam([numbers], RATE, betas=(0.9, 0.9))
-    scheduler = torch.optim.lr_scheduler.ExponentialLR(adam, (LAST_RATE / RATE) ** (1 / steps))
-    middle, errors = torch.tensor([right.cx, right.cy]), []
-    for _ in range(steps):
+    middle = torch.tensor([right.cx, right.cy])
+
+    def learned() -> CameraParameters:
         focal = torch.tensor([right.fx, right.fy]) * numbers[6:].exp()
-        parameters = CameraParameters(right, numbers[:6], torch.cat([focal, middle]))
-        errors.append(distance(parameters.camera, right))
-        loss = compared(rasterize(*gaussians, parameters).image, target)
+        return CameraParameters(right, numbers[:6], torch.cat([focal, middle]))
+
+    def loss() -> torch.Tensor:
+        return compared(rasterize(*gaussians, learned()).image, target)
+
+    errors = descend(numbers, loss, lambda: distance(learned().camera, right), steps, RATE, LAST_RATE)
+    return [*errors, distance(learned().camera, right)]
+
+
+def descend(
+    numbers: torch.Tensor, loss: Callable, watched: Callable, steps: int, rate: float, last: float, kept=1.0
+) -> list:
+    """What is ``watched`` before each of the steps of Adam, from one rate to another, with a share of the gradient."""
+    adam, found = torch.optim.Adam([numbers], rate, betas=(0.9, 0.9)), []
+    scheduler = torch.optim.lr_scheduler.ExponentialLR(adam, (last / rate) ** (1 / steps))
+    for _ in range(steps):
+        found.append(watched())
         adam.zero_grad()
-        loss.backward()
+        loss().backward()
+        numbers.grad *= kept
         adam.step()
         scheduler.step()
-    focal = torch.tensor([right.fx, right.fy]) * numbers[6:].exp()
-    return [*errors, distance(CameraParameters(right, numbers[:6], torch.cat([focal, middle])).camera, right)]
+    return found
 
 
 def compared(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
