@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
 from warp_splat.compare import oracle, truth
-from warp_splat.compare.exact_camera import exact_camera
+from warp_splat.compare.exact_motion import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.raster import project
 from warp_splat.raster.differences import INPUTS

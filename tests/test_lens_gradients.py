@@ -12,7 +12,7 @@ from scenes import SCENES
 
 from warp_splat import Camera, CameraParameters, InputError, Lens, RasterOptions, check_gradients, rasterize
 from warp_splat.compare import exact_lenses, oracle, truth
-from warp_splat.compare.exact_camera import exact_camera
+from warp_splat.compare.exact_motion import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.lenses.formulas import MODELS
 from warp_splat.raster import project as projection

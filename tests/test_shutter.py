@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, check_gradients, rasterize
-from warp_splat.compare import exact_shutter, oracle, truth
-from warp_splat.compare.exact_camera import exact_camera
+from warp_splat.compare import exact_motion, oracle, truth
+from warp_splat.compare.exact_motion import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.formats import model_folder
 from warp_splat.kernels.project import affine
@@ -135,7 +135,7 @@ def test_beyond_the_picture_the_motion_ends_and_that_alone_is_what_an_oracle_wit
         return float((out.image - wanted.image)[sure].detach().abs().max()), far
 
     assert max(off()) < ERROR
-    monkeypatch.setattr(exact_shutter, "LATEST", 1e9)
+    monkeypatch.setattr(exact_motion, "LATEST", 1e9)
     image, gradient = off()
     assert 1e-3 < image < 0.05 and 1e-3 < gradient < 0.2
 

@@ -100,24 +100,18 @@ def unscented(points, axes, camera, near=NEAR):
         camera: that looks at them.
         near: points are seen as if no nearer.
     """
-    alpha, beta, kappa, n = 1.0, 2.0, 0.0, 3
-    scale = alpha**2 * (n + kappa) - n
-    offsets = ((n + scale) ** 0.5 * axes).transpose(1, 2)
+    offsets = (3**0.5 * axes).transpose(1, 2)  # of alpha = 1, beta = 2, kappa = 0 in three dimensions
     sigma_points = torch.cat([points[:, None], points[:, None] + offsets, points[:, None] - offsets], 1)  # [N, 7, 3]
     if is_wide(camera.lens):
         _, visible = depths_of(sigma_points, camera.lens)
         sigma_points = torch.where(visible[..., None], sigma_points, points[:, None])
     else:
-        nearest = torch.cat([sigma_points[..., :2], sigma_points[..., 2:].clamp_min(near)], -1)
-        sigma_points = nearest
+        sigma_points = torch.cat([sigma_points[..., :2], sigma_points[..., 2:].clamp_min(near)], -1)
     places = on_image(sigma_points, camera)
     if camera.lens is not None and camera.lens.model == AROUND:
         turns = ((places[..., 0] - places[:, :1, 0]) / camera.width).detach().round()
         places = torch.stack([places[..., 0] - camera.width * turns, places[..., 1]], -1)
-    weights = torch.full((7,), 0.5 / (n + scale), dtype=torch.float64)
-    of_mean, of_covariance = weights.clone(), weights.clone()
-    of_mean[0] = scale / (n + scale)
-    of_covariance[0] = scale / (n + scale) + 1 - alpha**2 + beta
+    of_mean, of_covariance = (torch.tensor([center, *[1 / 6] * 6], dtype=torch.float64) for center in (0.0, 2.0))
     mean = (of_mean[:, None] * places).sum(1)
     off = places - mean[:, None]
     return mean.clone(), torch.einsum("p,npi,npj->nij", of_covariance, off, off)

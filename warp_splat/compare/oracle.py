@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warp_splat.compare import exact_lenses, exact_shutter
+from warp_splat.compare import exact_lenses, exact_motion
 
 BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.2  # Gaussians nearer than this are culled
@@ -150,7 +150,7 @@ def exact_splats(
     world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
     points, seen = means @ world_to_camera.T + translation, world_to_camera
     if getattr(camera, "shutter", None):
-        points, along = exact_shutter.exposed(points, camera, near)
+        points, along = exact_motion.exposed(points, camera, near)
         seen = along @ world_to_camera
     depth, live = exact_lenses.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
     live = live & (depth > near) & (quats.norm(dim=1) > 0)
