@@ -26,7 +26,7 @@ def option(*names: str, **how):
 REPEATS = option("--repeats", type=int, default=7)
 MODELS = option("--models", type=Path, required=True, help="folder for the models")
 TRAINED = option("-m", "--models", type=Path, action="append", required=True, help="a trained model; may come again")
-PHOTOGRAPHS = option("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
+SCENE = option("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
 
 
 def parse(doc: str | None, *options: tuple) -> argparse.Namespace:

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import torch
-from common import MODELS, interleaved, parse, write_table
+from common import MODELS, SCENE, interleaved, parse, write_table
 from preset import run
 
 from warp_splat.runtime import launch
@@ -51,7 +51,7 @@ def time_steps() -> dict[str, float]:
 
 
 def main() -> None:
-    arguments = parse(__doc__, MODELS, PHOTOGRAPHS)
+    arguments = parse(__doc__, MODELS, SCENE)
     scenes = {"embedded": FLAGS}
     if arguments.scene:
         scenes["quarter"] = ["-s", f"{arguments.scene.resolve()}", *PHOTOGRAPHS]

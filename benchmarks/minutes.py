@@ -15,7 +15,7 @@ import time
 import tomllib
 from pathlib import Path
 
-from common import MODELS, PHOTOGRAPHS, ROOT, parse, write_table
+from common import MODELS, ROOT, SCENE, parse, write_table
 
 from warp_splat.config import CORES
 from warp_splat.formats.png import load_png
@@ -57,7 +57,7 @@ def row_of(name: str, minutes: float, found: dict) -> tuple:
 
 
 def main() -> None:
-    arguments = parse(__doc__, MODELS, PHOTOGRAPHS)
+    arguments = parse(__doc__, MODELS, SCENE)
     flags = {"embedded": []}
     if arguments.scene:
         flags["half"] = ["-s", arguments.scene.resolve(), "-r", "2", "--eval"]

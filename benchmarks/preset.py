@@ -9,9 +9,10 @@ whose results are there already is not repeated. The models of benchmarks/traini
 import json
 from pathlib import Path
 
-from common import MODELS, parse, run_training, write_table
+from common import MODELS, SCENE, parse, run_training, write_table
 
-from warp_splat.evaluation.report import BLUE, ORANGE, new_figure, plain_axes, save_figure
+from warp_splat.compare.plots import Panel, draw
+from warp_splat.evaluation.report import BLUE, ORANGE
 
 EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}
 PHOTOGRAPHS = {
@@ -33,19 +34,17 @@ def run(model: Path, flags: list[str]) -> tuple[dict, list[dict]]:
 
 def plot(path: Path, found: dict[str, list[dict]]) -> None:
     """PSNR over seconds, a panel per scene."""
-    scenes = list(dict.fromkeys(name.split(",")[0] for name in found))
-    figure = new_figure(5 * len(scenes), 3.2, "constrained")
-    for axes, scene in zip(figure.subplots(1, len(scenes), squeeze=False)[0], scenes, strict=True):
+    panels = []
+    for scene in dict.fromkeys(name.split(",")[0] for name in found):
+        panels.append(panel := Panel(f"{scene}: PSNR [dB]", "seconds of training"))
         for name, color, label in ((scene, BLUE, "default"), (f"{scene}, fast", ORANGE, "--preset fast")):
             seconds, quality = zip(*((record["seconds"], record["psnr"]) for record in found[name]), strict=True)
-            axes.plot(seconds, quality, color=color, marker="o", markersize=3, label=label)
-        plain_axes(axes, f"{scene}: PSNR [dB] over seconds of training")
-        axes.legend(frameon=False, fontsize=9, loc="lower right")
-    save_figure(figure, path)
+            panel.marks(label, seconds, quality, (color, "o"), ls="-")
+    draw(path, panels, len(panels), 2.4, xscale="linear", yscale="linear")
 
 
 def main() -> None:
-    arguments = parse(__doc__, MODELS, PHOTOGRAPHS)
+    arguments = parse(__doc__, MODELS, SCENE)
     runs = dict(EMBEDDED)
     if arguments.scene:
         runs |= {name: ["-s", arguments.scene.resolve(), *flags] for name, flags in PHOTOGRAPHS.items()}

@@ -21,8 +21,9 @@ import torch
 from common import ROOT, option, parse, write_table
 from made_up import make_trainer
 
+from warp_splat.compare.plots import Panel, draw
 from warp_splat.config import TILE, RasterOptions
-from warp_splat.evaluation.report import BLUE, INK, ORANGE, new_figure, plain_axes, save_figure
+from warp_splat.evaluation.report import BLUE, INK, ORANGE
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch, timers
@@ -191,26 +192,17 @@ def stage_exponents(found: dict[str, list[dict]]) -> list[tuple]:
 
 def plot(path: Path, found: dict[str, list[dict]]) -> None:
     """Time above, memory below, over what each sweep varies; the forecast as open circles."""
-    figure = new_figure(10.0, 5.2, layout="constrained")
-    axes = figure.subplots(2, len(SWEEPS))
-    for column, (sweep, (title, _)) in enumerate(SWEEPS.items()):
-        points = found[sweep]
-        x = [point[sweep] for point in points]
-        for row, (key, name, color) in enumerate((("ms", "ms per step", BLUE), ("added", "MiB per step", ORANGE))):
-            panel = axes[row][column]
-            y = [point[key] for point in points]
-            plain_axes(panel, f"{name}: exponent {exponent(points, sweep, key):.2f}")
-            panel.set_xlabel(title, fontsize=9)
-            panel.set_xscale("log")
-            panel.set_yscale("log")
-            panel.set_ylim(10 ** math.floor(math.log10(min(y))), 10 ** math.ceil(math.log10(max(y))))
-            panel.yaxis.set_minor_formatter("")
-            panel.plot(x, y, color=color, marker="o", markersize=4, linewidth=1.8)
+    panels = []
+    for key, name, color in (("ms", "ms per step", BLUE), ("added", "MiB per step", ORANGE)):
+        for sweep, (title, _) in SWEEPS.items():
+            points = found[sweep]
+            x = [point[sweep] for point in points]
+            panels.append(panel := Panel(f"{name}: exponent {exponent(points, sweep, key):.2f}", title))
+            panel.marks("", x, [point[key] for point in points], (color, "o"), ls="-")
             if key == "added":
                 told = [point["added"] + point["forecast"] - point["peak"] for point in points]
-                panel.plot(x, told, "o", color=INK, markerfacecolor="none", markersize=8, label="forecast")
-                panel.legend(frameon=False, fontsize=8, loc="lower right")
-    save_figure(figure, path)
+                panel.marks("forecast", x, told, (INK, "o"), markerfacecolor="none", markersize=8)
+    draw(path, panels, len(SWEEPS), 2.3)
 
 
 def main() -> None:
