@@ -11,7 +11,7 @@ from pathlib import Path
 
 from common import MODELS, SCENE, parse, run_training, write_table
 
-from warp_splat.compare.plots import Panel, draw
+from warp_splat.compare.plots import Panel, draw_panels
 from warp_splat.evaluation.report import BLUE, ORANGE
 
 EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}
@@ -40,7 +40,7 @@ def plot(path: Path, found: dict[str, list[dict]]) -> None:
         for name, color, label in ((scene, BLUE, "default"), (f"{scene}, fast", ORANGE, "--preset fast")):
             seconds, quality = zip(*((record["seconds"], record["psnr"]) for record in found[name]), strict=True)
             panel.marks(label, seconds, quality, (color, "o"), ls="-")
-    draw(path, panels, len(panels), 2.4, xscale="linear", yscale="linear")
+    draw_panels(path, panels, len(panels), 2.4, xscale="linear", yscale="linear")
 
 
 def main() -> None:

@@ -21,7 +21,7 @@ import torch
 from common import ROOT, option, parse, write_table
 from made_up import make_trainer
 
-from warp_splat.compare.plots import Panel, draw
+from warp_splat.compare.plots import Panel, draw_panels
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, INK, ORANGE
 from warp_splat.raster.drivers import CPU
@@ -202,7 +202,7 @@ def plot(path: Path, found: dict[str, list[dict]]) -> None:
             if key == "added":
                 told = [point["added"] + point["forecast"] - point["peak"] for point in points]
                 panel.marks("forecast", x, told, (INK, "o"), markerfacecolor="none", markersize=8)
-    draw(path, panels, len(SWEEPS), 2.3)
+    draw_panels(path, panels, len(SWEEPS), 2.3)
 
 
 def main() -> None:

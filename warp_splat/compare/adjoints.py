@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.compare.truth import TAPE, Error, Truth, compute_truth, differentiate, errors_of, gradients_of
+from warp_splat.compare.truth import TAPE, Error, Truth, compute_truth, errors_of, gradients_of, run_passes
 from warp_splat.compare.workloads import CAPS, Workload
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
@@ -109,7 +109,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
     if variant.name != TAPE:  # whose arrays are Warp's
-        result.memory = peak_of(lambda: differentiate(workload, variant.adjoint, options), workload.device)
+        result.memory = peak_of(lambda: run_passes(workload, variant.adjoint, options), workload.device)
     return result
 
 
@@ -121,7 +121,7 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
     while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
         for variant in runnable:
             with timers.profile() as stages:
-                differentiate(workload, variant.adjoint, variant.options(workload))
+                run_passes(workload, variant.adjoint, variant.options(workload))
             stages_of[variant].append(dict(stages))
         rounds += 1
     for variant, result in runnable.items():
@@ -214,14 +214,14 @@ def knob_table(measurements: Sequence[Measurement]) -> str:
     found = []
     for item in measurements:
         name, error = item.worst
-        relative = item.both / default_of(measurements, item).both
+        relative = item.both / knob_default(measurements, item).both
         found.append({**_shown(item), "image": item.image_error, "error": error, "of": name, "relative": relative})
     errors = {"image error": "{image:.1e}", "gradient error": "{error:.1e}", "of": "{of}"}
     times = {"forward ms": "{forward}", "backward ms": "{backward}", "x default": "{relative:.2f}"}
     return table_of(found, {"scene": "{scene}", "setting": "{variant}", **errors, **times})
 
 
-def default_of(measurements: Sequence[Measurement], item: Measurement) -> Measurement:
+def knob_default(measurements: Sequence[Measurement], item: Measurement) -> Measurement:
     """The same knob at its default, on the same scene."""
     knob = item.variant.split()[0]
     here = (other for other in measurements if other.scene == item.scene and other.variant.split()[0] == knob)

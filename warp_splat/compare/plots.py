@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator, NullLocator
 
-from warp_splat.compare.adjoints import Measurement, default_of
+from warp_splat.compare.adjoints import Measurement, knob_default
 from warp_splat.compare.knobs import KNOBS
 from warp_splat.compare.workloads import CANDIDATES
 from warp_splat.evaluation import report
@@ -65,7 +65,7 @@ class Panel:
         self.line(name, x, y, **{"color": look[0], "marker": look[1], "markersize": 5, "ls": "", **style})
 
 
-def draw(path: Path, panels: Sequence[Panel], columns: int, height: float, y: str = "", **shared: Any) -> None:
+def draw_panels(path: Path, panels: Sequence[Panel], columns: int, height: float, y: str = "", **shared: Any) -> None:
     """Panels in rows of ``height`` inches under one legend."""
     figure, grid = report.new_panels(0.8 + height * -(-len(panels) // columns), -(-len(panels) // columns), columns)
     handles = {}
@@ -106,7 +106,7 @@ def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
             else:
                 panel.marks(item.variant, *place, STYLES[item.variant])
         panels.append(panel)
-    draw(path, panels, 3, 2.0, "relative error of the worst gradient")
+    draw_panels(path, panels, 3, 2.0, "relative error of the worst gradient")
 
 
 def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
@@ -117,7 +117,7 @@ def plot_memory(path: Path, measurements: Sequence[Measurement]) -> None:
         points = [(n, of[key] / 2**20) for n in CANDIDATES if (key := (f"{n} layers", variant)) in of]
         if points:
             panel.marks(variant, *np.array(points).T, STYLES[variant], ls="-", linewidth=1.2)
-    draw(path, [panel], 1, 2.8)
+    draw_panels(path, [panel], 1, 2.8)
 
 
 def plot_stages(path: Path, measurements: Sequence[Measurement], modes: Sequence[str]) -> None:
@@ -148,7 +148,7 @@ def plot_knobs(path: Path, measurements: Sequence[Measurement]) -> None:
             panel = Panel(f"{scene}: error of the {what}", "time of the pixel loop, default (*) = 1", ticks=True)
             for knob, style in zip(KNOBS, STYLES.values(), strict=False):
                 turned = [item for item in here if item.variant.startswith(f"{knob} ")]
-                times = [item.both / default_of(here, item).both for item in turned]
+                times = [item.both / knob_default(here, item).both for item in turned]
                 errors = [(item.image_error or 0.0) if what == "image" else item.worst[1] for item in turned]
                 errors = [max(error, LEAST) for error in errors]
                 panel.marks(knob, times, errors, style, ls="-", lw=0.8)
@@ -156,7 +156,7 @@ def plot_knobs(path: Path, measurements: Sequence[Measurement]) -> None:
                     if place[0] > 1.2 or place[1] > 1e-5:  # the others lie on one spot
                         panel.notes.append((tuple(place), item.variant.removeprefix(f"{knob} "), (3, 3), "left"))
             panels.append(panel)
-    draw(path, panels, 2, 2.8)
+    draw_panels(path, panels, 2, 2.8)
 
 
 def plot_maps(

@@ -275,7 +275,7 @@ def plot_modes(path: Path, runs: Sequence[Trained], modes: Sequence[str]) -> Non
                 panel.line("", x, y, color=color, lw=0.5, alpha=0.5)
             if curves:
                 panel.line(mode, *np.mean(curves, 0), ls=dash, color=color, lw=1.8)
-    plots.draw(path, panels, 2, 2.8, xscale="linear", yscale="linear")
+    plots.draw_panels(path, panels, 2, 2.8, xscale="linear", yscale="linear")
 
 
 def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Trained]) -> None:

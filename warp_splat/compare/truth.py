@@ -98,7 +98,7 @@ def gradients_of(
     return out.image.detach()[rows, columns].cpu(), _by_parameter(found)
 
 
-def differentiate(workload: Workload, adjoint: str, options: RasterOptions) -> None:
+def run_passes(workload: Workload, adjoint: str, options: RasterOptions) -> None:
     """A forward and a backward pass over the whole image, to be timed."""
     if adjoint == TAPE:
         differentiate_on_tape(workload)

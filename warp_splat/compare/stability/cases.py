@@ -119,4 +119,4 @@ def plot(path: Path, rows: Sequence[Row]) -> None:
         needle.marks(label, arithmetic.RATIOS, errors, plots.STYLES[style], ls="-")
     needle.line("", arithmetic.RATIOS, [1.0] * len(arithmetic.RATIOS), color=report.INK, ls="--")
     needle.notes.append(((arithmetic.RATIOS[0], 1.0), "no digit right", (0, 4), "left"))
-    plots.draw(path, [chain, needle], 2, 2.8)
+    plots.draw_panels(path, [chain, needle], 2, 2.8)

@@ -105,7 +105,7 @@ def enclosed(options: RasterOptions) -> Problem:
     return Problem(tensors(arrays), camera, options, left_out=tuple(range(8)))
 
 
-def seen_by(camera: Camera, seed: int, options: RasterOptions | None = None, **ranges) -> Problem:
+def seen_through(camera: Camera, seed: int, options: RasterOptions | None = None, **ranges) -> Problem:
     """Ordinary Gaussians that an odd camera sees."""
     return Problem(tensors(cloud(seed, 60, camera, **ranges)), camera, options or RasterOptions())
 
@@ -156,7 +156,7 @@ TABLE: dict[str, dict[str, tuple[str, Callable[[], Problem]]]] = {
     "camera": {
         "far_1e6": (
             "means and camera 1e6 from the origin: as in float64",
-            lambda: seen_by(look(**FAR), 34, depth=(50.0, 400.0)),
+            lambda: seen_through(look(**FAR), 34, depth=(50.0, 400.0)),
         ),
         "depth_1e-6_1e6": (
             "up to 0.2 left out, the rest as in float64",
@@ -171,11 +171,11 @@ TABLE: dict[str, dict[str, tuple[str, Callable[[], Problem]]]] = {
             partial(enclosed, ELLIPSOID),
         ),
         **{
-            f"fov_{degrees}{kind}": ("as in float64", partial(seen_by, look(fov=degrees), 37, options))
+            f"fov_{degrees}{kind}": ("as in float64", partial(seen_through, look(fov=degrees), 37, options))
             for kind, (options, angles) in FIELDS.items()
             for degrees in angles
         },
-        "principal_outside": ("as in float64", lambda: seen_by(look(**OFF), 38)),
+        "principal_outside": ("as in float64", lambda: seen_through(look(**OFF), 38)),
         "beside": ("the Jacobian's slope is clamped: as in float64", beside),
         **{f"size_{w}x{h}": (SIZE, partial(size, w, h)) for w, h in ((1, 1), (1, 20_000), (20_000, 1))},
     },

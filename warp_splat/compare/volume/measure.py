@@ -200,4 +200,4 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
         theory, color = record["theory"], media.METHODS[record["method"]][3]
         panel.line("", record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, lw=1.4)
         panel.line("stability limit for constant tau", [theory] * 2, [1e-16, 1e3], color=INK, lw=1, ls="--")
-    plots.draw(path, panels, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
+    plots.draw_panels(path, panels, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
