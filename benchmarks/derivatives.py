@@ -20,7 +20,14 @@ _KEPT = ("cpu/taped.replay_front_of_kept", "cpu/taped.adj_front_of_kept")
 
 #: Rules: functions that state a derivative or an inverse. Of overloads, one is counted.
 RULES = {
-    "manual": ("step.make_manual", "step.geometry_from_moments", "splat.adj_alpha_blend", "splat.odds_of", *_CLAMP),
+    "manual": (
+        "step.adj_step",
+        "step.manual",
+        "step.geometry_from_moments",
+        "splat.adj_alpha_blend",
+        "splat.odds_of",
+        *_CLAMP,
+    ),
     "stepwise": ("splat.odds_of", *_EXP, *_ROOT),
     "reversible": (*_BEGIN, *_UNDO, *_EXP, *_READ),
     "stored": (*_BEGIN, *_KEPT, *_EXP, *_READ),
@@ -32,8 +39,8 @@ _KNOWN = ("falloff.exp2_known", "step.opaque")
 _LOOP = ("cpu/adjoint.adj_blend", "cpu/adjoint.folded")
 _WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "cpu/taped.fall_value", *_KNOWN)
 PLUMBING = {
-    "manual": (*_LOOP, "cpu/adjoint._make_manual_body"),
-    "stepwise": (*_LOOP, "cpu/adjoint._make_stepwise_body", "step.make_stepwise", *_KNOWN),
+    "manual": (*_LOOP, "step.manual"),
+    "stepwise": (*_LOOP, "step.stepwise", "step.step", *_KNOWN),
     "reversible": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of"),
     "stored": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of_kept"),
     "generated": ("cpu/taped.walk", "cpu/taped.begin", "cpu/taped.front_of"),

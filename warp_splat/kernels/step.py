@@ -1,8 +1,8 @@
 """The adjoint of one step of the blend, for one pixel or for lanes: by hand, or differentiated by Warp.
 
-Both drivers' reverse loops call one of the two; what they share with the loops that Warp differentiates whole is here,
-too. ``number`` is float or vec16. The step is sliced so that the Gaussian is computed at one place of a kernel
-(:mod:`warp_splat.kernels.falloff`).
+The reverse loops by hand, of either driver, of the color and of channels beside it, call :func:`make_reverse_step`'s.
+What they share with the loops that Warp differentiates whole is here, too. ``number`` is float or vec16. The step is
+sliced so that the Gaussian is computed at one place of a kernel (:mod:`warp_splat.kernels.falloff`).
 """
 
 import functools
@@ -11,9 +11,10 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.falloff import LN_2, LOG2_E, make_falloff
-from warp_splat.kernels.simd import fill, fma, inner, times, vec16, where_less
-from warp_splat.kernels.splat import BlendVariant, adj_alpha_blend, adj_alpha_of, alpha_of, exponent, odds_of
+from warp_splat.kernels.falloff import LN_2, LOG2_E, Falloff, make_falloff
+from warp_splat.kernels.simd import LANES, fill, fma, inner, times, vec16, where_less
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.splat import adj_alpha_blend, adj_alpha_of, alpha_of, exponent, odds_of
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -49,6 +50,18 @@ def conic_from_root(adj_root: wp.vec3, root: wp.vec3):
 
 
 @wp.func
+def geometry_from_root(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
+    """dL/d(mean, conic) from sums over pixels of the gradients of mean and root."""
+    return s, conic_from_root(wp.vec3(xx, xy, yy), root)
+
+
+@wp.func
+def geometry_from_magnitudes(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
+    """Sums over pixels of |dL/dmean|, from their shares by dL/dq; nothing of the conic."""
+    return 2.0 * LN_2 * opacity * s, wp.vec3(0.0)
+
+
+@wp.func
 def geometry_from_moments(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
     """dL/d(mean, conic) from sums over pixels of d and d d', weighted by dL/dopacity."""
     adj_u = -2.0 * LN_2 * opacity * (root[0] * s[0] + root[1] * s[1])
@@ -59,93 +72,124 @@ def geometry_from_moments(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.
     )
 
 
+class ReverseStep(NamedTuple):
+    """One Gaussian and one pixel, or sixteen, in a reverse loop.
+
+    pixel(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit):
+        t: transmittance behind. adj_t: dL/dT behind, by hand times T. lit: what the pixel's gradient says of the
+        channels, color . u.
+        -> T in front, that in front, the weight, and what to sum over pixels, in the columns before the channels'.
+    geometry(s, xx, xy, yy, root, opacity):
+        What these sums, the first two in one, say of mean and conic.
+    """
+
+    pixel: wp.Function
+    geometry: wp.Function
+
+
 @functools.cache
-def make_manual(falloff: int | None, number: type) -> wp.Function:
-    """The adjoint of a step by hand (top of :mod:`warp_splat.kernels.splat`), of the Gaussian."""
-    fall_at = make_falloff(falloff).value
+def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) -> ReverseStep:
+    """By hand (top of :mod:`warp_splat.kernels.splat`), or, ``stepwise``, by Warp.
+
+    By ``absolute``, sums are of magnitudes of what each pixel says of the mean, and no others (Ye et al. 2024).
+    """
+    vec_sums = wp.types.vector(length=CHANNEL, dtype=float)
+    if number is vec16:
+        vec_sums = wp.types.matrix(shape=(CHANNEL, LANES), dtype=float)
+    fall_at, step = make_falloff(falloff).value, make_step(falloff, number)
 
     @wp.func
     def adj_step(
-        z: number,
-        opacity: float,
-        t: number,  # behind
-        behind: number,  # T dL/dT, behind
-        alphas: wp.vec2,
-        here: number,
-        walked: number,
-        lit: number,  # color . u
-    ):
-        """T in front, T dL/dT in front, the weight, and dL/dopacity of every pixel (times opacity: -dL/dq)."""
-        fall = fall_at(z)
-        raw = where_less(here, walked, fall * opacity, fill(-1.0, z))
+        dx: number, dy: number, root: wp.vec3, opacity: float,
+        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
+    ):  # fmt: skip
+        """In front; the weight, and dL/dopacity of every pixel (times opacity: -dL/dq)."""
+        fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
+        raw = where_less(here, walked, fall * opacity, fill(-1.0, dx))
         odds = odds_of(alpha_of(raw, alphas))
         w = times(t, odds)
         front = fma(t, odds, t)
-        adj_raw = adj_alpha_of(raw, alphas, adj_alpha_blend(front, odds, behind, lit))
-        return front, fma(w, lit, behind), w, times(adj_raw, fall)
+        adj_raw = adj_alpha_of(raw, alphas, adj_alpha_blend(front, odds, adj_t, lit))
+        return front, fma(w, lit, adj_t), w, times(adj_raw, fall)
 
-    return adj_step
+    @wp.func
+    def manual(
+        dx: number, dy: number, root: wp.vec3, opacity: float,
+        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
+    ):  # fmt: skip
+        front, adj_front, w, adj_opacity = adj_step(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit)
+        x = times(adj_opacity, dx)
+        y = times(adj_opacity, dy)
+        sums = vec_sums()
+        sums[MEAN_X] = x
+        sums[MEAN_Y] = y
+        sums[XX] = times(x, dx)
+        sums[XY] = times(x, dy)
+        sums[YY] = times(y, dy)
+        sums[OPACITY] = adj_opacity
+        return front, adj_front, w, sums
 
+    @wp.func
+    def absolute(
+        dx: number, dy: number, root: wp.vec3, opacity: float,
+        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
+    ):  # fmt: skip
+        front, adj_front, w, adj_opacity = adj_step(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit)
+        adj_u = times(fma(dx, root[0], times(dy, root[1])), adj_opacity)
+        adj_x = times(adj_u, root[0])
+        adj_y = fma(adj_u, root[1], times(times(times(dy, root[2]), adj_opacity), root[2]))
+        sums = vec_sums()
+        sums[MEAN_X] = wp.max(adj_x, -adj_x)
+        sums[MEAN_Y] = wp.max(adj_y, -adj_y)
+        return front, adj_front, w, sums
 
-class Stepwise(NamedTuple):
-    """A step for wp.grad, the struct that it is differentiated by, and what recovers the state in front of it."""
+    @wp.func
+    def stepwise(
+        dx: number, dy: number, root: wp.vec3, opacity: float,
+        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
+    ):  # fmt: skip
+        fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
+        odds = odds_of(opaque(fall * opacity, alphas, here, walked))
+        front = fma(t, odds, t)
+        sums = vec_sums()
+        x, y, xx, xy, yy, adj_opacity, w, _fall, adj_front, _behind, _alphas, _here, _walked = wp.grad(step)(
+            dx, dy, fill(root[0], dx), fill(root[1], dx), fill(root[2], dx), fill(opacity, dx), lit,
+            fall, front, adj_t, alphas, here, walked,
+        )  # fmt: skip
+        sums[MEAN_X] = x
+        sums[MEAN_Y] = y
+        sums[XX] = xx
+        sums[XY] = xy
+        sums[YY] = yy
+        sums[OPACITY] = adj_opacity
+        return front, adj_front, w, sums
 
-    Parcel: type
-    undo: wp.Function
-    step: wp.Function
+    return {
+        "manual": ReverseStep(manual, geometry_from_moments),
+        "absolute": ReverseStep(absolute, geometry_from_magnitudes),
+        "stepwise": ReverseStep(stepwise, geometry_from_root),
+    }[mode]
 
 
 @functools.cache
-def make_stepwise(variant: BlendVariant, number: type) -> Stepwise:
+def make_step(falloff: Falloff | int | None, number: type) -> wp.Function:
     """A step whose adjoint is wp.grad(step), as in the rasterizer written in Slang (Bangaru et al. 2023).
 
     A kernel may call a function that calls wp.grad, but no deeper: Warp 1.19 emits the functions in the wrong order.
     """
-    (fall_at, fall_known, _), CHANNELS = make_falloff(variant.falloff), variant.channels
-
-    @wp.struct
-    class Parcel:
-        """A Gaussian as the pixels see it: what its step depends on and is differentiated by."""
-
-        dx: number
-        dy: number
-        xx: number  # of the root
-        xy: number
-        yy: number
-        opacity: number
-        red: number
-        green: number
-        blue: number
-        depth: number
-
-    @wp.func
-    def undo(parcel: Parcel, t: number, alphas: wp.vec2, here: number, walked: number):
-        """The falloff and the transmittance in front, from that behind."""
-        fall = fall_at(exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy))
-        odds = odds_of(opaque(times(fall, parcel.opacity), alphas, here, walked))
-        return fall, fma(t, odds, t)
+    fall_known = make_falloff(falloff).known
 
     @wp.func
     def step(
-        parcel: Parcel,
+        dx: number, dy: number, xx: number, xy: number, yy: number, opacity: number, lit: number,
         fall: number,
         t: number,  # in front
         adj_behind: number,  # dL/dT behind
-        alphas: wp.vec2,
-        here: number,
-        walked: number,
-        red: number,  # upstream gradients
-        green: number,
-        blue: number,
-        far: number,
-    ):
+        alphas: wp.vec2, here: number, walked: number,
+    ):  # fmt: skip
         """What the step adds to the loss, T behind it seen as a quantity of weight dL/dT."""
-        z = exponent(parcel.dx, parcel.dy, parcel.xx, parcel.xy, parcel.yy)
-        alpha = opaque(times(fall_known(z, fall), parcel.opacity), alphas, here, walked)
+        alpha = opaque(times(fall_known(exponent(dx, dy, xx, xy, yy), fall), opacity), alphas, here, walked)
         w = times(alpha, t)
-        lit = fma(parcel.red, red, fma(parcel.green, green, times(parcel.blue, blue)))
-        if wp.static(CHANNELS > 3):
-            lit = fma(parcel.depth, far, lit)
         return inner(w, lit) + inner(adj_behind, t - w)
 
-    return Stepwise(Parcel, undo, step)
+    return step

@@ -11,14 +11,13 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.cpu.adjoint import folded, vec5, vec8
+from warp_splat.kernels.cpu.adjoint import folded, vec8
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
-from warp_splat.kernels.cpu.channel_steps import make_reverse_step
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16
-from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
-from warp_splat.kernels.step import opaque
+from warp_splat.kernels.step import make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
 
 AT_ONCE = 32  # channels
@@ -146,10 +145,10 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
 def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
     """The adjoint of the sums, by hand or by Warp's derivative of a step.
 
-    By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others (Ye et
-    al. 2024). With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
+    By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others. With
+    ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
-    body, adj_geometry = make_reverse_step(mode, variant)
+    pixel, geometry = make_reverse_step(mode, variant.falloff, vec16)
     WIDTH = most or AT_ONCE  # of a block's numbers
     geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     T, ADJ_T, WALKED, UP = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS
@@ -226,9 +225,10 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                         else:
                             lit = fma(s[up + channel], mine[channel], lit)
                         channel += 1
-                    front, adj_front, w, part = body(
-                        splat, dx, dy, s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit
-                    )
+                    front, adj_front, w, part = pixel(
+                        dx, dy, splat.root, splat.opacity,
+                        s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit,
+                    )  # fmt: skip
                     s[T + block] = front
                     s[ADJ_T + block] = adj_front
                     for grad in range(CHANNEL):
@@ -248,12 +248,10 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 grad += 1
             for grad in range(CHANNEL):
                 sums[grad] = folded(halves, quarters, grad)
-            adj_mean, adj_conic = adj_geometry(vec5(sums[MEAN_X], sums[MEAN_Y], sums[XX], sums[XY], sums[YY]), splat)
-            slots_out[k, MEAN_X] = adj_mean[0]
-            slots_out[k, MEAN_Y] = adj_mean[1]
-            slots_out[k, XX] = adj_conic[0]
-            slots_out[k, XY] = adj_conic[1]
-            slots_out[k, YY] = adj_conic[2]
+            mean, conic = geometry(
+                wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], splat.root, splat.opacity
+            )
+            write_geometry(slots_out, k, mean, conic)
             slots_out[k, OPACITY] = sums[OPACITY]
         for k in range(start + steps[tile], bins.ranges[tile][1]):
             for grad in range(slots_out.shape[1]):

@@ -25,7 +25,7 @@ from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, reach
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import fma, times, total, vec16, where_less
-from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
+from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
 from warp_splat.kernels.step import conic_from_root, opaque
 from warp_splat.kernels.structs import BinsView
@@ -102,11 +102,8 @@ def collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slot: i
 def adj_collect(m: wp.array[vec16], root: wp.vec3, slots: wp.array2d[float], slot: int):
     adj_root = wp.vec3(total(wp.adjoint[m][XX]), total(wp.adjoint[m][XY]), total(wp.adjoint[m][YY]))
     adj_conic = conic_from_root(adj_root, root)
-    slots[slot, MEAN_X] = total(wp.adjoint[m][MEAN_X])
-    slots[slot, MEAN_Y] = total(wp.adjoint[m][MEAN_Y])
-    slots[slot, XX] = adj_conic[0]
-    slots[slot, XY] = adj_conic[1]
-    slots[slot, YY] = adj_conic[2]
+    adj_mean = wp.vec2(total(wp.adjoint[m][MEAN_X]), total(wp.adjoint[m][MEAN_Y]))
+    write_geometry(slots, slot, adj_mean, adj_conic)
     for grad in range(OPACITY, slots.shape[1]):
         slots[slot, grad] = total(wp.adjoint[m][grad])
     for grad in range(slots.shape[1]):
@@ -124,11 +121,8 @@ def rows_of_copies(
     """The rows of ``generated``, from the gradients of its copies."""
     k = first + wp.tid()
     adj = adj_copies[k]
-    conic = conic_from_root(adj.root, copies[k].root)
-    slots_out[k, MEAN_X] = adj.mean[0]
-    slots_out[k, MEAN_Y] = adj.mean[1]
+    write_geometry(slots_out, k, adj.mean, conic_from_root(adj.root, copies[k].root))
     for i in range(3):
-        slots_out[k, XX + i] = conic[i]
         slots_out[k, CHANNEL + i] = adj.color[i]
     slots_out[k, OPACITY] = adj.opacity
     if slots_out.shape[1] > CHANNEL + 3:

@@ -37,13 +37,8 @@ from warp_splat.kernels.cuda.warps import (
 )
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
-from warp_splat.kernels.splat import BlendVariant, exponent
-from warp_splat.kernels.step import (
-    conic_from_root,
-    geometry_from_moments,
-    make_manual,
-    make_stepwise,
-)
+from warp_splat.kernels.splat import BlendVariant
+from warp_splat.kernels.step import make_reverse_step
 from warp_splat.kernels.structs import BinsView, PixelsView
 
 
@@ -57,22 +52,6 @@ def row_of(mean: wp.vec2, conic: wp.vec3, rest: vec10):
     row[XY] = conic[1]
     row[YY] = conic[2]
     return row
-
-
-@wp.func
-def row_from_moments(sums: vec10, g: vec10):
-    """From sums of d, d d', 1 (weighted by dL/dopacity) and of the channels' gradients."""
-    root = wp.vec3(g[XX], g[XY], g[YY])
-    s = wp.vec2(sums[MEAN_X], sums[MEAN_Y])
-    mean, conic = geometry_from_moments(s, sums[XX], sums[XY], sums[YY], root, g[OPACITY])
-    return row_of(mean, conic, sums)
-
-
-@wp.func
-def row_from_root(sums: vec10, root: wp.vec3):
-    """From sums of the gradients of mean, root, opacity and channels."""
-    conic = conic_from_root(wp.vec3(sums[XX], sums[XY], sums[YY]), root)
-    return row_of(wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic, sums)
 
 
 @wp.func
@@ -147,8 +126,8 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
 def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The reverse loop by hand, its step by hand (``manual``) or by Warp (``stepwise``); a warp per tile."""
     CHANNELS, GRADS = variant.channels, variant.columns
-    adj_step, reach_of = make_manual(variant.falloff, float), make_falloff(variant.falloff).reach_of
-    Parcel, undo, step = make_stepwise(variant, float)
+    reach_of = make_falloff(variant.falloff).reach_of
+    pixel, geometry = make_reverse_step(mode, variant.falloff, float)
 
     @wp.kernel(module="unique", module_options=dict(WARP_OPTIONS))
     def adj_blend(
@@ -200,6 +179,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
             blocks = wp.tile(touched)
             for j in range(wp.min(WARP, last + 1)):
                 g = staged[j]
+                root = wp.vec3(g[XX], g[XY], g[YY])
                 touched = blocks[j]
                 here = float(last - j)
                 sums = vec10(0.0)
@@ -207,45 +187,22 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
                     if (touched & (1 << p)) != 0:  # the same for all lanes
                         dx = g[MEAN_X] - (left + float(across_of(lane, p)))
                         dy = g[MEAN_Y] - (top + float(down_of(lane, p)))
-                        if wp.static(mode == "manual"):
-                            lit = reds[p] * g[CHANNEL] + greens[p] * g[CHANNEL + 1] + blues[p] * g[CHANNEL + 2]
-                            if wp.static(CHANNELS > 3):
-                                lit += fars[p] * g[CHANNEL + 3]
-                            z = exponent(dx, dy, g[XX], g[XY], g[YY])
-                            front, beyond, w, s = adj_step(
-                                z, g[OPACITY], ts[p], adj_ts[p], alphas, here, walked[p], lit
-                            )
-                            sx = s * dx
-                            sy = s * dy
-                            sums += vec10(
-                                sx, sy, sx * dx, sx * dy, sy * dy, s,
-                                w * reds[p], w * greens[p], w * blues[p], w * fars[p],
-                            )  # fmt: skip
-                            adj_ts[p] = beyond
-                        else:
-                            parcel = Parcel()
-                            parcel.dx = dx
-                            parcel.dy = dy
-                            parcel.xx = g[XX]
-                            parcel.xy = g[XY]
-                            parcel.yy = g[YY]
-                            parcel.opacity = g[OPACITY]
-                            parcel.red = g[CHANNEL]
-                            parcel.green = g[CHANNEL + 1]
-                            parcel.blue = g[CHANNEL + 2]
-                            parcel.depth = g[CHANNEL + 3]
-                            fall, front = undo(parcel, ts[p], alphas, here, walked[p])
-                            q, _fall, adj_front, _behind, _min, _here, _walked, _r, _g, _b, _z = wp.grad(step)(
-                                parcel, fall, front, adj_ts[p], alphas, here, walked[p],
-                                reds[p], greens[p], blues[p], fars[p],
-                            )  # fmt: skip
-                            sums += vec10(q.dx, q.dy, q.xx, q.xy, q.yy, q.opacity, q.red, q.green, q.blue, q.depth)
-                            adj_ts[p] = adj_front
+                        lit = reds[p] * g[CHANNEL] + greens[p] * g[CHANNEL + 1] + blues[p] * g[CHANNEL + 2]
+                        if wp.static(CHANNELS > 3):
+                            lit += fars[p] * g[CHANNEL + 3]
+                        front, adj_front, w, part = pixel(
+                            dx, dy, root, g[OPACITY], ts[p], adj_ts[p], alphas, here, walked[p], lit
+                        )
+                        sums += vec10(
+                            part[MEAN_X], part[MEAN_Y], part[XX], part[XY], part[YY], part[OPACITY],
+                            w * reds[p], w * greens[p], w * blues[p], w * fars[p],
+                        )  # fmt: skip
                         ts[p] = front
-                if wp.static(mode == "manual"):
-                    row = row_from_moments(sums, g)
-                else:
-                    row = row_from_root(sums, wp.vec3(g[XX], g[XY], g[YY]))
+                        adj_ts[p] = adj_front
+                mean, conic = geometry(
+                    wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], root, g[OPACITY]
+                )
+                row = row_of(mean, conic, sums)
                 total = lane_sum(row, lane)
                 k = start + last - j
                 if column >= 0 and column < GRADS:

@@ -8,14 +8,14 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.cuda.adjoint import clear_rest, row_from_moments, row_from_root
+from warp_splat.kernels.cuda.adjoint import clear_rest, row_of
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of
 from warp_splat.kernels.cuda.warps import AT_ONCE, COLUMNS, WARP, block_sum, column_of, vec10, vec_channels
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import fma
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, exponent
-from warp_splat.kernels.step import geometry_from_moments, make_manual, make_stepwise, opaque
+from warp_splat.kernels.step import make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
 
 
@@ -75,13 +75,12 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
 def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
     """The adjoint of the sums, by hand or by Warp's derivative of a step.
 
-    By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others (Ye et
-    al. 2024). With ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
+    By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others. With
+    ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
     WIDTH = most or AT_ONCE
     geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
-    adj_step = make_manual(variant.falloff, float)
-    Parcel, undo, step = make_stepwise(variant, float)
+    pixel, geometry = make_reverse_step(mode, variant.falloff, float)
     vec_up = wp.types.vector(length=WIDTH, dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
@@ -131,40 +130,12 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                     lit += wp.where(chosen[channel] == here, up[channel], 0.0)
                 else:
                     lit += up[channel] * rows[splat, channel]
-            if wp.static(mode != "stepwise"):
-                z = exponent(dx, dy, g[XX], g[XY], g[YY])
-                front, beyond, w, adj_opacity = adj_step(z, g[OPACITY], t, adj_t, alphas, here, walked, lit)
-                sx = adj_opacity * dx
-                sy = adj_opacity * dy
-                grads = vec10(sx, sy, sx * dx, sx * dy, sy * dy, adj_opacity, 0.0, 0.0, 0.0, 0.0)
-                adj_t = beyond
-                if wp.static(mode == "absolute"):
-                    mean, _conic = geometry_from_moments(
-                        wp.vec2(sx, sy), 0.0, 0.0, 0.0, wp.vec3(g[XX], g[XY], g[YY]), g[OPACITY]
-                    )
-                    grads = vec10(wp.abs(mean[0]), wp.abs(mean[1]), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            else:
-                parcel = Parcel()
-                parcel.dx = dx
-                parcel.dy = dy
-                parcel.xx = g[XX]
-                parcel.xy = g[XY]
-                parcel.yy = g[YY]
-                parcel.opacity = g[OPACITY]
-                parcel.red = lit
-                fall, front = undo(parcel, t, alphas, here, walked)
-                p, _fall, adj_front, _behind, _min, _here, _walked, _red, _green, _blue, _far = wp.grad(step)(
-                    parcel, fall, front, adj_t, alphas, here, walked, 1.0, 0.0, 0.0, 0.0
-                )
-                w = p.red
-                grads = vec10(p.dx, p.dy, p.xx, p.xy, p.yy, p.opacity, 0.0, 0.0, 0.0, 0.0)
-                adj_t = adj_front
+            root = wp.vec3(g[XX], g[XY], g[YY])
+            front, adj_front, w, part = pixel(dx, dy, root, g[OPACITY], t, adj_t, alphas, here, walked, lit)
             t = front
-            row = grads
-            if wp.static(mode == "manual"):
-                row = row_from_moments(grads, g)
-            if wp.static(mode == "stepwise"):
-                row = row_from_root(grads, wp.vec3(g[XX], g[XY], g[YY]))
+            adj_t = adj_front
+            mean, conic = geometry(wp.vec2(part[MEAN_X], part[MEAN_Y]), part[XX], part[XY], part[YY], root, g[OPACITY])
+            row = row_of(mean, conic, vec10(part[OPACITY]))
             total = block_sum(row, thread)
             if thread < WARP and written >= 0 and written < CHANNEL:
                 slots_out[k, written] = total

@@ -10,13 +10,13 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.cuda.adjoint import row_from_root
+from warp_splat.kernels.cuda.adjoint import row_of
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of
 from warp_splat.kernels.cuda.warps import COLUMNS, WARP, block_sum, column_of, vec10
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent, odds_of
-from warp_splat.kernels.step import opaque
+from warp_splat.kernels.step import conic_from_root, opaque
 from warp_splat.kernels.structs import BinsView
 
 
@@ -97,7 +97,8 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
 
     @wp.func_grad(read)
     def adj_read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int, adj_ret: vec10):
-        total = block_sum(row_from_root(adj_ret, splat.root), thread)
+        conic = conic_from_root(wp.vec3(adj_ret[XX], adj_ret[XY], adj_ret[YY]), splat.root)
+        total = block_sum(row_of(wp.vec2(adj_ret[MEAN_X], adj_ret[MEAN_Y]), conic, adj_ret), thread)
         column = column_of(thread, COLUMNS)
         if thread < WARP and column >= 0 and column < GRADS:
             slots[slot, column] = total
