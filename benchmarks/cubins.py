@@ -32,7 +32,6 @@ from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.environment import make_adj_put_behind, make_put_behind
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.project import adj_camera, affine, ellipsoid
-from warp_splat.kernels.project.adj_lens import make_bend
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.rolling import make_expose
 from warp_splat.kernels.project.shared import make_project
@@ -85,7 +84,7 @@ def modules() -> dict[str, wp.Module]:
     for name in ("OPENCV", "OPENCV_FISHEYE"):
         family = MODELS[name][0]
         found[f"project, {name}"] = make_project(affine.through(family), reach_of, 1, None).module
-        found[f"adjoint of {name}"] = make_bend(affine.through(family, True), 1).module
+        found[f"adjoint of {name}"] = make_project(affine.through(family, True), reach_of, 1, None).module
     for depth in (False, True):
         suffix, variant = ", depth" if depth else "", BlendVariant(3 + depth)
         found[f"blend{suffix}"] = make_blend_block(variant).module

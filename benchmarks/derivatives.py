@@ -13,21 +13,14 @@ KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
 _CLAMP = ("splat.adj_alpha_of",)
 _EXP = ("falloff.adj_exp2_known", "step.adj_opaque", *_CLAMP)
 _ROOT = ("step.conic_from_root",)
-_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "cpu/taped.adj_fall_value", *_ROOT)
+_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "falloff.adj_fall_value", *_ROOT)
 _BEGIN = ("cpu/taped.replay_begin", "cpu/taped.adj_begin")
 _UNDO = ("cpu/taped.replay_front_of", "cpu/taped.adj_front_of", "splat.odds_of")
 _KEPT = ("cpu/taped.replay_front_of_kept", "cpu/taped.adj_front_of_kept")
 
 #: Rules: functions that state a derivative or an inverse. Of overloads, one is counted.
 RULES = {
-    "manual": (
-        "step.adj_step",
-        "step.manual",
-        "step.geometry_from_moments",
-        "splat.adj_alpha_blend",
-        "splat.odds_of",
-        *_CLAMP,
-    ),
+    "manual": ("step.by_hand", "step.geometry_from_moments", "splat.adj_alpha_blend", "splat.odds_of", *_CLAMP),
     "stepwise": ("splat.odds_of", *_EXP, *_ROOT),
     "reversible": (*_BEGIN, *_UNDO, *_EXP, *_READ),
     "stored": (*_BEGIN, *_KEPT, *_EXP, *_READ),
@@ -37,9 +30,9 @@ RULES = {
 #: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
 _KNOWN = ("falloff.exp2_known", "step.opaque")
 _LOOP = ("cpu/adjoint.adj_blend", "cpu/adjoint.folded")
-_WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "cpu/taped.fall_value", *_KNOWN)
+_WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "falloff.fall_value", *_KNOWN)
 PLUMBING = {
-    "manual": (*_LOOP, "step.manual"),
+    "manual": _LOOP,
     "stepwise": (*_LOOP, "step.stepwise", "step.step", *_KNOWN),
     "reversible": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of"),
     "stored": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of_kept"),

@@ -1,6 +1,7 @@
 """The angle of a point in the plane, by a polynomial: alike on all processors, with no call of the C library."""
 
 import math
+from typing import Any
 
 import warp as wp
 
@@ -14,50 +15,33 @@ PI, EIGHTH, LEAST = wp.constant(math.pi), wp.constant(math.tan(math.pi / 8)), wp
 ARCTAN = wp.constant(wp.types.vector(length=4, dtype=float)(-0.33332955, 0.19977925, -0.13879842, 0.08060285))
 
 
-def _make_arctangent(number: type) -> wp.Function:
+@wp.func
+def arctangent(y: Any, x: Any):
+    zero = fill(0.0, x)
+    one = fill(1.0, x)
+    long = wp.max(wp.max(x, -x), wp.max(y, -y))
+    short = wp.min(wp.max(x, -x), wp.max(y, -y))
+    # of t = short / long: from 1 as well as from 0, whichever is nearer
+    steep = less(times(fill(EIGHTH, x), long), short)
+    t = over(pick(steep, short - long, short), wp.max(pick(steep, short + long, long), fill(LEAST, x)))
+    q = times(t, t)
+    series = fma(fill(ARCTAN[3], x), q, fill(ARCTAN[2], x))
+    series = fma(fma(series, q, fill(ARCTAN[1], x)), q, fill(ARCTAN[0], x))
+    found = fma(times(series, q), t, t) + pick(steep, fill(0.25 * PI, x), zero)
+    found = pick(less(wp.max(x, -x), wp.max(y, -y)), fill(0.5 * PI, x) - found, found)
+    found = pick(less(x, zero), fill(PI, x) - found, found)
+    return times(found, pick(less(y, zero), -one, one))
+
+
+for number in (float, vec16):
+
     @wp.func
-    def arctangent(y: number, x: number):
-        zero = fill(0.0, x)
-        one = fill(1.0, x)
-        long = wp.max(wp.max(x, -x), wp.max(y, -y))
-        short = wp.min(wp.max(x, -x), wp.max(y, -y))
-        # of t = short / long: from 1 as well as from 0, whichever is nearer
-        steep = less(times(fill(EIGHTH, x), long), short)
-        t = over(pick(steep, short - long, short), wp.max(pick(steep, short + long, long), fill(LEAST, x)))
-        q = times(t, t)
-        series = fma(fill(ARCTAN[3], x), q, fill(ARCTAN[2], x))
-        series = fma(fma(series, q, fill(ARCTAN[1], x)), q, fill(ARCTAN[0], x))
-        found = fma(times(series, q), t, t) + pick(steep, fill(0.25 * PI, x), zero)
-        found = pick(less(wp.max(x, -x), wp.max(y, -y)), fill(0.5 * PI, x) - found, found)
-        found = pick(less(x, zero), fill(PI, x) - found, found)
-        return times(found, pick(less(y, zero), -one, one))
+    def angle(y: number, x: number):
+        """Of the point (x, y) from the x axis, -pi to pi, 0 for the origin: a polynomial, alike on all processors."""
+        return arctangent(y, x)
 
-    return arctangent
-
-
-arctangent, arctangents = _make_arctangent(float), _make_arctangent(vec16)
-
-
-@wp.func
-def angle(y: float, x: float):
-    """Of the point (x, y) from the x axis, -pi to pi, 0 for the origin: a polynomial, alike on all processors."""
-    return arctangent(y, x)
-
-
-@wp.func
-def angle(y: vec16, x: vec16):
-    return arctangents(y, x)
-
-
-@wp.func_grad(angle)
-def adj_angle(y: float, x: float, adj_ret: float):
-    per_square = adj_ret / wp.max(x * x + y * y, LEAST)
-    wp.adjoint[y] += x * per_square
-    wp.adjoint[x] -= y * per_square
-
-
-@wp.func_grad(angle)
-def adj_angle(y: vec16, x: vec16, adj_ret: vec16):
-    per_square = over(adj_ret, wp.max(fma(x, x, times(y, y)), fill(LEAST, x)))
-    wp.adjoint[y] += times(x, per_square)
-    wp.adjoint[x] -= times(y, per_square)
+    @wp.func_grad(angle)
+    def adj_angle(y: number, x: number, adj_ret: number):
+        per_square = over(adj_ret, wp.max(fma(x, x, times(y, y)), fill(LEAST, x)))
+        wp.adjoint[y] += times(x, per_square)
+        wp.adjoint[x] -= times(y, per_square)

@@ -75,11 +75,8 @@ def make_falloff(falloff: Falloff | int | None) -> FalloffFunctions:
     if not isinstance(falloff, Falloff):
         return FalloffFunctions(make_exp(falloff), exp2_known, reach_of)
     fall, reach = falloff.fall, falloff.reach
-    for number in (
-        float,
-        vec16,
-    ):  # else Warp 1.19 leaves what it calls without adjoints, as ``value`` comes first
-        fall.get_overload([number], {}).adj.force_adjoint_codegen = True
+    for kind in (float, vec16):  # else Warp 1.19 leaves what it calls without adjoints, as ``value`` comes first
+        fall.get_overload([kind], {}).adj.force_adjoint_codegen = True
 
     @wp.func
     def value(z: Any):
@@ -94,6 +91,22 @@ def make_falloff(falloff: Falloff | int | None) -> FalloffFunctions:
         return wp.max(2.0 * reach(opacity / wp.max(alpha_min, 1.0e-37)), 1.0e-6)
 
     return FalloffFunctions(value, known, reach_of_fall)
+
+
+@functools.cache
+def make_fall_value(falloff: Falloff | int | None, number: type) -> wp.Function:
+    """The falloff without its gradient, which what knows the value supplies."""
+    fall_at = make_falloff(falloff).value
+
+    @wp.func
+    def fall_value(z: number):
+        return fall_at(z)
+
+    @wp.func_grad(fall_value)
+    def adj_fall_value(z: number, adj_ret: number):
+        pass
+
+    return fall_value
 
 
 @functools.cache
@@ -181,25 +194,16 @@ def exp2_exact(x: vec16):
     return r
 
 
-@wp.func
-def exp2_known(z: float, value: float):
-    """2^-z, computed before."""
-    return value
+for number in (float, vec16):
 
+    @wp.func
+    def exp2_known(z: number, value: number):
+        """2^-z, computed before."""
+        return value
 
-@wp.func
-def exp2_known(z: vec16, value: vec16):
-    return value
-
-
-@wp.func_grad(exp2_known)
-def adj_exp2_known(z: float, value: float, adj_ret: float):
-    wp.adjoint[z] += times(value, adj_ret) * -LN_2
-
-
-@wp.func_grad(exp2_known)
-def adj_exp2_known(z: vec16, value: vec16, adj_ret: vec16):
-    wp.adjoint[z] += times(value, adj_ret) * -LN_2
+    @wp.func_grad(exp2_known)
+    def adj_exp2_known(z: number, value: number, adj_ret: number):
+        wp.adjoint[z] += times(value, adj_ret) * -LN_2
 
 
 @wp.func

@@ -17,11 +17,12 @@ import warp as wp
 from warp_splat.errors import InputError
 
 
-def kernel_of_parts(module_options: dict, **parts: wp.Function) -> Callable:
+def kernel_of_parts(module_options: dict, **parts: wp.Function | Callable) -> Callable:
     """A decorator: the kernel with the bodies of ``parts`` in place of ``a, b = part(c, d)``, in a module of its own.
 
     Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end. It may
-    call other parts. Parameters beyond the arguments are the kernel's variables of these names.
+    call other parts. Parameters beyond the arguments are the kernel's variables of these names; where it has none, it
+    takes one more parameter, behind its first. A part that is never called need not be a Warp function.
 
     Raises:
         InputError: if a part does otherwise.
@@ -34,10 +35,12 @@ def kernel_of_parts(module_options: dict, **parts: wp.Function) -> Callable:
         }
         taken |= {parameter.arg for parameter in definition.args.args}
         definition.decorator_list = []
+        asked: dict[str, type] = {}
+        definition.body = [line for old in definition.body for line in _expanded(old, parts, names, taken, asked)]
+        definition.args.args[1:1] = [ast.arg(name) for name in asked]
         for parameter in definition.args.args:
             parameter.annotation = ast.Name(f"type_of_{parameter.arg}", ast.Load())
-            names[parameter.annotation.id] = function.__annotations__[parameter.arg]
-        definition.body = [line for old in definition.body for line in _expanded(old, parts, names, taken)]
+            names[parameter.annotation.id] = (function.__annotations__ | asked)[parameter.arg]
         source = ast.unparse(ast.fix_missing_locations(ast.Module([definition], [])))
         path = f"<{function.__qualname__} {zlib.crc32(source.encode())}>"
         linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
@@ -54,26 +57,40 @@ def _parsed(function: Callable) -> tuple[ast.FunctionDef, dict]:
     return definition, {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
 
 
-def _expanded(line: ast.stmt, parts: dict[str, wp.Function], names: dict, taken: set[str]) -> list[ast.stmt]:
-    """What stands for a statement of the kernel, whose own variables are ``taken``."""
+def _expanded(
+    line: ast.stmt, parts: dict[str, wp.Function | Callable], names: dict, taken: set[str], asked: dict[str, type]
+) -> list[ast.stmt]:
+    """What stands for a statement of the kernel, whose own variables are ``taken``; see :func:`_inlined`."""
     if isinstance(line, ast.If):
-        line.body = [new for old in line.body for new in _expanded(old, parts, names, taken)]
+        line.body = [new for old in line.body for new in _expanded(old, parts, names, taken, asked)]
     if isinstance(line, ast.Assign) and isinstance(line.value, ast.Call) and isinstance(line.value.func, ast.Name):
         part = line.value.func.id
         if part in parts:
-            body = _inlined(part, parts[part].func, line.targets[0], line.value.args, names, taken)
-            return [new for old in body for new in _expanded(old, parts, names, taken)]
+            function = getattr(parts[part], "func", parts[part])
+            body = _inlined(part, function, line.targets[0], line.value.args, names, taken, asked)
+            return [new for old in body for new in _expanded(old, parts, names, taken, asked)]
     return [line]
 
 
 def _inlined(
-    part: str, function: Callable, target: ast.expr, arguments: list[ast.expr], names: dict, taken: set[str]
+    part: str,
+    function: Callable,
+    target: ast.expr,
+    arguments: list[ast.expr],
+    names: dict,
+    taken: set[str],
+    asked: dict[str, type],
 ) -> list[ast.stmt]:
-    """The body of ``function``, its own names behind that of the part; ``names`` learns what it refers to."""
+    """The body of ``function``, its own names behind that of the part.
+
+    ``names`` learns what it refers to, ``asked`` which parameters it takes that are no variables of the kernel.
+    """
     definition, known = _parsed(function)
     parameters = [parameter.arg for parameter in definition.args.args]
     given = dict(zip(parameters, [argument.id for argument in arguments], strict=False))
     given |= {name: name for name in parameters[len(arguments) :]}
+    beyond = [name for name in parameters[len(arguments) :] if name not in taken]
+    asked |= {name: inspect.get_annotations(function, eval_str=True)[name] for name in beyond}
     nodes = [node for node in ast.walk(definition) if isinstance(node, ast.Name)]
     own = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
     renamed = {}

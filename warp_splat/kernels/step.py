@@ -19,25 +19,16 @@ from warp_splat.kernels.splat import adj_alpha_blend, adj_alpha_of, alpha_of, ex
 wp.set_module_options(FORWARD_ONLY)
 
 
-@wp.func
-def opaque(raw: float, alphas: wp.vec2, here: float, walked: float):
-    """Opacity, 0 for pixels that had stopped."""
-    return alpha_of(where_less(here, walked, raw, -1.0), alphas)
+for number in (float, vec16):
 
+    @wp.func
+    def opaque(raw: number, alphas: wp.vec2, here: number, walked: number):
+        """Opacity, 0 for pixels that had stopped."""
+        return alpha_of(where_less(here, walked, raw, fill(-1.0, raw)), alphas)
 
-@wp.func
-def opaque(raw: vec16, alphas: wp.vec2, here: vec16, walked: vec16):
-    return alpha_of(where_less(here, walked, raw, vec16(-1.0)), alphas)
-
-
-@wp.func_grad(opaque)
-def adj_opaque(raw: float, alphas: wp.vec2, here: float, walked: float, adj_ret: float):
-    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, -1.0), alphas, adj_ret)
-
-
-@wp.func_grad(opaque)
-def adj_opaque(raw: vec16, alphas: wp.vec2, here: vec16, walked: vec16, adj_ret: vec16):
-    wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, vec16(-1.0)), alphas, adj_ret)
+    @wp.func_grad(opaque)
+    def adj_opaque(raw: number, alphas: wp.vec2, here: number, walked: number, adj_ret: number):
+        wp.adjoint[raw] += adj_alpha_of(where_less(here, walked, raw, fill(-1.0, raw)), alphas, adj_ret)
 
 
 @wp.func
@@ -99,49 +90,35 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
     fall_at, step = make_falloff(falloff).value, make_step(falloff, number)
 
     @wp.func
-    def adj_step(
+    def by_hand(
         dx: number, dy: number, root: wp.vec3, opacity: float,
         t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
     ):  # fmt: skip
-        """In front; the weight, and dL/dopacity of every pixel (times opacity: -dL/dq)."""
         fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
         raw = where_less(here, walked, fall * opacity, fill(-1.0, dx))
         odds = odds_of(alpha_of(raw, alphas))
         w = times(t, odds)
         front = fma(t, odds, t)
         adj_raw = adj_alpha_of(raw, alphas, adj_alpha_blend(front, odds, adj_t, lit))
-        return front, fma(w, lit, adj_t), w, times(adj_raw, fall)
-
-    @wp.func
-    def manual(
-        dx: number, dy: number, root: wp.vec3, opacity: float,
-        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
-    ):  # fmt: skip
-        front, adj_front, w, adj_opacity = adj_step(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit)
-        x = times(adj_opacity, dx)
-        y = times(adj_opacity, dy)
+        adj_opacity = times(adj_raw, fall)  # times opacity: -dL/dq
         sums = vec_sums()
-        sums[MEAN_X] = x
-        sums[MEAN_Y] = y
-        sums[XX] = times(x, dx)
-        sums[XY] = times(x, dy)
-        sums[YY] = times(y, dy)
-        sums[OPACITY] = adj_opacity
-        return front, adj_front, w, sums
-
-    @wp.func
-    def absolute(
-        dx: number, dy: number, root: wp.vec3, opacity: float,
-        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
-    ):  # fmt: skip
-        front, adj_front, w, adj_opacity = adj_step(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit)
-        adj_u = times(fma(dx, root[0], times(dy, root[1])), adj_opacity)
-        adj_x = times(adj_u, root[0])
-        adj_y = fma(adj_u, root[1], times(times(times(dy, root[2]), adj_opacity), root[2]))
-        sums = vec_sums()
-        sums[MEAN_X] = wp.max(adj_x, -adj_x)
-        sums[MEAN_Y] = wp.max(adj_y, -adj_y)
-        return front, adj_front, w, sums
+        if wp.static(mode == "absolute"):
+            adj_u = times(fma(dx, root[0], times(dy, root[1])), adj_opacity)
+            adj_v = times(times(dy, root[2]), adj_opacity)
+            adj_x = times(adj_u, root[0])
+            adj_y = fma(adj_u, root[1], times(adj_v, root[2]))
+            sums[MEAN_X] = wp.max(adj_x, -adj_x)
+            sums[MEAN_Y] = wp.max(adj_y, -adj_y)
+        else:
+            x = times(adj_opacity, dx)
+            y = times(adj_opacity, dy)
+            sums[MEAN_X] = x
+            sums[MEAN_Y] = y
+            sums[XX] = times(x, dx)
+            sums[XY] = times(x, dy)
+            sums[YY] = times(y, dy)
+            sums[OPACITY] = adj_opacity
+        return front, fma(w, lit, adj_t), w, sums
 
     @wp.func
     def stepwise(
@@ -165,8 +142,8 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
         return front, adj_front, w, sums
 
     return {
-        "manual": ReverseStep(manual, geometry_from_moments),
-        "absolute": ReverseStep(absolute, geometry_from_magnitudes),
+        "manual": ReverseStep(by_hand, geometry_from_moments),
+        "absolute": ReverseStep(by_hand, geometry_from_magnitudes),
         "stepwise": ReverseStep(stepwise, geometry_from_root),
     }[mode]
 

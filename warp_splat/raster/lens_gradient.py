@@ -1,4 +1,4 @@
-"""The gradient of a lens's coefficients: of each group's by Warp (`kernels/project/adj_lens.py`), then summed."""
+"""The gradient of a lens's coefficients: of each group's by Warp (`kernels/project/shared.py`), then summed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def bent_groups(
         The gradients of the formula's coefficients, of each group, [N / lanes, K].
     """
     number, integer, row2, row3, row4 = TYPES[lanes]
-    types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number)
+    types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
 
     def arrays(tensors: Sequence[torch.Tensor], types: Sequence[type]) -> list:
         return [lanes_of(dtype, tensor)[0] for tensor, dtype in zip(tensors, types, strict=False)]
@@ -50,10 +50,10 @@ def bent_groups(
     radii = outputs[-1]
     numbers = torch.tensor(lens.numbers, dtype=torch.float32, device=radii.device).repeat(len(radii) // lanes, 1)
     adj = torch.zeros_like(numbers)
-    given = [cam, view(numbers, wp.float32), *arrays(inputs, types_in), *lanes_of(integer, radii)]
-    adj_given = [cam, view(adj, wp.float32), *arrays(adj_inputs, types_in), None]
+    given = [view(numbers, wp.float32), cam, *arrays(inputs, types_in)]
+    adj_given = [view(adj, wp.float32), cam, *arrays(adj_inputs, types_in)]
     bounds = even_slices(len(adj), SMALLEST_SLICE // lanes)
-    adjoint = {"adj_inputs": adj_given, "adj_outputs": arrays(adj_outputs, types_out)}
+    adjoint = {"adj_inputs": adj_given, "adj_outputs": [*arrays(adj_outputs[:4], types_out), None, None]}
     launch(bend, len(adj), given, arrays(outputs, types_out), bounds=bounds, device=adj.device, **adjoint)
     return [adj]
 

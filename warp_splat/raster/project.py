@@ -16,7 +16,6 @@ from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.project import Projection
-from warp_splat.kernels.project.adj_lens import make_bend
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.lens import LIMIT
 from warp_splat.kernels.project.quarantine import quarantine
@@ -95,14 +94,14 @@ def project(
 ) -> Splats2D:
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
     learned, limits, bend = (None, None, None, None), camera, None
-    driver = driver or driver_of(gaussians.means.device)
+    driver, reach_of = driver or driver_of(gaussians.means.device), falloff_of(options).reach_of
     if isinstance(camera, CameraParameters):
         learned = (camera.twist, camera.intrinsics, camera.last_twist, camera.coefficients)
         limits, camera = camera.base, camera.camera
         if learned[-1] is not None and learned[-1].requires_grad:
-            bend = make_bend(projection_of(options, camera.lens, learned=True), driver.lanes)
+            bend = make_project(projection_of(options, camera.lens, learned=True), reach_of, driver.lanes, None)
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
-    projection, reach_of = projection_of(options, camera.lens), falloff_of(options).reach_of
+    projection = projection_of(options, camera.lens)
     kernel = make_project(projection, reach_of, driver.lanes, exposed_by(camera, options, driver.lanes))
     return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, bend, driver, dropped or Dropped()))
 

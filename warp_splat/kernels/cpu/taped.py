@@ -23,7 +23,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, reach
-from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.falloff import make_fall_value, make_falloff
 from warp_splat.kernels.simd import fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
@@ -134,16 +134,7 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
     CHANNELS, GRADS = variant.channels, variant.columns
     STATE = BLOCKS * CHANNELS
-    fall_at, fall_known, _ = make_falloff(variant.falloff)
-
-    @wp.func
-    def fall_value(z: vec16):
-        """The falloff without its gradient, which ``fall_known`` supplies."""
-        return fall_at(z)
-
-    @wp.func_grad(fall_value)
-    def adj_fall_value(z: vec16, adj_ret: vec16):
-        pass
+    (fall_at, fall_known, _), fall_value = make_falloff(variant.falloff), make_fall_value(variant.falloff, vec16)
 
     @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
     def walk(

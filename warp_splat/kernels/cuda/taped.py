@@ -13,7 +13,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.cuda.adjoint import row_of
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of
 from warp_splat.kernels.cuda.warps import COLUMNS, WARP, block_sum, column_of, vec10
-from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.falloff import make_fall_value, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent, odds_of
 from warp_splat.kernels.step import conic_from_root, opaque
@@ -88,7 +88,7 @@ def adj_behind_of(front: float, w: float, adj_ret: float):
 def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
     CHANNELS, GRADS = variant.channels, variant.columns
-    fall_at, fall_known, _ = make_falloff(variant.falloff)
+    fall_known, fall_value = make_falloff(variant.falloff).known, make_fall_value(variant.falloff, float)
 
     @wp.func
     def read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int):
@@ -102,15 +102,6 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
         column = column_of(thread, COLUMNS)
         if thread < WARP and column >= 0 and column < GRADS:
             slots[slot, column] = total
-
-    @wp.func
-    def fall_value(z: float):
-        """The falloff without its gradient, which ``fall_known`` supplies."""
-        return fall_at(z)
-
-    @wp.func_grad(fall_value)
-    def adj_fall_value(z: float, adj_ret: float):
-        pass
 
     @wp.kernel(module="unique", module_options={**BLOCK_OPTIONS, "enable_backward": True})
     def walk(

@@ -33,7 +33,7 @@ class Projection(NamedTuple):
     wide:
         It sees beside and behind the camera: depth is the distance, and z may be negative.
     learned:
-        They may take the lens's coefficients as well, from a kernel that has them (:mod:`.adj_lens`).
+        They may take the lens's coefficients as well (:func:`.shared.make_project`).
     """
 
     lens: Callable[[int], wp.Function]

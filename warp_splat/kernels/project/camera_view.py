@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_splat.kernels.simd import fill, vec16
+from warp_splat.kernels.simd import LANES, vec16
 
 
 @wp.struct
@@ -25,43 +25,21 @@ class CameraView:
     lens: vec16  # coefficients of its formula; last, how far from the axis it is followed (:mod:`.lens`)
 
 
-@wp.func
-def turn(camera: CameraView, row: int, column: int, like: float):
+@wp.func_native("return camera.rotation.data[row][column];")
+def turn(camera: CameraView, row: int, column: int, like: float) -> float:
     """An entry of the camera's rotation, without a gradient, which would take a quarter of the adjoint."""
-    return fill(camera.rotation[row, column], like)
+    return camera.rotation[row, column]
 
 
-@wp.func
-def turn(camera: CameraView, row: int, column: int, like: vec16):
-    return fill(camera.rotation[row, column], like)
+@wp.func_native(f"return wp::vec_t<{LANES}, float>(camera.rotation.data[row][column]);")
+def turn(camera: CameraView, row: int, column: int, like: vec16) -> vec16: ...
 
 
-@wp.func_grad(turn)
-def adj_turn(camera: CameraView, row: int, column: int, like: float, adj_ret: float):
-    pass
-
-
-@wp.func_grad(turn)
-def adj_turn(camera: CameraView, row: int, column: int, like: vec16, adj_ret: vec16):
-    pass
-
-
-@wp.func
-def of_lens(camera: CameraView, index: int, like: float):
+@wp.func_native("return camera.lens[index];")
+def of_lens(camera: CameraView, index: int, like: float) -> float:
     """A number of the camera's lens, likewise."""
-    return fill(camera.lens[index], like)
+    return camera.lens[index]
 
 
-@wp.func
-def of_lens(camera: CameraView, index: int, like: vec16):
-    return fill(camera.lens[index], like)
-
-
-@wp.func_grad(of_lens)
-def adj_of_lens(camera: CameraView, index: int, like: float, adj_ret: float):
-    pass
-
-
-@wp.func_grad(of_lens)
-def adj_of_lens(camera: CameraView, index: int, like: vec16, adj_ret: vec16):
-    pass
+@wp.func_native(f"return wp::vec_t<{LANES}, float>(camera.lens[index]);")
+def of_lens(camera: CameraView, index: int, like: vec16) -> vec16: ...

@@ -8,73 +8,26 @@ Gaussian's rotation and scales), the projected covariance is A A' + e I, e = ``b
 a sum of positive terms: the usual a c - b^2 loses every digit for needles. No dynamic loop.
 """
 
-import functools
+from collections.abc import Callable
 
 import warp as wp
 
 from warp_splat.config import COMPENSATION_MIN
 from warp_splat.kernels.project import Projection
-from warp_splat.kernels.project.camera_view import CameraView, turn
-from warp_splat.kernels.simd import TYPES, fill, fma, less, over, pick, root, times
+from warp_splat.kernels.project.camera_view import turn
+from warp_splat.kernels.project.pieces import covariance
+from warp_splat.kernels.simd import fill, fma, less, over, pick, root, times
 
 
-def parts_of_image(projection: Projection, lanes: int) -> dict[str, wp.Function]:
-    """What :func:`make_image` consists of (:func:`warp_splat.kernels.inline.kernel_of_parts`), by name."""
+def parts_of_image(projection: Projection, lanes: int) -> dict[str, Callable]:
+    """By name: what puts a Gaussian into the image, and what that is put together from (:mod:`.pieces`)."""
     lens, outline = projection.functions(lanes)
-    return {"lens": lens, "covariance": make_covariance(lanes)} | ({"outline": outline} if outline else {})
 
+    def image(camera, x, y, z, m00, m01, m02, m10, m11, m12, m20, m21, m22, sx, sy, sz, opacity, here):
+        """Mean [px], covariance and determinant, opacity after antialiasing, and whether there is an outline.
 
-@functools.cache
-def make_covariance(lanes: int) -> wp.Function:
-    """A A', and its determinant as a sum of squares."""
-    number = TYPES[lanes].number
-
-    @wp.func
-    def covariance(a10: number, a11: number, a12: number, a20: number, a21: number, a22: number):
-        c0 = times(a11, a22) - times(a12, a21)
-        c1 = times(a12, a20) - times(a10, a22)
-        c2 = times(a10, a21) - times(a11, a20)
-        return (
-            fma(a10, a10, fma(a11, a11, times(a12, a12))),
-            fma(a10, a20, fma(a11, a21, times(a12, a22))),
-            fma(a20, a20, fma(a21, a21, times(a22, a22))),
-            fma(c0, c0, fma(c1, c1, times(c2, c2))),
-        )
-
-    return covariance
-
-
-@functools.cache
-def make_image(projection: Projection, lanes: int) -> wp.Function:
-    """Mean [px], covariance and determinant, opacity after antialiasing, and whether there is an outline.
-
-    Of a Gaussian at x, y, z in the camera, with the matrix m of its quaternion and its scales.
-    """
-    number = TYPES[lanes].number
-    lens, outline = projection.functions(lanes)
-    covariance = make_covariance(lanes)
-
-    @wp.func
-    def image(
-        camera: CameraView,
-        x: number,
-        y: number,
-        z: number,
-        m00: number,
-        m01: number,
-        m02: number,
-        m10: number,
-        m11: number,
-        m12: number,
-        m20: number,
-        m21: number,
-        m22: number,
-        sx: number,
-        sy: number,
-        sz: number,
-        opacity: number,
-        here: number,
-    ):
+        Of a Gaussian at x, y, z in the camera, with the matrix m of its quaternion and its scales.
+        """
         one = fill(1.0, here)
         px, py, j00, j01, j02, j10, j11, j12 = lens(camera, x, y, z)
         # a1, a2; scaled last, or needles would lose digits of the scales' gradients
@@ -107,4 +60,4 @@ def make_image(projection: Projection, lanes: int) -> wp.Function:
             shown = times(shown, root(pick(less(least, share), share, least)))
         return px, py, xx, xy, yy, det, shown, drawn
 
-    return image
+    return {"image": image, "lens": lens, "covariance": covariance} | ({"outline": outline} if outline else {})

@@ -19,8 +19,8 @@ from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
-from warp_splat.kernels.project.image import make_image, parts_of_image
-from warp_splat.kernels.project.pieces import make_pieces
+from warp_splat.kernels.project.image import parts_of_image
+from warp_splat.kernels.project.pieces import all_finite, offset, rotation, sized_or_one, taken_along, turned_or_not
 from warp_splat.kernels.simd import (
     LANES,
     TYPES,
@@ -32,6 +32,7 @@ from warp_splat.kernels.simd import (
     pick,
     real,
     root,
+    rounded_down,
     rounded_up,
     some,
     times,
@@ -50,21 +51,34 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
 
     ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`). ``expose``: the camera moves while
     its rows are read (:mod:`.rolling`).
+
+    Of a projection that is learned, only the adjoint is launched, after the forward pass of the one that is not. Its
+    kernel takes the lens's coefficients behind ``first``, one row for each group, so that no two write into one place.
+    What Warp's adjoint finds for each is summed outside. Tried: a kernel for the coefficients alone, which takes as
+    long again as projection and adjoint.
     """
     number, integer, row2, row3, row4 = TYPES[lanes]
-    pieces = make_pieces(lanes)
-    largest, all_finite, rotation, taken_along, covers_pixel, offset, turned_or_not, sized_or_one = pieces
-    image = make_image(projection, lanes)
+    turns = wp.array2d[row4] if expose else wp.array[row4]
 
     @wp.func
-    def quat_of(turns: wp.array[row4], g: int):
-        w, x, y, z = columns(turns[g])
-        return w, x, y, z
+    def largest(a: number, b: number, c: number, d: number):
+        """The largest magnitude, without a gradient: it chooses a factor that normalization takes out again."""
+        return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
+
+    @wp.func_grad(largest)
+    def adj_largest(a: number, b: number, c: number, d: number, adj_ret: number):
+        pass
 
     @wp.func
-    def quat_before_motion(turns: wp.array2d[row4], g: int):
-        w, x, y, z = columns(turns[g, 0])
-        return w, x, y, z
+    def covers_pixel(mean: number, extent: number, size: float):
+        """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
+        first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
+        last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
+        return fill(1.0, mean) - less(last, first)
+
+    @wp.func_grad(covers_pixel)
+    def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
+        pass
 
     @wp.func
     def reaches(opacity: vec16, alpha_min: float):
@@ -93,11 +107,9 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     ):
         pass
 
-    parts = {"all_finite": all_finite, "offset": offset, "rotation": rotation, "image": image}
-    parts |= {"turned_or_not": turned_or_not, "sized_or_one": sized_or_one} | parts_of_image(projection, lanes)
-    parts |= {"taken_along": taken_along} if expose else {}
-    parts |= {"quat_of": quat_before_motion if expose else quat_of}
-    turns = wp.array2d[row4] if expose else wp.array[row4]
+    parts = {"all_finite": all_finite, "offset": offset, "turned_or_not": turned_or_not, "rotation": rotation}
+    parts |= {"taken_along": taken_along, "sized_or_one": sized_or_one} | parts_of_image(projection, lanes)
+    image = parts["image"]
 
     @kernel_of_parts(DIFFERENTIABLE, **parts)
     def project(
@@ -117,7 +129,10 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     ):
         g = first + wp.tid()
         mx, my, mz = columns(means[g])
-        qw, qx, qy, qz = quat_of(quats, g)
+        if wp.static(expose is None):
+            qw, qx, qy, qz = columns(quats[g])
+        else:
+            qw, qx, qy, qz = columns(quats[g, 0])
         sx, sy, sz = columns(scales[g])
         opacity = opacities[g]
         zero = fill(0.0, opacity)
