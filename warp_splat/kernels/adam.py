@@ -56,13 +56,6 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
                 mask[lane] = wp.where(radii[shown] > 0, 1.0, 0.0)
             return mask
 
-    @wp.func
-    def wide(x: moment):
-        if wp.static(halves):
-            return widened(x)
-        else:
-            return x
-
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adam(
         first: int,  # group of rows of this slice
@@ -85,8 +78,8 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
             seconds = wp.array(ptr=tables_out[table, 3] + begin_moments, shape=(width,), dtype=moment)
             for i in range(width):
                 grad = grads[i]
-                before = wide(firsts[i])
-                before2 = wide(seconds[i])
+                before = widened(firsts[i])
+                before2 = widened(seconds[i])
                 value, m, v = adam_step_of(
                     values[i], grad, before, before2,
                     numbers[table, RATE], numbers[table, EPS], numbers[table, PER_ROOT],

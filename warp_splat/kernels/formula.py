@@ -7,16 +7,16 @@ host and sixteen Gaussians in a kernel, and no derivative of it is written by ha
 
 from __future__ import annotations
 
-import linecache
-import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from warp_splat.kernels import simd
 from warp_splat.kernels.angle import angle
+from warp_splat.kernels.inline import defined
 from warp_splat.kernels.project.camera_view import CameraView, of_lens, turn
 
 Name = str | None  # of a variable of the function; None: zero
@@ -43,6 +43,10 @@ class Notes:
     def of_lens(self, index: int) -> Number:
         """A number of the camera's lens."""
         return Number(self, self.note("of_lens", "camera", str(index)))
+
+    def turn(self, row: int, column: int) -> Number:
+        """An entry of the camera's rotation."""
+        return Number(self, self.note("turn", "camera", str(row), str(column)))
 
     def element(self, code: str) -> Number:
         """A number of an array of the kernel, which gets a gradient."""
@@ -87,7 +91,7 @@ class Notes:
                     (other,) = (a for a in operands if a != product)
                     written = [line for line in written if not line.startswith(f"{product} ")]
                     operation, operands = "fma", [*steps[product][1:], other]
-            operands += [like] if operation in ("fill", "of_lens", "everywhere") else []
+            operands += [like] if operation in ("fill", "of_lens", "turn", "everywhere") else []
             code = {"plus": "{} + {}", "minus": "{} - {}", "negative": "-{}"}.get(operation)
             code = code.format(*operands) if code else f"{operation}({', '.join(operands)})"
             written.append(f"{name} = {code}")
@@ -132,14 +136,12 @@ def _multiply(notes: Notes, a: Number, b: Number) -> Number:
     return Number(notes, notes.product(a.name, b.name), tuple(slopes))
 
 
-def _add(notes: Notes, a: Number, b: Number) -> Number:
-    slopes = (notes.sum(*pair) for pair in zip(a.slopes, b.slopes, strict=True))
-    return Number(notes, notes.sum(a.name, b.name), tuple(slopes))
+def _linear(combine: Callable[[Notes, Name, Name], Name], notes: Notes, a: Number, b: Number) -> Number:
+    slopes = (combine(notes, *pair) for pair in zip(a.slopes, b.slopes, strict=True))
+    return Number(notes, combine(notes, a.name, b.name), tuple(slopes))
 
 
-def _subtract(notes: Notes, a: Number, b: Number) -> Number:
-    slopes = (notes.difference(*pair) for pair in zip(a.slopes, b.slopes, strict=True))
-    return Number(notes, notes.difference(a.name, b.name), tuple(slopes))
+_add, _subtract = partial(_linear, Notes.sum), partial(_linear, Notes.difference)
 
 
 def _negative(notes: Notes, a: Number) -> Number:
@@ -172,12 +174,10 @@ def _arctan2(notes: Notes, a: Number, b: Number) -> Number:
     return Number(notes, notes.note("angle", notes.real(a.name), notes.real(b.name)), tuple(slopes))
 
 
-def _less(notes: Notes, a: Number, b: Number) -> Number:
-    return Number(notes, notes.note("less", notes.real(a.name), notes.real(b.name)), (None,) * len(a.slopes))
-
-
-def _floor(notes: Notes, a: Number) -> Number:
-    return Number(notes, notes.note("rounded_down", notes.real(a.name)), (None,) * len(a.slopes))
+def _flat(operation: str, notes: Notes, *operands: Number) -> Number:
+    """Of what has no slope."""
+    names = (notes.real(a.name) for a in operands)
+    return Number(notes, notes.note(operation, *names), (None,) * len(operands[0].slopes))
 
 
 #: What formulas may use besides ``np.where``.
@@ -189,9 +189,9 @@ RULES = {
     np.negative: _negative,
     np.sqrt: _sqrt,
     np.arctan2: _arctan2,
-    np.less: _less,
-    np.floor: _floor,
-    np.greater: lambda notes, a, b: _less(notes, b, a),
+    np.less: partial(_flat, "less"),
+    np.floor: partial(_flat, "rounded_down"),
+    np.greater: lambda notes, a, b: _flat("less", notes, b, a),
 }
 
 
@@ -213,9 +213,6 @@ def write_function(
     taken = ["camera: CameraView", *(f"{parameter}: number" for parameter in parameters), *more]
     head = f"def {name}({', '.join(taken)}):"
     source = "\n    ".join([head, *body]) + "\n"
-    path = f"<{name} {zlib.crc32(source.encode())} of {lanes}>"
-    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
     known = {**vars(simd), "angle": angle, "CameraView": CameraView, "of_lens": of_lens, "turn": turn}
     known["number"] = simd.TYPES[lanes].number
-    exec(compile(source, path, "exec"), known)
-    return wp.func(known[name])
+    return wp.func(defined(name, f"{source}# of {lanes}\n", known))

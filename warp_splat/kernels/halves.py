@@ -43,6 +43,16 @@ def widened(half: wp.uint16) -> float:
 def widened(half: vec16h) -> vec16: ...
 
 
+@wp.func
+def widened(whole: float):
+    return whole  # it is
+
+
+@wp.func
+def widened(whole: vec16):
+    return whole
+
+
 @wp.func_native(
     "unsigned x; __builtin_memcpy(&x, &value, 4); "
     "return (unsigned short)((x + (((unsigned)bits >> shift) & 65535u)) >> 16);"

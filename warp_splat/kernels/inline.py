@@ -11,13 +11,24 @@ import linecache
 import textwrap
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import warp as wp
 
 from warp_splat.errors import InputError
 
+Part = wp.Function | Callable
 
-def kernel_of_parts(module_options: dict, **parts: wp.Function | Callable) -> Callable:
+
+def defined(name: str, source: str, names: dict) -> Callable:
+    """The function ``name`` of a text that may refer to ``names``, where Warp finds its source."""
+    path = f"<{name} {zlib.crc32(source.encode())}>"
+    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)
+    exec(compile(source, path, "exec"), names)
+    return names[name]
+
+
+def kernel_of_parts(module_options: dict, **parts: Part) -> Callable:
     """A decorator: the kernel with the bodies of ``parts`` in place of ``a, b = part(c, d)``, in a module of its own.
 
     Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end. It may
@@ -30,22 +41,20 @@ def kernel_of_parts(module_options: dict, **parts: wp.Function | Callable) -> Ca
 
     def decorate(function: Callable) -> wp.Kernel:
         definition, names = _parsed(function)
-        taken = {
-            node.id for node in ast.walk(definition) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
-        }
+        nodes = [node for node in ast.walk(definition) if isinstance(node, ast.Name)]
+        taken = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
         taken |= {parameter.arg for parameter in definition.args.args}
+        assembly = _Assembly(parts, names, taken, dict(function.__annotations__))
         definition.decorator_list = []
-        asked: dict[str, type] = {}
-        definition.body = [line for old in definition.body for line in _expanded(old, parts, names, taken, asked)]
-        definition.args.args[1:1] = [ast.arg(name) for name in asked]
+        definition.body = assembly.expanded(definition.body)
+        more = [ast.arg(name) for name in assembly.types if name not in function.__annotations__]
+        definition.args.args[1:1] = more
         for parameter in definition.args.args:
             parameter.annotation = ast.Name(f"type_of_{parameter.arg}", ast.Load())
-            names[parameter.annotation.id] = (function.__annotations__ | asked)[parameter.arg]
+            names[parameter.annotation.id] = assembly.types[parameter.arg]
         source = ast.unparse(ast.fix_missing_locations(ast.Module([definition], [])))
-        path = f"<{function.__qualname__} {zlib.crc32(source.encode())}>"
-        linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
-        exec(compile(source, path, "exec"), names)
-        return wp.kernel(module="unique", module_options=dict(module_options))(names[function.__name__])
+        kernel = defined(function.__name__, source, names)
+        return wp.kernel(module="unique", module_options=dict(module_options))(kernel)
 
     return decorate
 
@@ -57,70 +66,70 @@ def _parsed(function: Callable) -> tuple[ast.FunctionDef, dict]:
     return definition, {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
 
 
-def _expanded(
-    line: ast.stmt, parts: dict[str, wp.Function | Callable], names: dict, taken: set[str], asked: dict[str, type]
-) -> list[ast.stmt]:
-    """What stands for a statement of the kernel, whose own variables are ``taken``; see :func:`_inlined`."""
-    if isinstance(line, ast.If):
-        line.body = [new for old in line.body for new in _expanded(old, parts, names, taken, asked)]
-    if isinstance(line, ast.Assign) and isinstance(line.value, ast.Call) and isinstance(line.value.func, ast.Name):
-        part = line.value.func.id
-        if part in parts:
-            function = getattr(parts[part], "func", parts[part])
-            body = _inlined(part, function, line.targets[0], line.value.args, names, taken, asked)
-            return [new for old in body for new in _expanded(old, parts, names, taken, asked)]
-    return [line]
+@dataclass
+class _Assembly:
+    """What is known while a kernel is put together."""
 
+    parts: dict[str, Part]
+    names: dict  # what the kernel's text refers to
+    taken: set[str]  # the kernel's own variables
+    types: dict[str, type]  # of its parameters
 
-def _inlined(
-    part: str,
-    function: Callable,
-    target: ast.expr,
-    arguments: list[ast.expr],
-    names: dict,
-    taken: set[str],
-    asked: dict[str, type],
-) -> list[ast.stmt]:
-    """The body of ``function``, its own names behind that of the part.
+    def expanded(self, lines: list[ast.stmt]) -> list[ast.stmt]:
+        """Statements with the bodies of parts in place of their calls."""
+        found = []
+        for line in lines:
+            if isinstance(line, ast.If):
+                line.body = self.expanded(line.body)
+            call = line.value if isinstance(line, ast.Assign) else None
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in self.parts:
+                found += self.expanded(self.inlined(call.func.id, line.targets[0], call.args))
+            else:
+                found.append(line)
+        return found
 
-    ``names`` learns what it refers to, ``asked`` which parameters it takes that are no variables of the kernel.
-    """
-    definition, known = _parsed(function)
-    parameters = [parameter.arg for parameter in definition.args.args]
-    given = dict(zip(parameters, [argument.id for argument in arguments], strict=False))
-    given |= {name: name for name in parameters[len(arguments) :]}
-    beyond = [name for name in parameters[len(arguments) :] if name not in taken]
-    asked |= {name: inspect.get_annotations(function, eval_str=True)[name] for name in beyond}
-    nodes = [node for node in ast.walk(definition) if isinstance(node, ast.Name)]
-    own = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
-    renamed = {}
-    for name in {node.id for node in nodes} - set(given):
-        if name in own or (name in known and (name in taken or names.get(name, known[name]) is not known[name])):
-            renamed[name] = f"{part}_{name}"
-        if name in known:
-            names[renamed.get(name, name)] = known[name]
-    for node in nodes:
-        node.id = given[node.id] if node.id in given else renamed.get(node.id, node.id)
-    body = [
-        line for line in definition.body if not (isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant))
-    ]
-    answer, returns = body.pop(), [node for node in ast.walk(definition) if isinstance(node, ast.Return)]
-    if returns != [answer] or own & set(given):
-        raise InputError(
-            f"{part} {function.__name__}: expected a function that returns once, at its end, and changes none of its "
-            "parameters; give what changes a name of its own, and choose with pick instead of if."
-        )
-    targets = target.elts if isinstance(target, ast.Tuple) else [target]
-    values = answer.value.elts if isinstance(answer.value, ast.Tuple) else [answer.value]
-    if len(values) != len(targets):
-        raise InputError(
-            f"{part} {function.__name__}: expected a function that returns {len(targets)} values, one after another, "
-            f"found {len(values)}; Projection.{part} says which."
-        )
-    read = {node.id for value in values for node in ast.walk(value) if isinstance(node, ast.Name)}
-    if read.isdisjoint({place.id for place in targets}):
-        return body + [ast.Assign([place], value) for place, value in zip(targets, values, strict=True)]
-    # a target may be an argument: all values come before it changes
-    found = [f"{part}_returned{i}" for i in range(len(values))]
-    body += [ast.Assign([ast.Name(name, ast.Store())], value) for name, value in zip(found, values, strict=True)]
-    return body + [ast.Assign([place], ast.Name(name, ast.Load())) for place, name in zip(targets, found, strict=True)]
+    def inlined(self, part: str, target: ast.expr, arguments: list[ast.expr]) -> list[ast.stmt]:
+        """The body of a part, its own names behind that of the part."""
+        function = getattr(self.parts[part], "func", self.parts[part])
+        definition, known = _parsed(function)
+        parameters = [parameter.arg for parameter in definition.args.args]
+        given = dict(zip(parameters, [argument.id for argument in arguments], strict=False))
+        given |= {name: name for name in parameters[len(arguments) :]}
+        beyond = [name for name in parameters[len(arguments) :] if name not in self.taken]
+        self.types |= {name: inspect.get_annotations(function, eval_str=True)[name] for name in beyond}
+        nodes = [node for node in ast.walk(definition) if isinstance(node, ast.Name)]
+        own = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
+        renamed = {}
+        for name in {node.id for node in nodes} - set(given):
+            another = name in known and self.names.get(name, known[name]) is not known[name]
+            if name in own or another or (name in known and name in self.taken):
+                renamed[name] = f"{part}_{name}"
+            if name in known:
+                self.names[renamed.get(name, name)] = known[name]
+        for node in nodes:
+            node.id = given[node.id] if node.id in given else renamed.get(node.id, node.id)
+        is_text = lambda line: isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)  # noqa: E731
+        body = [line for line in definition.body if not is_text(line)]
+        name = f"{part} {function.__name__}"
+        answer, returns = body.pop(), [node for node in ast.walk(definition) if isinstance(node, ast.Return)]
+        if returns != [answer] or own & set(given):
+            raise InputError(
+                f"{name}: expected a function that returns once, at its end, and changes none of its "
+                "parameters; give what changes a name of its own, and choose with pick instead of if."
+            )
+        targets = target.elts if isinstance(target, ast.Tuple) else [target]
+        values = answer.value.elts if isinstance(answer.value, ast.Tuple) else [answer.value]
+        if len(values) != len(targets):
+            raise InputError(
+                f"{name}: expected a function that returns {len(targets)} values, one after another, "
+                f"found {len(values)}; Projection.{part} says which."
+            )
+        read = {node.id for value in values for node in ast.walk(value) if isinstance(node, ast.Name)}
+        if read.isdisjoint({place.id for place in targets}):
+            return body + [ast.Assign([place], value) for place, value in zip(targets, values, strict=True)]
+        # a target may be an argument: all values come before it changes
+        found = [f"{part}_returned{i}" for i in range(len(values))]
+        body += [ast.Assign([ast.Name(name, ast.Store())], value) for name, value in zip(found, values, strict=True)]
+        return body + [
+            ast.Assign([place], ast.Name(name, ast.Load())) for place, name in zip(targets, found, strict=True)
+        ]

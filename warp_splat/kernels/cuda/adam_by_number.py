@@ -25,13 +25,6 @@ def make_adam_by_number(sparse: bool, halves: bool = False) -> wp.Kernel:
     """``sparse``: only of Gaussians that are drawn; ``halves``: moments in 16 bits."""
     moment = HALF[1] if halves else float
 
-    @wp.func
-    def wide(x: moment):
-        if wp.static(halves):
-            return widened(x)
-        else:
-            return x
-
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adam(
         first: int,
@@ -58,7 +51,7 @@ def make_adam_by_number(sparse: bool, halves: bool = False) -> wp.Kernel:
                 firsts = wp.array(ptr=tables_out[table, FIRSTS], shape=(i + 1,), dtype=moment)
                 seconds = wp.array(ptr=tables_out[table, SECONDS], shape=(i + 1,), dtype=moment)
                 value, m, v = adam_step_of(
-                    values[i], grads[i], wide(firsts[i]), wide(seconds[i]),
+                    values[i], grads[i], widened(firsts[i]), widened(seconds[i]),
                     numbers[table, RATE], numbers[table, EPS], numbers[table, PER_ROOT],
                     numbers[table, BETA1], numbers[table, REST1], numbers[table, BETA2], numbers[table, REST2],
                 )  # fmt: skip

@@ -36,10 +36,7 @@ def through(family: Family, learned: bool = False) -> Projection:
         notes = Notes()
         place, slopes, seen = image_of(notes, family, *(Number(notes, name) for name in "xyz"), learned=learned)
         place = [np.where(seen, number, NOWHERE) for number in place] if family.wide else place
-        turns = [
-            [Number(notes, notes.note("turn", "camera", str(axis), str(column), "z")) for axis in range(3)]
-            for column in range(3)
-        ]
+        turns = [[notes.turn(axis, column) for axis in range(3)] for column in range(3)]
         rows = [sum(slope * entry for slope, entry in zip(row, turn, strict=True)) for row in slopes for turn in turns]
         more = COEFFICIENTS if learned else ()
         return write_function(f"{family.formula.__name__}_lens", notes, "xyz", [*place, *rows], lanes, more)

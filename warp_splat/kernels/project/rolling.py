@@ -47,10 +47,7 @@ def make_expose(family: Family, lanes: int, steps: int = STEPS) -> wp.Function:
     """
     notes = Notes()
     given = {name: Number(notes, name) for name in GIVEN}
-    camera = [
-        [Number(notes, notes.note("turn", "camera", str(row), str(column), GIVEN[-1])) for column in range(3)]
-        for row in range(3)
-    ]
+    camera = [[notes.turn(row, column) for column in range(3)] for row in range(3)]
     world = [list(column) for column in zip(*camera, strict=True)]
     w, d = (_times(world, [given[f"{name}{axis}"] for axis in "xyz"]) for name in "wd")
     o = [given[f"o{axis}"] for axis in "xyz"]

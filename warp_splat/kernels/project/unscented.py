@@ -18,9 +18,7 @@ import warp as wp
 
 from warp_splat.kernels.formula import Notes, Number, write_function
 from warp_splat.kernels.project import COEFFICIENTS, Projection
-from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.project.lens import NOWHERE, OUTLINE, image_of
-from warp_splat.kernels.simd import TYPES
 from warp_splat.lenses.formulas import PINHOLE, Family
 
 STEP = 3.0**0.5  # standard deviations
@@ -30,22 +28,9 @@ LEAST = 1.0e-30  # px^2 or px^4, of what has a root
 @functools.cache
 def make_identity(lanes: int) -> wp.Function:
     """The camera's own axes: the outline, not the lens, makes an image of them."""
-    number = TYPES[lanes].number
-
-    @wp.func
-    def identity(camera: CameraView, x: number, y: number, z: number):
-        return (
-            x,
-            y,
-            turn(camera, 0, 0, z),
-            turn(camera, 0, 1, z),
-            turn(camera, 0, 2, z),
-            turn(camera, 1, 0, z),
-            turn(camera, 1, 1, z),
-            turn(camera, 1, 2, z),
-        )
-
-    return identity
+    notes = Notes()
+    turns = [notes.turn(row, column) for row in range(2) for column in range(3)]
+    return write_function("identity", notes, "xyz", [Number(notes, "x"), Number(notes, "y"), *turns], lanes)
 
 
 @functools.cache
