@@ -31,9 +31,10 @@ def defined(name: str, source: str, names: dict) -> Callable:
 def kernel_of_parts(module_options: dict, **parts: Part) -> Callable:
     """A decorator: the kernel with the bodies of ``parts`` in place of ``a, b = part(c, d)``, in a module of its own.
 
-    Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end. It may
-    call other parts. Parameters beyond the arguments are the kernel's variables of these names; where it has none, it
-    takes one more parameter, behind its first. A part that is never called need not be a Warp function.
+    Arguments of such a call are variables. A part changes none of its parameters, and returns once, at its end; one in
+    place of ``part(c, d)`` returns nothing. It may call other parts. Parameters beyond the arguments are the kernel's
+    variables of these names; where it has none, it takes one more parameter, behind its first. A part that is never
+    called need not be a Warp function.
 
     Raises:
         InputError: if a part does otherwise.
@@ -79,16 +80,17 @@ class _Assembly:
         """Statements with the bodies of parts in place of their calls."""
         found = []
         for line in lines:
-            if isinstance(line, ast.If):
+            if isinstance(line, ast.If | ast.For | ast.While):
                 line.body = self.expanded(line.body)
-            call = line.value if isinstance(line, ast.Assign) else None
+            call = line.value if isinstance(line, ast.Assign | ast.Expr) else None
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in self.parts:
-                found += self.expanded(self.inlined(call.func.id, line.targets[0], call.args))
+                target = line.targets[0] if isinstance(line, ast.Assign) else None
+                found += self.expanded(self.inlined(call.func.id, target, call.args))
             else:
                 found.append(line)
         return found
 
-    def inlined(self, part: str, target: ast.expr, arguments: list[ast.expr]) -> list[ast.stmt]:
+    def inlined(self, part: str, target: ast.expr | None, arguments: list[ast.expr]) -> list[ast.stmt]:
         """The body of a part, its own names behind that of the part."""
         function = getattr(self.parts[part], "func", self.parts[part])
         definition, known = _parsed(function)
@@ -111,12 +113,15 @@ class _Assembly:
         is_text = lambda line: isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)  # noqa: E731
         body = [line for line in definition.body if not is_text(line)]
         name = f"{part} {function.__name__}"
-        answer, returns = body.pop(), [node for node in ast.walk(definition) if isinstance(node, ast.Return)]
-        if returns != [answer] or own & set(given):
+        returns = [node for node in ast.walk(definition) if isinstance(node, ast.Return)]
+        if returns != ([body[-1]] if target else []) or own & set(given):
             raise InputError(
                 f"{name}: expected a function that returns once, at its end, and changes none of its "
                 "parameters; give what changes a name of its own, and choose with pick instead of if."
             )
+        if not target:
+            return body
+        answer = body.pop()
         targets = target.elts if isinstance(target, ast.Tuple) else [target]
         values = answer.value.elts if isinstance(answer.value, ast.Tuple) else [answer.value]
         if len(values) != len(targets):

@@ -37,6 +37,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, total, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
@@ -85,15 +86,88 @@ def aligned(address: wp.uint64):
     return (address + wp.uint64(63)) & wp.uint64(0xFFFFFFFFFFFFFFC0)
 
 
+@wp.func
+def corner(bins: BinsView, tile: int):
+    """Center of a tile's first pixel [px]."""
+    return float((tile % bins.tiles_x) * TILE) + 0.5, float((tile // bins.tiles_x) * TILE) + 0.5
+
+
+def walk(bins, near, start, count, way, x0, y0, out, begin, step, finish):
+    """The loop over ``count`` instances of a list and the blocks that they reach, of which kernels put in the text.
+
+    From ``start`` on, or (``way`` -1) towards it. ``near`` has room for AHEAD splats. Parts of the kernel, for which
+    ``out`` is: ``begin`` with a splat, its answer goes to ``step`` with a block; ``finish`` says whether to stop there.
+    """
+    boxes = mat_boxes()
+    for number in range(count):
+        k = start + number
+        if wp.static(way < 0):
+            k = start + count - 1 - number
+        ahead = number & (AHEAD - 1)
+        if ahead == 0:
+            if wp.static(way > 0):
+                for j in range(wp.min(AHEAD, count - number - AHEAD)):
+                    ask(bins.splats, bins.instances[k + AHEAD + j])
+            for j in range(wp.min(AHEAD, count - number)):  # alone, many reads are under way at a time
+                near[j] = bins.splats[bins.instances[k + way * j]]
+            for j in range(wp.min(AHEAD, count - number)):
+                boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
+        splat = near[ahead]
+        box = boxes[ahead]
+        here = vec16(float(k - start))
+        own = begin(k, here, out)
+        by = box[2]
+        while by <= box[3]:
+            dy = offset_y(splat.mean, y0, by)
+            bx = box[0]
+            while bx <= box[1]:
+                block = (4 * by + bx) & (BLOCKS - 1)
+                dx = offset_x(splat.mean, x0, bx)
+                step(k, splat, dx, dy, block, here, own, out)
+                bx += 1
+            by += 1
+        stopped = finish(k, splat, ahead, out)
+        if stopped:
+            break
+
+
 @functools.cache
 def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     CHANNELS = variant.channels
     T, WALKED, RGB, DEPTH, STATE = 0, BLOCKS, 2 * BLOCKS, 5 * BLOCKS, (2 + CHANNELS) * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
-    fall_at = make_falloff(variant.falloff).value
+    fall_at, way = make_falloff(variant.falloff).value, 1
 
-    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def begin(k, here, out):
+        """Instances walked."""
+        return here + vec16(1.0)
+
+    def step(k, splat, dx, dy, block, here, walked, kept_out, s, alphas, t_min):
+        fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+        alpha = alpha_of(fall * splat.opacity, alphas)
+        behind = advance(s[T + block], alpha, t_min)
+        w = weight(s[T + block], alpha, behind)
+        if wp.static(variant.keep):
+            kept_out[k, block] = s[T + block]
+        for channel in range(3):
+            row = RGB + channel * BLOCKS + block
+            s[row] = fma(w, splat.color[channel], s[row])
+        if wp.static(CHANNELS > 3):
+            s[DEPTH + block] = fma(w, splat.depth, s[DEPTH + block])
+        s[T + block] = behind
+        s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
+
+    def finish(k, splat, ahead, out, s):
+        stopped = bool(False)  # the whole tile
+        if ahead == AHEAD - 1:
+            alive = vec16(0.0)
+            for block in range(BLOCKS):
+                alive = alive + where_less(s[T + block], vec16(0.0), vec16(0.0), s[T + block])
+            stopped = total(alive) == 0.0
+        return stopped
+
+    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
     def blend(
         first: int,  # tile of this slice
         bins: BinsView,
@@ -108,11 +182,10 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         kept_out: wp.array2d[vec16],  # [M, BLOCKS] transmittance in front of each Gaussian
     ):
         tile = first + wp.tid()
-        span = bins.ranges[tile]
+        start = bins.ranges[tile][0]
         column = (tile % bins.tiles_x) * TILE
         line = (tile // bins.tiles_x) * TILE
-        x0 = float(column) + 0.5
-        y0 = float(line) + 0.5
+        x0, y0 = corner(bins, tile)
         room = mat_room()
         # rows of lanes: T, instances walked, sums of w color and of w z
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
@@ -121,48 +194,8 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             s[T + block] = vec16(1.0)
         for row in range(WALKED, s.shape[0]):  # as a constant, a blend that takes half as long again
             s[row] = vec16(0.0)
-        end = span[0] + wp.min(span[1] - span[0], max_steps)
-        boxes = mat_boxes()
-        for k in range(span[0], end):
-            ahead = (k - span[0]) & (AHEAD - 1)
-            if ahead == 0:
-                for j in range(wp.min(AHEAD, end - k - AHEAD)):
-                    ask(bins.splats, bins.instances[k + AHEAD + j])
-                for j in range(wp.min(AHEAD, end - k)):  # alone, many reads are under way at a time
-                    near[j] = bins.splats[bins.instances[k + j]]
-                for j in range(wp.min(AHEAD, end - k)):
-                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
-            splat = near[ahead]
-            box = boxes[ahead]
-            walked = vec16(float(k - span[0] + 1))
-            by = box[2]
-            while by <= box[3]:
-                dy = offset_y(splat.mean, y0, by)
-                bx = box[0]
-                while bx <= box[1]:
-                    block = (4 * by + bx) & (BLOCKS - 1)
-                    dx = offset_x(splat.mean, x0, bx)
-                    fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-                    alpha = alpha_of(fall * splat.opacity, alphas)
-                    behind = advance(s[T + block], alpha, t_min)
-                    w = weight(s[T + block], alpha, behind)
-                    if wp.static(variant.keep):
-                        kept_out[k, block] = s[T + block]
-                    for channel in range(3):
-                        row = RGB + channel * BLOCKS + block
-                        s[row] = fma(w, splat.color[channel], s[row])
-                    if wp.static(CHANNELS > 3):
-                        s[DEPTH + block] = fma(w, splat.depth, s[DEPTH + block])
-                    s[T + block] = behind
-                    s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
-                    bx += 1
-                by += 1
-            if ahead == AHEAD - 1:
-                alive = vec16(0.0)
-                for block in range(BLOCKS):
-                    alive = alive + where_less(s[T + block], vec16(0.0), vec16(0.0), s[T + block])
-                if total(alive) == 0.0:
-                    break
+        length = wp.min(bins.ranges[tile][1] - start, max_steps)
+        walk(bins, near, start, length, way, x0, y0, kept_out, begin, step, finish)
         for block in range(BLOCKS):
             s[T + block] = wp.max(s[T + block], -s[T + block])
             final_out[tile, block] = s[T + block]

@@ -11,9 +11,10 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.cpu.adjoint import folded, vec8
-from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
+from warp_splat.kernels.cpu.adjoint import folded
+from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, corner, walk
 from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
@@ -66,11 +67,29 @@ def row_of_splat(rows: wp.array2d[float], splat: int):
 @functools.cache
 def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
     """The sums of weights times channels; nothing stands behind them."""
-    fall_at, WIDTH = make_falloff(variant.falloff).value, AT_ONCE
+    fall_at, WIDTH, way = make_falloff(variant.falloff).value, AT_ONCE, 1
     T, WALKED, SUMS, STATE = 0, BLOCKS, 2 * BLOCKS, (2 + AT_ONCE) * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
 
-    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def begin(k, here, out, bins, rows):
+        return row_of_splat(rows, bins.instances[k])
+
+    def step(k, splat, dx, dy, block, here, mine, out, s, alphas, channels):
+        fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+        alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
+        w = times(alpha, s[T + block])
+        if some(w):
+            s[T + block] = fma(-alpha, s[T + block], s[T + block])
+            row = SUMS + block * WIDTH
+            channel = int(0)
+            while channel < channels:
+                s[row + channel] = fma(w, mine[channel], s[row + channel])
+                channel += 1
+
+    def finish(k, splat, ahead, out):
+        return False
+
+    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
     def blend_channels(
         first: int,
         bins: BinsView,
@@ -85,8 +104,7 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
-        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
+        x0, y0 = corner(bins, tile)
         room = mat_room()
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
@@ -95,38 +113,8 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
             s[WALKED + block] = count[tile, block]
         for row in range(SUMS, s.shape[0]):
             s[row] = vec16(0.0)
-        end = start + steps[tile]
-        boxes = mat_boxes()
-        for k in range(start, end):
-            ahead = (k - start) & (AHEAD - 1)
-            if ahead == 0:
-                for j in range(wp.min(AHEAD, end - k)):
-                    near[j] = bins.splats[bins.instances[k + j]]
-                for j in range(wp.min(AHEAD, end - k)):
-                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
-            splat = near[ahead]
-            box = boxes[ahead]
-            mine = row_of_splat(rows, bins.instances[k])
-            here = vec16(float(k - start))
-            by = box[2]
-            while by <= box[3]:
-                dy = offset_y(splat.mean, y0, by)
-                bx = box[0]
-                while bx <= box[1]:
-                    block = (4 * by + bx) & (BLOCKS - 1)
-                    dx = offset_x(splat.mean, x0, bx)
-                    fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-                    alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
-                    w = times(alpha, s[T + block])
-                    if some(w):
-                        s[T + block] = fma(-alpha, s[T + block], s[T + block])
-                        row = SUMS + block * WIDTH
-                        channel = int(0)
-                        while channel < channels:
-                            s[row + channel] = fma(w, mine[channel], s[row + channel])
-                            channel += 1
-                    bx += 1
-                by += 1
+        length = steps[tile]
+        walk(bins, near, start, length, way, x0, y0, pixels_out, begin, step, finish)
         numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
@@ -148,7 +136,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     By ``absolute``, instead of the means' gradients the sums of their magnitudes over the pixels, and no others. With
     ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
-    pixel, geometry = make_reverse_step(mode, variant.falloff, vec16)
+    (pixel, geometry), way = make_reverse_step(mode, variant.falloff, vec16), -1
     WIDTH = most or AT_ONCE  # of a block's numbers
     geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     T, ADJ_T, WALKED, UP = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS
@@ -156,7 +144,55 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     GRADS = CHANNEL + (0 if geometric else WIDTH)
     mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
 
-    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def begin(k, here, slots_out, bins, rows, s):
+        row = int(SUMS)
+        while row < SUMS + slots_out.shape[1]:
+            s[row] = vec16(0.0)
+            row += 1
+        return row_of_splat(rows, bins.instances[k])
+
+    def step(k, splat, dx, dy, block, here, mine, out, s, alphas, channels):
+        up = UP + block * WIDTH
+        lit = vec16(0.0)
+        channel = int(0)
+        while channel < channels:
+            if wp.static(most > 0):
+                meant = equal(here, s[RANK + block * WIDTH + channel])
+                lit = lit + pick(meant, s[up + channel], vec16(0.0))
+            else:
+                lit = fma(s[up + channel], mine[channel], lit)
+            channel += 1
+        front, adj_front, w, part = pixel(
+            dx, dy, splat.root, splat.opacity, s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit
+        )
+        s[T + block] = front
+        s[ADJ_T + block] = adj_front
+        for grad in range(CHANNEL):
+            s[SUMS + grad] = s[SUMS + grad] + part[grad]
+        if wp.static(not geometric):
+            if some(w):
+                channel = int(0)
+                while channel < channels:
+                    row = SUMS + CHANNEL + channel
+                    s[row] = fma(w, s[up + channel], s[row])
+                    channel += 1
+
+    def finish(k, splat, ahead, slots_out, s):
+        sums = vec_geometry()
+        grad = int(CHANNEL)
+        while grad < slots_out.shape[1]:
+            slots_out[k, grad] = folded(s, SUMS + grad)
+            grad += 1
+        for grad in range(CHANNEL):
+            sums[grad] = folded(s, SUMS + grad)
+        mean, conic = geometry(
+            wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], splat.root, splat.opacity
+        )
+        write_geometry(slots_out, k, mean, conic)
+        slots_out[k, OPACITY] = sums[OPACITY]
+        return False
+
+    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
     def adj_channels(
         first: int,
         bins: BinsView,
@@ -174,8 +210,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
-        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
+        x0, y0 = corner(bins, tile)
         room = mat_room()
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * (SUMS + GRADS)), shape=(AHEAD,), dtype=Splat2D)
@@ -188,71 +223,8 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         if wp.static(most > 0):
             chosen = wp.array(ptr=s.ptr + wp.uint64(64 * RANK), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
             into_lanes(ranks, 0, channels, tile, bins.tiles_x, chosen, WIDTH)
-        boxes = mat_boxes()
-        sums = vec_geometry()
-        halves = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(2 * GRADS,), dtype=vec8)
-        quarters = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(4 * GRADS,), dtype=wp.vec4)
-        for back in range(steps[tile]):
-            k = start + steps[tile] - 1 - back
-            ahead = back & (AHEAD - 1)
-            if ahead == 0:
-                for j in range(wp.min(AHEAD, steps[tile] - back)):
-                    near[j] = bins.splats[bins.instances[k - j]]
-                for j in range(wp.min(AHEAD, steps[tile] - back)):
-                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
-            splat = near[ahead]
-            box = boxes[ahead]
-            mine = row_of_splat(rows, bins.instances[k])
-            here = vec16(float(k - start))
-            row = int(SUMS)
-            while row < SUMS + slots_out.shape[1]:
-                s[row] = vec16(0.0)
-                row += 1
-            by = box[2]
-            while by <= box[3]:
-                dy = offset_y(splat.mean, y0, by)
-                bx = box[0]
-                while bx <= box[1]:
-                    block = (4 * by + bx) & (BLOCKS - 1)
-                    dx = offset_x(splat.mean, x0, bx)
-                    up = UP + block * WIDTH
-                    lit = vec16(0.0)
-                    channel = int(0)
-                    while channel < channels:
-                        if wp.static(most > 0):
-                            meant = equal(here, s[RANK + block * WIDTH + channel])
-                            lit = lit + pick(meant, s[up + channel], vec16(0.0))
-                        else:
-                            lit = fma(s[up + channel], mine[channel], lit)
-                        channel += 1
-                    front, adj_front, w, part = pixel(
-                        dx, dy, splat.root, splat.opacity,
-                        s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit,
-                    )  # fmt: skip
-                    s[T + block] = front
-                    s[ADJ_T + block] = adj_front
-                    for grad in range(CHANNEL):
-                        s[SUMS + grad] = s[SUMS + grad] + part[grad]
-                    if wp.static(not geometric):
-                        if some(w):
-                            channel = int(0)
-                            while channel < channels:
-                                row = SUMS + CHANNEL + channel
-                                s[row] = fma(w, s[up + channel], s[row])
-                                channel += 1
-                    bx += 1
-                by += 1
-            grad = int(CHANNEL)
-            while grad < slots_out.shape[1]:
-                slots_out[k, grad] = folded(halves, quarters, grad)
-                grad += 1
-            for grad in range(CHANNEL):
-                sums[grad] = folded(halves, quarters, grad)
-            mean, conic = geometry(
-                wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], splat.root, splat.opacity
-            )
-            write_geometry(slots_out, k, mean, conic)
-            slots_out[k, OPACITY] = sums[OPACITY]
+        length = steps[tile]
+        walk(bins, near, start, length, way, x0, y0, slots_out, begin, step, finish)
         for k in range(start + steps[tile], bins.ranges[tile][1]):
             for grad in range(slots_out.shape[1]):
                 slots_out[k, grad] = 0.0

@@ -6,9 +6,10 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, mat_boxes, offset_x, offset_y, reach
+from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, corner, walk
 from warp_splat.kernels.cpu.channels import pixel_of
 from warp_splat.kernels.falloff import make_falloff
+from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import opaque
@@ -18,12 +19,36 @@ from warp_splat.kernels.structs import BinsView
 @functools.cache
 def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
     """Places in the tile's list of the ``most`` strongest, those weights, and the place of the median."""
-    fall_at = make_falloff(variant.falloff).value
+    fall_at, way = make_falloff(variant.falloff).value, 1
     T, WALKED, MEDIAN, WEIGHT, RANK = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS, (3 + most) * BLOCKS
     STATE = (3 + 2 * most) * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
 
-    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def begin(k, here, out):
+        return 0
+
+    def step(k, splat, dx, dy, block, here, own, out, s, alphas):
+        fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+        t = s[T + block]
+        alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
+        behind = fma(-alpha, t, t)
+        s[T + block] = behind
+        known = s[MEDIAN + block]
+        s[MEDIAN + block] = where_less(vec16(0.5), t, where_less(vec16(0.5), behind, known, here), known)
+        w = times(alpha, t)
+        place = here
+        for j in range(most):  # each as strong as it is pushes the weaker ones down
+            best = s[WEIGHT + j * BLOCKS + block]
+            rank = s[RANK + j * BLOCKS + block]
+            s[WEIGHT + j * BLOCKS + block] = wp.max(w, best)
+            s[RANK + j * BLOCKS + block] = where_less(best, w, place, rank)
+            place = where_less(best, w, rank, place)
+            w = wp.min(w, best)
+
+    def finish(k, splat, ahead, out):
+        return False
+
+    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
     def strongest(
         first: int,
         bins: BinsView,
@@ -37,8 +62,7 @@ def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
-        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
+        x0, y0 = corner(bins, tile)
         room = mat_room()
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
@@ -49,44 +73,8 @@ def make_strongest(variant: BlendVariant, most: int) -> wp.Kernel:
             for j in range(most):
                 s[WEIGHT + j * BLOCKS + block] = vec16(0.0)
                 s[RANK + j * BLOCKS + block] = vec16(-1.0)
-        end = start + steps[tile]
-        boxes = mat_boxes()
-        half = vec16(0.5)
-        for k in range(start, end):
-            ahead = (k - start) & (AHEAD - 1)
-            if ahead == 0:
-                for j in range(wp.min(AHEAD, end - k)):
-                    near[j] = bins.splats[bins.instances[k + j]]
-                for j in range(wp.min(AHEAD, end - k)):
-                    boxes[j] = reach(near[j].mean, near[j].extent, x0, y0)
-            splat = near[ahead]
-            box = boxes[ahead]
-            here = vec16(float(k - start))
-            by = box[2]
-            while by <= box[3]:
-                dy = offset_y(splat.mean, y0, by)
-                bx = box[0]
-                while bx <= box[1]:
-                    block = (4 * by + bx) & (BLOCKS - 1)
-                    dx = offset_x(splat.mean, x0, bx)
-                    fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-                    t = s[T + block]
-                    alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
-                    behind = fma(-alpha, t, t)
-                    s[T + block] = behind
-                    known = s[MEDIAN + block]
-                    s[MEDIAN + block] = where_less(half, t, where_less(half, behind, known, here), known)
-                    w = times(alpha, t)
-                    place = here
-                    for j in range(most):  # each as strong as it is pushes the weaker ones down
-                        best = s[WEIGHT + j * BLOCKS + block]
-                        rank = s[RANK + j * BLOCKS + block]
-                        s[WEIGHT + j * BLOCKS + block] = wp.max(w, best)
-                        s[RANK + j * BLOCKS + block] = where_less(best, w, place, rank)
-                        place = where_less(best, w, rank, place)
-                        w = wp.min(w, best)
-                    bx += 1
-                by += 1
+        length = steps[tile]
+        walk(bins, near, start, length, way, x0, y0, median_out, begin, step, finish)
         numbers = wp.array(ptr=s.ptr + wp.uint64(64 * MEDIAN), shape=((STATE - MEDIAN) * LANES,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
