@@ -29,7 +29,7 @@ RULES = {
 }
 #: Plumbing: loops and steps restated so that they can be differentiated, and what carries values to and from them.
 _KNOWN = ("falloff.exp2_known", "step.opaque")
-_LOOP = ("cpu/adjoint.adj_blend", "cpu/adjoint.folded")
+_LOOP = ("cpu/blend.walk", *(f"cpu/adjoint.{name}" for name in ("adj_blend", "begin", "step", "finish", "folded")))
 _WALK = ("cpu/taped.walk", "cpu/taped.spread", "cpu/taped.collect", "falloff.fall_value", *_KNOWN)
 PLUMBING = {
     "manual": _LOOP,
@@ -61,7 +61,7 @@ class _Specialize(ast.NodeTransformer):
     """Removes docstrings, and the branches of ``if wp.static(...)`` that a mode does not take."""
 
     def __init__(self, mode: str):
-        self.known = {"mode": mode, "CHANNELS": 3}
+        self.known = {"mode": mode, "CHANNELS": 3, "way": -1}
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         super().generic_visit(node)

@@ -248,7 +248,7 @@ def sentences() -> dict[str, list[tuple]]:
                 "`stepwise` has {} in all, `manual` {}.",
                 *(f.rules(mode) + f.plumbing(mode) for mode in ("stepwise", "manual")),
             ),
-            ("it saves a third: {} against {}.", f.rules("stepwise"), f.rules("manual")),
+            ("it saves almost half: {} against {}.", f.rules("stepwise"), f.rules("manual")),
             ("`stored` takes {} to {} times the adjoint", *f.span(f.stored_to_reversible(), f.one)),
             ("What it costs is {} times the memory", round(f.mebibytes("stored") / f.mebibytes("manual"))),
         ],
