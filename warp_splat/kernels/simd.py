@@ -13,7 +13,9 @@ derivative by hand, too: Warp 1.19 silently leaves out the generated one.)
 Masks are 1 or 0. Masks, constants, whole and rounded numbers have no derivative.
 """
 
+import inspect
 import re
+from collections.abc import Callable
 from typing import NamedTuple
 
 import warp as wp
@@ -42,6 +44,16 @@ class Types(NamedTuple):
 
 
 TYPES = {1: Types(wp.float32, wp.int32, wp.vec2, wp.vec3, wp.vec4), LANES: Types(vec16, vec16i, vec32, vec48, vec64)}
+
+
+def func_of(number: type, **others: type) -> Callable[[Callable], wp.Function]:
+    """A decorator: wp.func of a function whose parameters are all of ``number``, but for ``others``."""
+
+    def decorate(function: Callable) -> wp.Function:
+        function.__annotations__ = {name: others.get(name, number) for name in inspect.signature(function).parameters}
+        return wp.func(function)
+
+    return decorate
 
 
 def _fused(number: str, builtin: str) -> str:

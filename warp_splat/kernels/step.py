@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import LN_2, LOG2_E, Falloff, make_falloff
-from warp_splat.kernels.simd import LANES, fill, fma, inner, times, vec16, where_less
+from warp_splat.kernels.simd import LANES, fill, fma, func_of, inner, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import adj_alpha_blend, adj_alpha_of, alpha_of, exponent, odds_of
 
@@ -89,11 +89,8 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
         vec_sums = wp.types.matrix(shape=(CHANNEL, LANES), dtype=float)
     fall_at, step = make_falloff(falloff).value, make_step(falloff, number)
 
-    @wp.func
-    def by_hand(
-        dx: number, dy: number, root: wp.vec3, opacity: float,
-        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
-    ):  # fmt: skip
+    @func_of(number, root=wp.vec3, opacity=float, alphas=wp.vec2)
+    def by_hand(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit):
         fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
         raw = where_less(here, walked, fall * opacity, fill(-1.0, dx))
         odds = odds_of(alpha_of(raw, alphas))
@@ -120,11 +117,8 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
             sums[OPACITY] = adj_opacity
         return front, fma(w, lit, adj_t), w, sums
 
-    @wp.func
-    def stepwise(
-        dx: number, dy: number, root: wp.vec3, opacity: float,
-        t: number, adj_t: number, alphas: wp.vec2, here: number, walked: number, lit: number,
-    ):  # fmt: skip
+    @func_of(number, root=wp.vec3, opacity=float, alphas=wp.vec2)
+    def stepwise(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit):
         fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
         odds = odds_of(opaque(fall * opacity, alphas, here, walked))
         front = fma(t, odds, t)
@@ -156,15 +150,9 @@ def make_step(falloff: Falloff | int | None, number: type) -> wp.Function:
     """
     fall_known = make_falloff(falloff).known
 
-    @wp.func
-    def step(
-        dx: number, dy: number, xx: number, xy: number, yy: number, opacity: number, lit: number,
-        fall: number,
-        t: number,  # in front
-        adj_behind: number,  # dL/dT behind
-        alphas: wp.vec2, here: number, walked: number,
-    ):  # fmt: skip
-        """What the step adds to the loss, T behind it seen as a quantity of weight dL/dT."""
+    @func_of(number, alphas=wp.vec2)
+    def step(dx, dy, xx, xy, yy, opacity, lit, fall, t, adj_behind, alphas, here, walked):
+        """What the step adds to the loss, from T in front; that behind is seen as a quantity of weight dL/dT."""
         alpha = opaque(times(fall_known(exponent(dx, dy, xx, xy, yy), fall), opacity), alphas, here, walked)
         w = times(alpha, t)
         return inner(w, lit) + inner(adj_behind, t - w)

@@ -19,7 +19,7 @@ from warp_splat.config import OUTLINE, OUTLINE_REACH
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.affine import make_pinhole
 from warp_splat.kernels.project.camera_view import CameraView
-from warp_splat.kernels.simd import TYPES, fill, fma, less, over, pick, root, times
+from warp_splat.kernels.simd import TYPES, fill, fma, func_of, less, over, pick, root, times
 
 LEAST_REST = wp.constant(1.0 - (OUTLINE / OUTLINE_REACH) ** 2)
 
@@ -32,28 +32,9 @@ def make_lens(lanes: int) -> wp.Function:
 @functools.cache
 def make_outline(lanes: int) -> wp.Function:
     """The mean and the rows of A that belong to the outline."""
-    number = TYPES[lanes].number
 
-    @wp.func
-    def outline(
-        camera: CameraView,
-        z: number,
-        px: number,
-        py: number,
-        a10: number,
-        a11: number,
-        a12: number,
-        a20: number,
-        a21: number,
-        a22: number,
-        t0: number,
-        t1: number,
-        t2: number,
-        sx: number,
-        sy: number,
-        sz: number,
-        drawn: number,
-    ):
+    @func_of(TYPES[lanes].number, camera=CameraView)
+    def outline(camera, z, px, py, a10, a11, a12, a20, a21, a22, t0, t1, t2, sx, sy, sz, drawn):
         one = fill(1.0, z)
         k = fill(OUTLINE, z)
         k_per_z = over(k, z)
