@@ -1,6 +1,7 @@
 """Kernels assembled from functions without a call. LLVM leaves long functions as calls, and so their adjoints.
 
-As calls, the projection takes 13 % longer and its adjoint 24 % (50,000 Gaussians, one thread, AVX-512).
+As calls, the projection takes 13 % longer and its adjoint 24 % (50,000 Gaussians, one thread, AVX-512). Loops that
+kernels share, and what each of them does in it, are parts as well (:func:`warp_splat.kernels.cpu.blend.walk`).
 """
 
 from __future__ import annotations
