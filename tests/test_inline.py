@@ -69,7 +69,8 @@ def test_functions_that_cannot_be_put_in_place_are_refused(part, message):
 def test_what_is_compiled_can_be_read():
     """What was assembled: names of a part stand in the kernel; what was written from a formula."""
     script = Path(__file__).parents[1] / "benchmarks" / "show_kernel.py"
-    for word, line in (("project", "    rotation_w = times(qw, rotation_scale)\n"), ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n")):
+    lines = {"project": "    rotation_w = times(qw, rotation_scale)\n"}
+    for word, line in (lines | {"perspective_lens": "    v0 = of_lens(camera, 15, z)\n"}).items():
         command = [sys.executable, script, word]
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=600)
         assert f"def {word}(" in done.stdout and line in done.stdout, done.stderr
