@@ -59,24 +59,11 @@ def inside(values: vec16, start: int, length: int):
 
 
 @wp.func
-def sixteen(rows: wp.array2d[float], row: int, start: int):
-    """Floats ``start`` .. ``start + 15`` of a row that holds them, as one element: read and written unaligned."""
-    place = wp.uint64(row) * wp.uint64(rows.shape[1]) + wp.uint64(start)
-    return wp.array(ptr=rows.ptr + wp.uint64(4) * place, shape=(1,), dtype=vec16)
-
-
-@wp.func
-def sixteen(rows: wp.array2d[wp.uint8], row: int, start: int):
-    place = wp.uint64(row) * wp.uint64(rows.shape[1]) + wp.uint64(start)
-    return wp.array(ptr=rows.ptr + place, shape=(1,), dtype=vec16b)
-
-
-@wp.func
-def neighbors(rows: wp.array2d[float], row: int, start: int):
+def neighbors(rows: wp.array2d[float], taps: wp.array2d[vec16], row: int, start: int):
     """Floats ``start`` .. ``start + 15`` of a row, 0 beyond its end."""
     length = rows.shape[1]
     if start + LANES <= length:
-        return sixteen(rows, row, start)[0]
+        return taps[row, start]
     values = vec16(0.0)
     for lane in range(length - start):
         values[lane] = rows[row, start + lane]
@@ -84,12 +71,12 @@ def neighbors(rows: wp.array2d[float], row: int, start: int):
 
 
 @wp.func
-def neighbors(rows: wp.array2d[wp.uint8], row: int, start: int):
+def neighbors(rows: wp.array2d[wp.uint8], taps: wp.array2d[vec16b], row: int, start: int):
     """The same of bytes, divided by 255."""
     length = rows.shape[1]
     values = vec16(0.0)
     if start + LANES <= length:
-        levels = sixteen(rows, row, start)[0]
+        levels = taps[row, start]
         for lane in range(LANES):
             values[lane] = float(levels[lane])
     else:
@@ -100,21 +87,31 @@ def neighbors(rows: wp.array2d[wp.uint8], row: int, start: int):
 
 @wp.struct
 class Pictures:
-    """What is compared."""
+    """What is compared, each as numbers and as taps: element p holds numbers p .. p + 15 of a row."""
 
     image: wp.array2d[float]  # [H, L]
+    image_taps: wp.array2d[vec16]  # [H, L - 15]
     limits: wp.vec2
     target: wp.array2d[float]  # [H, L], or nothing
+    target_taps: wp.array2d[vec16]  # [H, L - 15], or nothing
     levels: wp.array2d[wp.uint8]  # [H, L] the target times 255, or nothing
+    level_taps: wp.array2d[vec16b]  # [H, L - 15], or nothing
     centers: wp.vec2  # p, q
 
 
 @wp.func
-def photograph(target: wp.array2d[float], levels: wp.array2d[wp.uint8], row: int, start: int):
+def photograph(
+    target: wp.array2d[float],
+    target_taps: wp.array2d[vec16],
+    levels: wp.array2d[wp.uint8],
+    level_taps: wp.array2d[vec16b],
+    row: int,
+    start: int,
+):
     """:func:`neighbors` of the one of the two that has rows."""
     if levels.shape[0] > 0:
-        return neighbors(levels, row, start)
-    return neighbors(target, row, start)
+        return neighbors(levels, level_taps, row, start)
+    return neighbors(target, target_taps, row, start)
 
 
 @wp.func
@@ -206,9 +203,12 @@ def compare(
     band = first + wp.tid()
     # in front of the loop: read in it, the loss takes a third longer
     image = pictures.image
+    image_taps = pictures.image_taps
     limits = pictures.limits
     target = pictures.target
+    target_taps = pictures.target_taps
     levels = pictures.levels
+    level_taps = pictures.level_taps
     height = image.shape[0]
     length = image.shape[1]
     groups = missing.shape[0]
@@ -230,8 +230,8 @@ def compare(
             difference = zero
             for group in range(groups):
                 start = LANES * group
-                a = between(neighbors(image, ahead, start), limits) - vec16(p)
-                b = photograph(target, levels, ahead, start) - vec16(q)
+                a = between(neighbors(image, image_taps, ahead, start), limits) - vec16(p)
+                b = photograph(target, target_taps, levels, level_taps, ahead, start) - vec16(q)
                 x[group + 1] = inside(a, start, length)
                 y[group + 1] = inside(b, start, length)
                 delta = inside(a - b + vec16(p - q), start, length)
@@ -260,13 +260,17 @@ def adj_compare(
     ring_out: wp.array4d[vec16],  # [B, RING, G, SLOPES]
     blurred_out: wp.array4d[vec16],  # [B, ROWS, G, SLOPES]
     adj_image_out: wp.array2d[float],  # [H, L]
+    adj_taps_out: wp.array2d[vec16],  # [H, L - 15]
 ):
     band = first + wp.tid()
     # in front of the loop: read in it, the loss takes a third longer
     image = pictures.image
+    image_taps = pictures.image_taps
     limits = pictures.limits
     target = pictures.target
+    target_taps = pictures.target_taps
     levels = pictures.levels
+    level_taps = pictures.level_taps
     height = image.shape[0]
     length = image.shape[1]
     groups = slopes.shape[2] - 2
@@ -289,17 +293,16 @@ def adj_compare(
         while which < ROWS and row < bounds[band + 1]:
             for group in range(groups):
                 start = LANES * group
-                given = neighbors(image, row, start)
+                given = neighbors(image, image_taps, row, start)
                 a = between(given, limits) - vec16(p)
-                b = photograph(target, levels, row, start) - vec16(q)
+                b = photograph(target, target_taps, levels, level_taps, row, start) - vec16(q)
                 delta = a - b + vec16(p - q)
                 sign = where_less(zero, delta, vec16(1.0), where_less(delta, zero, vec16(-1.0), zero))
                 adj = blurred[which, group, 0] + times(a, blurred[which, group, 1]) * 2.0
                 adj = sign * adj_l1 + (adj + times(b, blurred[which, group, 2])) * adj_ssim
                 adj = where_less(vec16(limits[0]), given, where_less(given, vec16(limits[1]), adj, zero), zero)
                 if start + LANES <= length:
-                    taken = sixteen(adj_image_out, row, start)
-                    taken[0] = adj
+                    adj_taps_out[row, start] = adj
                 else:
                     for lane in range(length - start):
                         adj_image_out[row, start + lane] = adj[lane]

@@ -142,7 +142,7 @@ class ImageLoss(torch.autograd.Function):
                     view(slopes, vec16),
                     *weights,
                 ],
-                [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32)],
+                [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)],
                 bounds=list(range(bands + 1)),
             )
             return adj.view(height, -1, CHANNELS), None, None, None
@@ -194,8 +194,9 @@ def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Te
     """What both kernels read of [H, L]: the target as floats or as bytes, the other is empty."""
     floats, levels = _by_type(target)
     return pack_struct(
-        ssim.Pictures, image=image, limits=wp.vec2(*limits), target=floats, levels=levels, centers=wp.vec2(*centers)
-    )
+        ssim.Pictures, image=image, image_taps=_taps(image), limits=wp.vec2(*limits), centers=wp.vec2(*centers),
+        target=floats, target_taps=_taps(floats), levels=levels, level_taps=_taps(levels, ssim.vec16b),
+    )  # fmt: skip
 
 
 def _dense(image: torch.Tensor, target: torch.Tensor, centers: torch.Tensor, limits: tuple[float, float]):
@@ -243,3 +244,10 @@ def _missing(groups: int, length: int) -> torch.Tensor:
     missing = torch.zeros(groups * LANES, dtype=torch.float32, device="cpu")
     missing[:length] = torch.from_numpy(np.repeat(share, CHANNELS))
     return missing.view(groups, LANES)
+
+
+def _taps(rows: torch.Tensor, dtype=vec16) -> wp.array:
+    """[..., P] numbers as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbors."""
+    shape = (*rows.shape[:-1], max(rows.shape[-1] - LANES + 1, 0))
+    strides = tuple(rows.element_size() * stride for stride in rows.stride())
+    return wp.array(ptr=rows.data_ptr(), dtype=dtype, shape=shape, strides=strides, device="cpu", copy=False)
