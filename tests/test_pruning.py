@@ -71,7 +71,7 @@ def test_an_image_loses_what_the_adjoint_says(device):
     upstream = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(splats).to(torch.device(device)).activated()
-    found = carried(gaussians, camera, setting, upstream.to(device))
+    found = carried(gaussians, setting.views[0], setting, upstream)
     lost = (found.adj_opacities * found.splats.opacities.detach()).cpu().double()
     whole = drawn(splats, setting, camera)
     for row in range(len(splats.means)):

@@ -86,12 +86,10 @@ def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None
     pictures = [opened.picture(splats) for splats in (before, after)]
     pairs = [[picture(view.camera, view.name) for picture in pictures] for view in views]
     changes = [np.abs(one.astype(int) - other).mean() for one, other in pairs]
-    chosen = np.argsort(changes, kind="stable")[::-1][:SHOWN]
-    sections = {}
-    for place, title in enumerate(("before", "after")):
-        rows = [(views[index], pairs[index][place]) for index in chosen]
-        sections[title] = [
-            (view.name, view.picture, render, f"PSNR {psnr(render, view.picture, view.mask):.2f} dB")
-            for view, render in rows
-        ]
+    sections: dict[str, list] = {"before": [], "after": []}
+    for index in np.argsort(changes, kind="stable")[::-1][:SHOWN]:
+        view = views[index]
+        for rows, render in zip(sections.values(), pairs[index], strict=True):
+            said = f"PSNR {psnr(render, view.picture, view.mask):.2f} dB"
+            rows.append((view.name, view.picture, render, said))
     contact_sheet(path, sections)

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.behind import put_behind
@@ -49,15 +48,18 @@ class ViewSetting(NamedTuple):
     background: torch.Tensor  # [3], or harmonics [16, 3]
 
 
-def carried(gaussians: Gaussians, camera: Camera, setting: ViewSetting, upstream: torch.Tensor) -> Carried:
+def carried(gaussians: Gaussians, view: View, setting: ViewSetting, upstream: torch.Tensor) -> Carried:
     """The adjoint of the blend of a view alone.
 
     Args:
         gaussians: activated, without gradients.
-        camera: of the view.
+        view: whose mask counts.
         setting: how it is rendered.
         upstream: gradient of the image, [H, W, 3].
     """
+    camera, upstream = view.camera, upstream.to(gaussians.means.device)
+    if view.mask is not None:
+        upstream = upstream * torch.from_numpy(view.mask).to(upstream)[..., None]
     options, driver, dropped = setting.options, driver_of(gaussians.means.device), Dropped()
     with torch.no_grad():
         splats = project(gaussians, camera, options, driver, dropped)
@@ -75,8 +77,7 @@ def carried(gaussians: Gaussians, camera: Camera, setting: ViewSetting, upstream
 def weights(gaussians: Gaussians, view: View, setting: ViewSetting) -> tuple[torch.Tensor, torch.Tensor]:
     """The share of a view's pixels that each Gaussian covers, [N] float64, and its depth [N], world units."""
     camera = view.camera
-    ones = torch.ones(camera.height, camera.width, 3, device=gaussians.means.device)
-    found = carried(gaussians, camera, setting, _masked(ones, view))
+    found = carried(gaussians, view, setting, torch.ones(camera.height, camera.width, 3))
     return found.adj_colors[:, 0].double() / (camera.height * camera.width), found.splats.depths
 
 
@@ -94,7 +95,7 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
     for number, view in enumerate(setting.views):
         camera, generator = view.camera, torch.Generator().manual_seed(number)
         signs = 2.0 * torch.randint(0, 2, (camera.height, camera.width, 3), generator=generator) - 1.0
-        found = carried(gaussians, camera, setting, _masked(signs.to(model.device), view))
+        found = carried(gaussians, view, setting, signs)
         whole += (found.adj_opacities.double() * found.splats.opacities.detach()) ** 2
         squares = (found.adj_colors.double() ** 2).mean(1)
         for degree in range(degrees):
@@ -103,9 +104,3 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
                 colors = project(gaussians, camera, fewer, driver_of(model.device), Dropped()).colors
             harmonics[:, degree] += squares * ((colors - found.splats.colors.detach()).double() ** 2).sum(1)
     return Costs(whole, harmonics)
-
-
-def _masked(upstream: torch.Tensor, view: View) -> torch.Tensor:
-    if view.mask is None:
-        return upstream
-    return upstream * torch.from_numpy(view.mask).to(upstream)[..., None]

@@ -15,13 +15,8 @@ from warp_splat.scene.types import Scene, visible
 ORBIT_SIZE = (980, 545)  # px
 ORBIT_VIEW = (1.4, 0.9)  # horizontal and vertical field of view, rad
 ORBIT_RADIUS = 5.0  # world units from the world's origin
-ORBIT_LENS = Camera(
-    *ORBIT_SIZE,
-    *(0.5 * np.array(ORBIT_SIZE) / np.tan(0.5 * np.array(ORBIT_VIEW))),
-    *(0.5 * np.array(ORBIT_SIZE)),
-    np.eye(3),
-    np.zeros(3),
-)
+HALF = 0.5 * np.array(ORBIT_SIZE)
+ORBIT_LENS = Camera(*ORBIT_SIZE, *(HALF / np.tan(0.5 * np.array(ORBIT_VIEW))), *HALF, np.eye(3), np.zeros(3))
 TURNS = 2  # of a spiral
 LARGEST_SPIRAL = 0.3  # times the distance of what it looks at
 KEY_FRAMES = 10  # between two cameras that a path passes: fewer show how a hand shook

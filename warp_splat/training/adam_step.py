@@ -47,11 +47,7 @@ def _launch(tables: list, numbers: list, keyed: list[int], count: int, radii: to
     of_tables = torch.tensor(numbers, dtype=torch.float32, device="cpu")
 
     def arguments(_types: Types, rows: slice) -> tuple[list, list]:
-        places = [
-            [t.data_ptr() + t.element_size() * size * rows.start for t in table]
-            for table, size in zip(tables, sizes, strict=True)
-        ]
-        addresses = torch.tensor(places, dtype=torch.int64, device="cpu")
+        addresses = torch.tensor(_addresses(tables, sizes, rows.start), dtype=torch.int64, device="cpu")
         shown = widths if radii is None else radii[rows]
         inputs = [rows.start, view(widths, wp.int32), view(keys, wp.int32), view(of_tables, wp.float32)]
         inputs.append(view(shown, wp.int32))
@@ -59,6 +55,14 @@ def _launch(tables: list, numbers: list, keyed: list[int], count: int, radii: to
 
     make = partial(make_adam, sparse=radii is not None, halves=tables[0][-1].dtype == HALF)
     launch_in_lanes(make, LANES, count, arguments)
+
+
+def _addresses(tables: list, widths: list[int], row: int) -> list[list[int]]:
+    """Where a row begins in each tensor of each table."""
+    return [
+        [t.data_ptr() + t.element_size() * width * row for t in table]
+        for table, width in zip(tables, widths, strict=True)
+    ]
 
 
 def _launch_numbers(tables: list, numbers: list, keys: list[int], count: int, radii: torch.Tensor | None) -> None:
@@ -71,10 +75,5 @@ def _launch_numbers(tables: list, numbers: list, keys: list[int], count: int, ra
     of_all += [numbered.mat_numbers(*chain(*numbers), *[0.0] * 7 * missing), view(shown, wp.int32)]
     for start in range(0, count, MOST // max(widths)):
         rows = min(count - start, MOST // max(widths))
-        places = [
-            t.data_ptr() + t.element_size() * width * start
-            for table, width in zip(tables, widths, strict=True)
-            for t in table
-        ]
-        outputs = [numbered.mat_addresses(*places, *[0] * 4 * missing)]
+        outputs = [numbered.mat_addresses(*chain(*_addresses(tables, widths, start)), *[0] * 4 * missing)]
         launch(kernel, rows * max(widths), [start, rows, *of_all], outputs, device=device)

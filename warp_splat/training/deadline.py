@@ -15,9 +15,8 @@ import torch
 from warp_splat.errors import InputError
 from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.scene.types import Scene
-from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import LearnOptions, TrainConfig
-from warp_splat.training.plan import Cost, Reached, StepTime, Task, as_flags, comparable, plan_for, seconds_of
+from warp_splat.training.plan import Cost, Reached, StepTime, Task, as_flags, comparable, plan_for, seconds_of, task_of
 from warp_splat.training.trainer import Trainer
 from warp_splat.training.trial import suggested
 
@@ -81,10 +80,7 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     measured_as = suggested(config, scene).changed(settle_from_iter=1, minutes=0.0)  # its set stays as it is
     trial = Trainer(scene, measured_as, processes)
     trial.warm_up()
-    camera, start = scene.train[0].camera, len(trial.model)
-    pixels = camera.width * camera.height
-    most = config.grow.max_gaussians or expected_gaussians(start, pixels)[0]
-    task = Task(pixels, start, most, trial.photographs.shares)
+    task = task_of(config, scene, trial.photographs.shares)
     measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
     for row in measured:
         say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")
@@ -105,9 +101,8 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
 
 def _measured(trial: Trainer, task: Task) -> list[StepTime]:
     """Steps of the smallest size and the full one, and of as many Gaussians as there may be."""
-    found, end = [], trial.config.learn.iterations
-    for iteration in (1, end):
-        found.append(_of_step(trial, iteration))
+    end = trial.config.learn.iterations
+    found = [_of_step(trial, 1), _of_step(trial, end)]
     if task.most > task.start:
         _multiply(trial, task.most)
         found.append(_of_step(trial, end))

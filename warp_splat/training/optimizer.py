@@ -27,6 +27,11 @@ def power(base: float, steps: float, of: int = 1) -> float:
     return float(_root(base, of) ** Decimal(steps))
 
 
+def log_linear(start: float, end: float, iteration: int, last: int) -> float:
+    """From ``start`` to ``end``, which it has from step ``last`` on, evenly in the logarithm; 0 if ``start`` is."""
+    return start * power(end / start, min(iteration, last), last) if start else 0.0
+
+
 @functools.cache
 def _root(base: float, degree: int) -> Decimal:
     return Decimal(base) ** (Decimal(1) / degree)
@@ -80,10 +85,9 @@ class Optimizer:
         In the last ``cooldown`` steps all fall to a tenth as well, which settles what constant rates keep in motion.
         """
         self.iteration, options = iteration, self.options
-        steps, fall = options.position_lr_max_steps, options.position_lr_final / options.position_lr_init
-        rate = options.position_lr_init * power(fall, min(iteration, steps), steps)
+        start, end, last = options.position_lr_init, options.position_lr_final, options.position_lr_max_steps
         rates = {
-            "means": rate * self.extent,
+            "means": log_linear(start, end, iteration, last) * self.extent,
             "sh_dc": options.feature_lr,
             "sh_rest": options.feature_lr / 20.0,
             "opacities": options.opacity_lr,

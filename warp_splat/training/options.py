@@ -6,17 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
-from warp_splat.config import (
-    ADJOINTS,
-    LAST_PORT,
-    LENSES,
-    LOSS_SPACES,
-    LPIPS_HELP,
-    OPTIMIZERS,
-    PORT,
-    PORT_HELP,
-    PROJECTIONS,
-)
+from warp_splat.config import ADJOINTS, LAST_PORT, LENSES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers, data, flag, flags_of, growing, learning, machinery, rendering, reporting
 from warp_splat.training.growth import GROWTHS
@@ -40,7 +30,7 @@ class DataOptions:
     white_background: bool = data(False, "composite on white instead of black", "-w")
     invert_masks: bool = data(False, "of the masks in masks/, the dark part counts, not the bright one")
     lens: str = data("undistort", "photographs with distortion: as pinholes would take them, or as is", choices=LENSES)
-    loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=LOSS_SPACES)
+    loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=("srgb", "log"))
     start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")
 
@@ -78,7 +68,9 @@ class LearnOptions:
         0, "from this step nothing grows, the cooldown runs, and training ends; 0: as --iterations says", schedule=True
     )
     sh_interval: int = learning(1000, "steps between two rises of the active SH degree", least=1, schedule=True)
-    optimizer_type: str = learning("default", "sparse_adam updates only what the image shows", choices=OPTIMIZERS)
+    optimizer_type: str = learning(
+        "default", "sparse_adam updates only what the image shows", choices=("default", "sparse_adam")
+    )
     half_moments: bool = learning(False, "keep Adam's moments in 16 bits, rounded at random: less memory")
     coarse: int = learning(1, "start with images of this fraction of their size", choices=(1, 2, 4, 8))
     coarse_until_iter: int = learning(3000, "by this step the size has doubled to the full one", least=1, schedule=True)

@@ -16,6 +16,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from warp_splat.flags import flags_of
+from warp_splat.scene.types import Scene
+from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import TrainConfig, schedule_of
 from warp_splat.training.photographs import shrink_at
 
@@ -58,6 +60,14 @@ class Task(NamedTuple):
     start: int  # Gaussians at the start
     most: int  # Gaussians that the shape is made for
     shares: tuple[float, ...]  # of --coarse_until_iter, where sizes end
+
+
+def task_of(config: TrainConfig, scene: Scene, shares: tuple[float, ...]) -> Task:
+    """Of a scene; ``shares`` as :func:`shares_of_size` gives them."""
+    camera = scene.train[0].camera
+    pixels = camera.width * camera.height
+    start = len(scene.start.splats.means) if scene.start else len(scene.points)
+    return Task(pixels, start, config.grow.max_gaussians or expected_gaussians(start, pixels)[0], shares)
 
 
 def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:

@@ -17,11 +17,10 @@ from warp_splat.evaluation.metrics import cc_psnr, ssim
 from warp_splat.flags import default_of
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.types import Scene
-from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import shares_of_size, shrink_at
-from warp_splat.training.plan import Task, of_length
+from warp_splat.training.plan import of_length, task_of
 from warp_splat.training.seams import Verdict
 from warp_splat.training.trainer import Trainer
 
@@ -81,11 +80,12 @@ def _tried(
     """A verdict by trainings on each part that is suggested, beside those that are sure and those taken before it."""
     count = FOLDS * (1 + len(suggested))
     steps = steps_of(config, scene, count)
+    lacking = ""
     if len(scene.train) < FEWEST:
         lacking = f"{len(scene.train)} photographs are too few to hold some back"
-        return {name: _untried(verdict, lacking) for name, verdict in suggested.items()}
-    if steps < SHORTEST:
+    elif steps < SHORTEST:
         lacking = f"this training is too short, which leaves {max(steps, 0)} steps of {SHORTEST} for it"
+    if lacking:
         return {name: _untried(verdict, lacking) for name, verdict in suggested.items()}
     say(f"Trying {', '.join(suggested)}: {count} trainings of {steps} steps on small images ...")
     found, base = {}, sure
@@ -151,11 +151,8 @@ def quality(config: TrainConfig, scene: Scene, parts: list[str], steps: int, fol
 
 def _shortened(config: TrainConfig, scene: Scene, steps: int) -> TrainConfig:
     """The shape of the training over fewer steps, with images that stay small."""
-    camera, learn = scene.train[0].camera, config.learn
-    start = scene.start.splats.means.shape[0] if scene.start else len(scene.points)
-    most = config.grow.max_gaussians or expected_gaussians(start, camera.width * camera.height)[0]
-    task = Task(camera.width * camera.height, start, most // SHRINK, ())
-    short = of_length(config, steps / learn.end_or_plan, task)
+    task = task_of(config, scene, ())
+    short = of_length(config, steps / config.learn.end_or_plan, task._replace(most=task.most // SHRINK))
     return short.changed(
         iterations=steps, minutes=0.0, coarse=SHRINK, coarse_by="steps", coarse_until_iter=SHRINK * steps
     )

@@ -19,7 +19,7 @@ from warp_splat.runtime.timers import stage
 from warp_splat.scene.coverage import few_photographs
 from warp_splat.scene.depth_maps import read_inverse_depths
 from warp_splat.scene.types import Scene, View, visible
-from warp_splat.training.optimizer import power
+from warp_splat.training.optimizer import log_linear
 from warp_splat.training.parts import DepthOptions
 from warp_splat.training.seams import Setting, Step, Verdict
 
@@ -74,8 +74,8 @@ class Depth:
 
     def weight(self, iteration: int) -> float:
         """Log-linear between those at start and end, as in the reference."""
-        start, final = self.options.depth_l1_weight_init, self.options.depth_l1_weight_final
-        return start * power(final / start, min(iteration, self.iterations), self.iterations) if start else 0.0
+        start, end = self.options.depth_l1_weight_init, self.options.depth_l1_weight_final
+        return log_linear(start, end, iteration, self.iterations)
 
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """Add the term, of points and of maps."""

@@ -22,7 +22,7 @@ from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import GREEN, NEEDED, gains_of
 from warp_splat.scene.neighbors import guessed
 from warp_splat.scene.types import Scene
-from warp_splat.training.optimizer import power
+from warp_splat.training.optimizer import log_linear
 from warp_splat.training.parts import ExposureOptions
 from warp_splat.training.seams import Setting, Step, Verdict
 
@@ -69,8 +69,7 @@ class Exposure:
 
     def _rate(self, iteration: int) -> float:
         """Log-linear between the rates at start and end."""
-        start, final = self.options.exposure_lr_init, self.options.exposure_lr_final
-        return start * power(final / start, min(iteration, self.end), self.end) if start else 0.0
+        return log_linear(self.options.exposure_lr_init, self.options.exposure_lr_final, iteration, self.end)
 
     def load(self) -> None:
         """Compile and load the kernels."""

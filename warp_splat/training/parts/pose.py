@@ -113,16 +113,14 @@ class Pose:
         if view in self.places:
             place = self.places[view]
             twist = in_pairs(self.ways[place] * self.moves[place].double()[:, None])
-        if not self.options.pose_intrinsics or intrinsics_of(view) not in self.lenses:
-            return CameraParameters(
-                camera, twist, torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-            )
         free = self.options.pose_intrinsics == "all"
         units = [camera.fx, camera.fy, free * camera.width, free * camera.height]
         given = [camera.fx, camera.fy, camera.cx, camera.cy]
-        given, units = torch.tensor([given, units], dtype=torch.float64, device=self.stretches.device)
-        stretch = self.stretches[self.lenses[intrinsics_of(view)]].double()
-        return CameraParameters(camera, twist, given + units * stretch)
+        lens, units = torch.tensor([given, units], dtype=torch.float64)
+        if self.options.pose_intrinsics and intrinsics_of(view) in self.lenses:
+            stretch = self.stretches[self.lenses[intrinsics_of(view)]].double()
+            lens = lens.to(stretch.device) + units.to(stretch.device) * stretch
+        return CameraParameters(camera, twist, lens)
 
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """Add the squared distance from what was given."""
