@@ -1,4 +1,9 @@
-"""The training loop: a step, then what is due between two steps."""
+"""The training loop: a step, then what is due between two steps.
+
+A step is two methods of the trainer. ``update`` changes the model by the gradients of the step before, and
+``differentiate`` finds those of another view. Between two steps the held-out views are measured, models and checkpoints
+are written, and the viewer draws. This page and those two methods are the whole of a training.
+"""
 
 from __future__ import annotations
 
