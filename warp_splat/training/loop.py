@@ -119,11 +119,10 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         "seconds": run.seconds,
     }
     run.history.append(record)
-    for steps_ago, loss in zip(reversed(range(len(values))), values, strict=True):
-        run.events.write(run.iteration - steps_ago * trainer.processes.count, {"train/loss": loss})
+    first = run.iteration - (len(values) - 1) * trainer.processes.count
+    points = [(first + place * trainer.processes.count, "train/loss", loss) for place, loss in enumerate(values)]
     shown = {f"{split}/psnr_on_the_way": record["psnr"], "gaussians": record["gaussians"], "seconds": record["seconds"]}
-    run.events.write(run.iteration, shown)
-    run.events.flush()
+    run.events.write(points + [(run.iteration, name, value) for name, value in shown.items()])
     text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"
     bar.set_postfix_str(text, refresh=False)
     if time.perf_counter() - run.preview > PREVIEW_SECONDS:

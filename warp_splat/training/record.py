@@ -192,8 +192,8 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     views, where = trainer.refined(views), trainer.where_taken()
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
     show_views(compared, run.folder, split, run.iteration, say)
-    run.events.write(run.iteration, {f"{split}/{name}": value for name, value in means.items()})
-    run.events.flush()
+    run.events.write((run.iteration, f"{split}/{name}", value) for name, value in means.items())
+    run.events.close()
     names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
     lines = [(what, run.folder / name) for what, name in names.items() if run.history or name != plot.name]
     if run.stages:

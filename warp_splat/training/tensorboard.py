@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,16 +23,17 @@ class EventLog:
     def __init__(self, folder: Path | None = None, begun: int = 0):
         self.writer = writer_class()(str(folder), purge_step=begun + 1, flush_secs=10) if folder else None
 
-    def write(self, iteration: int, values: Mapping[str, float]) -> None:
-        """A point of each curve, by its name."""
+    def write(self, points: Iterable[tuple[int, str, float]]) -> None:
+        """Points of curves: iteration, name of the curve, value."""
         if self.writer:
-            for name, value in values.items():
+            for iteration, name, value in points:
                 self.writer.add_scalar(name, value, iteration)
-
-    def flush(self) -> None:
-        """Put all into the file."""
-        if self.writer:
             self.writer.flush()
+
+    def close(self) -> None:
+        """Nothing follows."""
+        if self.writer:
+            self.writer.close()
 
 
 def writer_class() -> type[SummaryWriter]:
