@@ -51,7 +51,7 @@ def test_the_ends_of_every_range(tmp_path):
     file = some_file(20)
     file.splats.sh[0, 1:], file.splats.sh[1, 1:], file.splats.scales[2] = -4.0, 9.0, -30.0
     notes = []
-    written, _ = save_gaussians(tmp_path / "a.compressed.ply", file, report=notes.append)
+    written, *_ = save_gaussians(tmp_path / "a.compressed.ply", file, report=notes.append)
     found = load_gaussians(tmp_path / "a.compressed.ply", report=silent).splats
     assert notes == [
         "log scale of 1 of 20 Gaussians moved into -20..20",
@@ -64,7 +64,7 @@ def test_the_ends_of_every_range(tmp_path):
 
 
 def test_older_files_have_no_ranges_of_colors(tmp_path):
-    splats, _ = save_gaussians(tmp_path / "a.compressed.ply", some_file(300, 1), report=silent)
+    splats, *_ = save_gaussians(tmp_path / "a.compressed.ply", some_file(300, 1), report=silent)
     _, chunks, words, _ = tables(tmp_path / "a.compressed.ply", 300, 1)
     header = (tmp_path / "a.compressed.ply").read_bytes().split(b"end_header\n")[0]
     for name in "rgb":

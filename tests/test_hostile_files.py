@@ -63,7 +63,7 @@ def survive(folder, kind, data):
     tracemalloc.start()
     try:
         with warnings.catch_warnings(action="error"):
-            splats, antialiased = load_gaussians(path, report=lines.append)
+            splats, antialiased, _ = load_gaussians(path, report=lines.append)
     except InputError as error:
         assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 600 + 2 * len(str(path))
         return False

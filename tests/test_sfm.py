@@ -23,7 +23,7 @@ from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
-from warp_splat.sfm import stages
+from warp_splat.sfm import matching, stages
 from warp_splat.sfm.command import scene_for, sfm
 from warp_splat.sfm.video import sample_frames
 
@@ -82,9 +82,9 @@ def test_features_are_compared_without_blas(scene, monkeypatch):
     """pycolmap's has no locks, and gives two threads the same memory now and then; else it takes one thread."""
     library = ctypes.CDLL(sys.modules["pycolmap._core"].__file__)
     assert ctypes.c_int.in_dll(library, "_ZN5faiss31distance_compute_blas_thresholdE").value == 2**31 - 1
-    assert stages.avoid_blas()
-    monkeypatch.setattr(stages, "FAISS_THRESHOLD", "no_such_name")
-    assert not stages.avoid_blas()
+    assert matching.avoid_blas()
+    monkeypatch.setattr(matching, "FAISS_THRESHOLD", "no_such_name")
+    assert not matching.avoid_blas()
 
 
 def test_photographs_may_keep_their_lens(photos, scene, tmp_path):

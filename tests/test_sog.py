@@ -45,7 +45,7 @@ def sog_rows(path):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_sog_bytes_are_the_documented_layout(tmp_path, degree):
     file = some_file(37, (degree + 1) ** 2, antialiased=True)
-    splats, _ = save_gaussians(tmp_path / "a.sog", file, report=silent)
+    splats, *_ = save_gaussians(tmp_path / "a.sog", file, report=silent)
     meta, images = sog_parts(tmp_path / "a.sog")
     assert (meta["version"], meta["count"], meta["antialias"], meta["model"]) == (2, 37, True, "antialiased")
     assert {image.shape for name, image in images.items() if "centroids" not in name} == {(8, 8, 4)}
@@ -65,7 +65,7 @@ def test_sog_bytes_are_the_documented_layout(tmp_path, degree):
 
 def test_near_gaussians_become_near_pixels(tmp_path):
     before = some_file(2000, 1)
-    splats, _ = save_gaussians(tmp_path / "a.sog", before, report=silent)
+    splats, *_ = save_gaussians(tmp_path / "a.sog", before, report=silent)
     place = KDTree(before.splats.means).query(splats.means)[1]
     assert sorted(place) == list(range(2000))  # all of them, each with its own values
     for old, new in zip(before.splats, splats, strict=True):
@@ -79,7 +79,7 @@ def test_a_palette_stands_for_many_harmonics(tmp_path):
     kinds = rng.normal(scale=0.2, size=(300, 15, 3))
     splats = some_splats(12_000)
     splats.sh[:, 1:] = kinds[rng.integers(0, 300, 12_000)] + rng.normal(scale=0.003, size=(12_000, 15, 3))
-    written, _ = save_gaussians(tmp_path / "a.sog", SplatFile(splats), report=silent)
+    written, *_ = save_gaussians(tmp_path / "a.sog", SplatFile(splats), report=silent)
     read = load_gaussians(tmp_path / "a.sog", report=silent).splats
     assert sog_parts(tmp_path / "a.sog")[0]["shN"]["count"] <= 1500
     error = (read.sh[:, 1:] - written.sh[:, 1:]).std()

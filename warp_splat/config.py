@@ -147,9 +147,14 @@ class SfmConfig:
     frames: int = flag(150, "frames to take from a video: the sharpest of each of as many equal spans", least=3)
     matching: str = flag(
         "auto",
-        "which photographs to compare: exhaustive, all pairs; sequential, neighbors by name; auto: sequential for more "
-        "than 200 frames of a video",
-        choices=("auto", "exhaustive", "sequential"),
+        "which photographs to compare: exhaustive, all pairs; looks, those that look alike, and what fits to both; "
+        "sequential, neighbors by name; auto: looks from 100 photographs on",
+        choices=("auto", "exhaustive", "looks", "sequential"),
+    )
+    coordinates: str = flag(
+        "auto",
+        "scale, up and origin: auto, from GPS in the photographs if they have it; none; or a CSV file whose first line "
+        "is name,x,y,z (cameras in meters: east, north, up) or name,other,distance",
     )
     threads: int = flag(0, "CPU threads; 0: all cores")
     seed: int = flag(0, "seed of everything random", most=2**31 - 1)

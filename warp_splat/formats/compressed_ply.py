@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_splat.formats.coordinates import comments_of
 from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import Unexpected
 from warp_splat.formats.splats import SplatArrays, SplatFile
@@ -74,7 +75,7 @@ def save_compressed_ply(path: str | Path, file: SplatFile, report: Report = prin
         steps = np.clip(np.floor(HARMONIC_STEPS * harmonics) + 128, 0, 255).astype(np.uint8)
         rows = np.ascontiguousarray(steps.transpose(0, 2, 1)).reshape(count, 3 * (coefficients - 1))
         tables["sh"] = rows.view([(f"f_rest_{index}", "u1") for index in range(rows.shape[1])])[:, 0]
-    write_tables(path, tables, [ANTIALIASED] * file.antialiased)
+    write_tables(path, tables, [ANTIALIASED] * file.antialiased + comments_of(file.coordinates))
 
 
 def read_compressed(tables: PlyTables) -> SplatArrays:

@@ -8,6 +8,7 @@ import numpy as np
 
 from warp_splat.config import ConvertConfig
 from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_environment
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
@@ -27,7 +28,8 @@ def convert(config: ConvertConfig) -> int:
     source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, iteration)
     if os.path.exists(config.target) and os.path.samefile(source, config.target):
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")
-    before = before._replace(antialiased=bool(trained["antialiasing"]))
+    where = before.coordinates if is_file_of_gaussians(config.source) else read_coordinates(config.source)
+    before = before._replace(antialiased=bool(trained["antialiasing"]), coordinates=where)
     notes: list[str] = []
     before = save_gaussians(config.target, before, notes.append)
     after = load_gaussians(config.target)
@@ -49,6 +51,8 @@ def losses(before: SplatFile, after: SplatFile) -> list[str]:
         notes.append(f"SH degree {degrees[0]} became {degrees[1]}")
     if before.antialiased != after.antialiased:
         notes.append("the mark that the Gaussians are antialiased")
+    if before.coordinates and not after.coordinates:
+        notes.append("where they are in the world (coordinates.json)")
     if len(old.means) != len(new.means):
         return [*notes, f"{len(old.means) - len(new.means)} of {len(old.means)} Gaussians"]
     for name, unit, largest, change in _changes(old, new):

@@ -2,7 +2,8 @@
 
 A mesh primitive of POINTS whose attributes are POSITION, ROTATION (x y z w), SCALE (standard deviations), OPACITY
 (0..1) and SH_DEGREE_l_COEF_n, one VEC3 for each coefficient. Axes of glTF: left, up, forward. COLOR_0 is what viewers
-without the extension show. The extension has no word for Mip-Splatting: "extras" keeps the PLY file's.
+without the extension show. The extension has no word for Mip-Splatting: "extras" keeps the PLY file's. Those of the
+file say where in the world the Gaussians are.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from warp_splat import __version__
 from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_bytes, write_text
+from warp_splat.formats.coordinates import kept
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
 from warp_splat.formats.reading import Unexpected, entries_of, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
@@ -28,6 +30,7 @@ AXES = "LUF"
 UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may require
 COLOR_SPACE = "srgb_rec709_display"  # that of the photographs
 RENDER_MODE = "SplatRenderMode"
+COORDINATES = "coordinates"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
 LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the color
 GLB_BYTES = 2**32 - 1  # the length in the header of a .glb file has four bytes
@@ -51,6 +54,8 @@ def save_gltf(path: str | Path, file: SplatFile, report: Report = print) -> None
     attributes = _attributes(turned(file.splats, frame(AXES).T), report)
     data = b"".join(array.tobytes() for array in attributes.values())
     document = _describe(attributes, file.antialiased)
+    if coordinates := kept(file.coordinates, "x west, y up, z north"):
+        document["extras"] = {COORDINATES: coordinates}
     if path.suffix.lower() == ".gltf":
         buffer = path.with_name(f"{path.stem}.{hashlib.sha256(data).hexdigest()[:8]}.bin")
         write_bytes(buffer, data)
@@ -96,7 +101,8 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
     antialiased = all(_render_mode(piece) == "mip" for piece, _ in placed)
-    return SplatFile(_joined(parts), antialiased)
+    extras = document.json.get("extras")
+    return SplatFile(_joined(parts), antialiased, kept(extras.get(COORDINATES)) if isinstance(extras, dict) else None)
 
 
 def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:

@@ -190,16 +190,20 @@ def _parse_namespace(text: str, path: Path) -> dict[str, object]:
         raise InputError(f"{path}: expected one line Namespace(name=literal, ...), found another ({error}).") from error
 
 
-def write_cameras(folder: str | Path, views_test: Sequence[View], views_train: Sequence[View]) -> None:
+def write_cameras(
+    folder: str | Path, views_test: Sequence[View], views_train: Sequence[View], coordinates: dict | None = None
+) -> None:
     """Write ``cameras.json`` for viewers: test cameras first, then training cameras, at their original sizes.
 
-    Positions are camera centers and rotations camera-to-world, both in world coordinates; focal lengths in pixels.
+    Positions are camera centers and rotations camera-to-world, both in the frame of the scene; focal lengths in pixels.
+    Where the scene's ``coordinates`` are known, each camera has the "origin" of that frame in the world.
 
     Raises:
         InputError: if the file cannot be written.
     """
+    origin = {"origin": coordinates["origin"]} if coordinates else {}
     cameras = [
-        {"id": index, "img_name": view.name, **camera_entry(view.original)}
+        {"id": index, "img_name": view.name, **camera_entry(view.original), **origin}
         for index, view in enumerate([*views_test, *views_train])
     ]
     write_text(Path(folder) / CAMERAS, json.dumps(cameras, allow_nan=False))

@@ -13,6 +13,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.compressed_ply import is_compressed, read_compressed
+from warp_splat.formats.coordinates import comments_of, of_comments
 from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
@@ -50,7 +51,7 @@ def save_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
     names = (*POSITION, *NORMAL, *F_DC, *_rest_names(rest.shape[1]), "opacity", *SCALE, *ROTATION)
     table = np.concatenate(columns, axis=1, dtype="<f4")
     rows = table.view([(name, "<f4") for name in names])[:, 0]
-    write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased)
+    write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased + comments_of(file.coordinates))
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -110,16 +111,16 @@ def load_ply(path: str | Path, report: Report = print) -> SplatFile:
         report: called with one line if rows were left out.
 
     Returns:
-        The Gaussians as stored; whether a comment says that they are antialiased.
+        The Gaussians as stored; what comments say of them.
 
     Raises:
         InputError: if the file is missing, damaged, or not a PLY file of 3D Gaussians.
     """
     with reading(path, EXPECTED), open(path, "rb") as file:
         tables = PlyTables(file)
-        antialiased = not ANTIALIASED_READ.isdisjoint(tables.comments)
+        told = not ANTIALIASED_READ.isdisjoint(tables.comments), of_comments(tables.comments)
         if is_compressed(tables):
-            return SplatFile(finite_rows(read_compressed(tables), path, report), antialiased)
+            return SplatFile(finite_rows(read_compressed(tables), path, report), *told)
         vertex = tables.rows("vertex")
         names = vertex.dtype.names or ()
         rest_count = sum(name.startswith("f_rest_") for name in names)
@@ -138,7 +139,7 @@ def load_ply(path: str | Path, report: Report = print) -> SplatFile:
         means, base, rest, opacities, scales, quats = (columns_of(vertex, group) for group in columns)
         rest = rest.reshape(len(vertex), 3, rest_count // 3).transpose(0, 2, 1)
         splats = SplatArrays(means, np.concatenate([base[:, None], rest], axis=1), opacities[:, 0], scales, quats)
-        return SplatFile(finite_rows(splats, path, report), antialiased)
+        return SplatFile(finite_rows(splats, path, report), *told)
 
 
 def _rest_names(count: int) -> list[str]:

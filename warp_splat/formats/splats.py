@@ -33,6 +33,7 @@ class SplatFile(NamedTuple):
 
     splats: SplatArrays
     antialiased: bool = False  # trained, and to be rendered, with the opacities of Mip-Splatting (Yu et al. 2024)
+    coordinates: dict | None = None  # where in the world they are (formats/coordinates.py)
 
 
 def check_shapes(splats: SplatArrays) -> None:

@@ -40,6 +40,7 @@ def inspect(config: InspectConfig) -> int:
     findings += geometry.check_sky(subject)
     findings += geometry.check_axes(subject)
     findings += brightness.check_exposure(subject, measured)
+    findings += verdicts.check_coordinates(subject)
     findings += verdicts.check_names(subject)
     findings += verdicts.check_masks(subject)
     findings += verdicts.check_loading(subject, config.images)

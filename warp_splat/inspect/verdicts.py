@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.inspect.cost import forecast
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
@@ -50,6 +51,26 @@ def check_cameras(subject: Subject) -> Iterator[Finding]:
         yield Finding("intrinsics", "ok", f"focal lengths are {focal[0]:.2f} to {focal[-1]:.2f} widths of the image.")
     if 0 < len(subject.photos) < AT_LEAST:
         yield Finding("cameras", "warning", f"{len(subject.photos)} images are few: new views will be poor.")
+
+
+def check_coordinates(subject: Subject) -> Iterator[Finding]:
+    """Where the scene is in the world, and how well positions that were given for its photographs fit."""
+    try:
+        found = read_coordinates(subject.source)
+    except InputError as error:
+        yield Finding("coordinates", "error", str(error))
+        return
+    if found is None:
+        return
+    left_out, residuals = found.get("left_out", []), dict(found.get("residuals", {}))
+    fitting = sorted((size, name) for name, size in residuals.items() if name not in left_out)
+    text = f"{found.get('reference')}, origin at {', '.join(f'{x:.12g}' for x in found['origin'])}"
+    if fitting:
+        worst, name = fitting[-1]
+        text += f"; {len(fitting)} positions fit within {fitting[len(fitting) // 2][0]:.2g} m (median), "
+        text += f"the worst, {name}, within {worst:.2g} m"
+    rest = f"; {len(left_out)} were left out: {few(left_out)}" if left_out else ""
+    yield Finding("coordinates", "warning" if left_out else "ok", f"{text}{rest}.")
 
 
 def check_names(subject: Subject) -> Iterator[Finding]:

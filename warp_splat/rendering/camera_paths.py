@@ -59,15 +59,14 @@ def origin_orbit(count: int, lens: Camera = ORBIT_LENS) -> list[Camera]:
 
 
 def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
-    """The point nearest to all optical axes (least squares), the cameras' mean up, their mean distance from it."""
+    """The point nearest to all optical axes (least squares), the scene's up, the cameras' mean distance from it."""
     cameras = [view.camera for view in scene.train]
     across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
     center = np.linalg.lstsq(
         sum(across), sum(a @ camera.center for a, camera in zip(across, cameras, strict=True)), rcond=None
     )[0]
-    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     distance = float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
-    return center, up / np.linalg.norm(up), distance
+    return center, scene.up, distance
 
 
 def focus_orbit(scene: Scene, count: int, lens: Camera = ORBIT_LENS) -> list[Camera]:

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from typing import NoReturn
 
 
 @contextmanager
@@ -33,9 +34,10 @@ def interruptible() -> Iterator[list[int]]:
 
 def leaving_at_once() -> AbstractContextManager[None]:
     """Let Ctrl-C end the process instead of raising: in libraries that are half loaded, exceptions become others."""
-    return _handling((signal.SIGINT,), _leave)
+    return _handling((signal.SIGINT,), lambda number, frame: leave("warp-splat: interrupted before it began."))
 
 
-def _leave(*_: object) -> None:
-    os.write(2, b"warp-splat: interrupted before it began.\n")  # print may be what was interrupted
+def leave(words: str) -> NoReturn:
+    """End the process at once, as Ctrl-C does."""
+    os.write(2, f"{words}\n".encode())  # print may be what was interrupted
     os._exit(130)

@@ -10,6 +10,7 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
+from warp_splat.formats.coordinates import UP, read_coordinates
 from warp_splat.formats.splats import SplatFile
 
 
@@ -78,6 +79,17 @@ class Scene:
     def tracks(self) -> dict[str, Sightings]:
         """What each view saw of the points, by its name; empty if the scene does not say. Read when first asked for."""
         return self.find_tracks()
+
+    @cached_property
+    def coordinates(self) -> dict | None:
+        """Where the scene is in the world (``formats/coordinates.py``), if it says so."""
+        return read_coordinates(self.source) if self.source else None
+
+    @property
+    def up(self) -> np.ndarray:
+        """Away from the ground, [3], unit length: as coordinates say it, or the mean of the cameras."""
+        up = UP if self.coordinates else -np.mean([view.camera.rotation[1] for view in self.train], axis=0)
+        return up / np.linalg.norm(up)
 
     @property
     def linear(self) -> bool:

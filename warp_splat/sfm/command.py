@@ -21,6 +21,7 @@ from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, reason_of
 from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_json
+from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.photos import (
@@ -33,13 +34,14 @@ from warp_splat.scene.photos import (
     scene_of,
     sfm_hint,
 )
-from warp_splat.sfm import stages
+from warp_splat.sfm import mapping, stages
+from warp_splat.sfm.georeference import georeference
+from warp_splat.sfm.matching import match
 from warp_splat.text import few
 
 WORK = "sfm"  # the folder of the work inside the scene: what resuming needs
 LEAST = 3  # registered photographs; a scene of fewer shows nothing from another side
 FEW = 0.6  # share of registered photographs below which the user is told what to do
-EXHAUSTIVE_FRAMES = 200  # of a video: 20,000 pairs
 ADVICE = (
     "photographs should overlap by two thirds, show texture, be sharp, and be taken from different places, not by "
     "turning on the spot"
@@ -188,27 +190,28 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
     say(f"{len(names)} photographs, {lenses}, {config.threads} threads; work in {work}")
     database = work / "database.db"
     stages.extract(database, root, groups, config)
-    matching = config.matching
-    if matching == "auto":
-        many = root.parent == work and len(names) > EXHAUSTIVE_FRAMES
-        matching = "sequential" if many else "exhaustive"
-    pairs = stages.match(database, matching, config)
-    models = stages.reconstruct(database, root, work / "models", config)
+    pairs = match(database, config, say)
+    models = mapping.reconstruct(database, root, work / "models", config, say)
     sizes = {index: model.num_reg_images() for index, model in models.items()}
-    best = max(sizes, key=lambda index: sizes[index], default=None)
-    if best is None or sizes[best] < LEAST:
+    if sizes.get(0, 0) < LEAST:
         shutil.rmtree(work / "models")  # the next run may have another seed of luck, and more photographs
         raise InputError(
-            f"{root}: {sizes.get(best, 0)} of {len(names)} photographs could be registered, expected at least {LEAST} "
+            f"{root}: {sizes.get(0, 0)} of {len(names)} photographs could be registered, expected at least {LEAST} "
             f"({pairs} pairs of them fit together); {ADVICE}."
         )
-    model = models[best]
+    model, path = models[0], work / "models" / "0"
     registered = {model.image(index).name for index in model.reg_image_ids()}
-    stages.write_scene(work / "models" / str(best), root, scene, work / "scene.part", sizes[best], config)
+    where = georeference(model, database, config.coordinates, config.seed, say)
+    if where:
+        path = work / "placed"
+        path.mkdir(exist_ok=True)
+        model.write(path)
+    write_coordinates(scene, where)
+    stages.write_scene(path, root, scene, work / "scene.part", sizes[0], config)
     return {
         "photographs": len(names) + len(broken),
         "unreadable": broken,
-        "registered": sizes[best],
+        "registered": sizes[0],
         "unregistered": sorted(set(names) - registered),
         "registered_by_model": sorted(sizes.values(), reverse=True),
         "points": model.num_points3D(),

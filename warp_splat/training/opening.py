@@ -13,6 +13,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
+from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.ply import save_points
 from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
@@ -131,7 +132,8 @@ def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: boo
     others = {"train_test_exp": False, "linear_light": scene.linear}
     model_folder.write_cfg_args(folder, {**config.flat(), **others})
     write_config(folder, config)
-    model_folder.write_cameras(folder, scene.test, scene.train)
+    model_folder.write_cameras(folder, scene.test, scene.train, scene.coordinates)
+    write_coordinates(folder, scene.coordinates)
     remove_leftovers(folder)
     if not (continues and (folder / "input.ply").exists()):
         save_points(folder / "input.ply", scene.points, scene.colors)

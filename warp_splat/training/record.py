@@ -92,7 +92,7 @@ def _save_cameras(trainer: Trainer, folder: Path, beside: Path) -> None:
         return
     test = trainer.refined(scene.test)
     for place in (beside, folder):
-        model_folder.write_cameras(place, test, train)
+        model_folder.write_cameras(place, test, train, scene.coordinates)
     cameras = [(view.name, view.original) for view in (*train, *test)]
     write_colmap(folder / "colmap" / "sparse" / "0", cameras, scene.points, scene.colors)
 

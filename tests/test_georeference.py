@@ -1,0 +1,139 @@
+"""Scale, up and origin of a model, against positions that are known."""
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import MODEL_FROM_WORLD, read_coordinates, write_coordinates
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.sfm import stages
+from warp_splat.sfm.georeference import _gps, georeference
+
+UTM = np.array([691_000.25, 5_335_000.5, 520.0])
+COUNT = 16
+
+
+def model_of(centers, random):
+    """Cameras at centers [N, 3] (x east, y north, z up) that look level, in another frame."""
+    model = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(camera_id=1, model="PINHOLE", width=8, height=8, params=[8, 8, 4, 4])
+    model.add_camera_with_trivial_rig(lens)
+    for index, center in enumerate(centers):
+        forward = np.append(random.normal(size=2), 0.0)
+        forward /= np.linalg.norm(forward)
+        rotation = np.stack([np.cross(forward, (0, 0, 1)), (0, 0, -1), forward])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center)
+        image = pycolmap.Image(name=f"{index}.jpg", camera_id=1, image_id=index + 1)
+        model.add_image_with_trivial_frame(image, pose)
+    model.transform(pycolmap.Sim3d(0.037, pycolmap.Rotation3d(random.normal(size=3)), random.normal(size=3)))
+    return model
+
+
+def write_positions(path, world):
+    rows = [f"{index}.jpg,{x!r},{y!r},{z!r}" for index, (x, y, z) in enumerate(world.tolist())]
+    path.write_text("\n".join(["name,x,y,z", *rows]))
+    return str(path)
+
+
+def placed(model, found):
+    """Positions of the model's cameras in the world, by its coordinates."""
+    local = np.array([model.image(i + 1).projection_center() for i in range(COUNT)])
+    assert np.abs(local).max() < 100  # so float32 holds them
+    return local.astype(np.float32) @ MODEL_FROM_WORLD + np.array(found["origin"])
+
+
+@pytest.mark.parametrize("along", ["an area", "a line"])
+def test_positions_place_a_model_and_outliers_are_left_out(tmp_path, along):
+    random = np.random.default_rng(3)
+    centers = random.uniform(-20, 20, (COUNT, 3)) * ((1, 1, 0.1) if along == "an area" else (1, 0, 0))
+    model, world = model_of(centers, random), centers + UTM
+    noisy = world + random.normal(size=world.shape) * 1e-3
+    noisy[4] += (30, 0, 9)
+    found = georeference(model, tmp_path, write_positions(tmp_path / "a.csv", noisy), 0, print)
+    assert np.linalg.norm(placed(model, found) - world, axis=1).max() < 0.01
+    assert (
+        found["left_out"] == ["4.jpg"] and 25 < found["residuals"]["4.jpg"] < 40 and found["residuals"]["0.jpg"] < 0.01
+    )
+    down = np.array([model.image(i + 1).cam_from_world().rotation.matrix()[1] for i in range(COUNT)])
+    np.testing.assert_allclose(down, np.broadcast_to((0, 1, 0), down.shape), atol=0.01)
+
+
+def test_distances_give_the_scale_and_cameras_the_up(tmp_path):
+    random = np.random.default_rng(4)
+    centers = random.uniform(-5, 5, (COUNT, 3))
+    model = model_of(centers, random)
+    between = np.linalg.norm(centers[0] - centers[1]), np.linalg.norm(centers[2] - centers[3])
+    (tmp_path / "d.csv").write_text(f"name,other,distance\n0.jpg,1.jpg,{between[0]}\n2.jpg, 3.jpg, {between[1]}\n")
+    found = georeference(model, tmp_path, str(tmp_path / "d.csv"), 0, print)
+    world = placed(model, found)
+    np.testing.assert_allclose(world[:, 2] - world[0, 2], centers[:, 2] - centers[0, 2], atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(world - world[0], axis=1), np.linalg.norm(centers - centers[0], axis=1), 1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x,y\n1,2", "expected a CSV file that begins with name,x,y,z"),
+        ("name,x,y,z\na.jpg,1,2", "found the line a.jpg,1,2"),
+        ("name,x,y,z\na.jpg,1,2,b", "without numbers"),
+        ("name,x,y,z\na.jpg,1,2,3", "of at least 3 photographs"),
+        ("name,other,distance\na.jpg,b.jpg,3", "two photographs that were registered"),
+        (
+            "name,x,y,z\n" + "\n".join(f"{k}.jpg,{k**3 % 7},{k**5 % 11},{k**2 % 5}" for k in range(COUNT)),
+            "fit to the cam",
+        ),
+    ],
+)
+def test_files_that_do_not_fit_get_one_sentence(tmp_path, text, words):
+    random = np.random.default_rng(5)
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        georeference(model_of(random.uniform(-5, 5, (COUNT, 3)), random), tmp_path, str(tmp_path / "a.csv"), 0, print)
+
+
+def test_gps_of_photographs_is_read_as_utm(tmp_path):
+    """Against the zone's own middle meridian: 500 km east, and there the scale is 0.9996."""
+    for index in range(3):
+        exif = Image.new("RGB", (64, 48)).getexif()
+        exif.get_ifd(0x8825).update(
+            {1: "N", 2: (48.0, 0.0, 36.0 * index), 3: "E", 4: (9.0, 0.0, 0.0), 5: b"\0", 6: 500.0}
+        )
+        Image.effect_noise((64, 48), 50).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
+    database = tmp_path / "database.db"
+    stages.opened(database).close()
+    pycolmap.import_images(database, tmp_path, image_names=[f"{index}.jpg" for index in range(3)])
+    found, reference = _gps(database)
+    assert "UTM zone 32 north" in reference
+    np.testing.assert_allclose([found[f"{k}.jpg"][[0, 2]] for k in range(3)], [(500_000, 500)] * 3, atol=0.01)
+    assert abs((found["1.jpg"] - found["0.jpg"])[1] - 0.9996 * 1111.97) < 1.0  # a hundredth of a degree
+
+
+@pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".glb", ".gltf"])
+def test_files_of_gaussians_keep_the_origin(tmp_path, ending):
+    random = np.random.default_rng(0)
+    shapes = [(4, 3), (4, 1, 3), (4,), (4, 3), (4, 4)]
+    splats = SplatFile(SplatArrays(*(random.normal(size=shape).astype(np.float32) for shape in shapes)))
+    where = {"origin": UTM.tolist(), "axes": "x east, y down, z north", "reference": "UTM"}
+    save_gaussians(tmp_path / f"a{ending}", splats._replace(coordinates={**where, "residuals": {}}))
+    assert load_gaussians(tmp_path / f"a{ending}").coordinates == where
+    save_gaussians(tmp_path / f"b{ending}", splats)
+    assert load_gaussians(tmp_path / f"b{ending}").coordinates is None
+
+
+def test_damaged_coordinates_get_one_sentence(tmp_path):
+    assert read_coordinates(tmp_path) is None
+    for text in ("[]", '{"origin": [1, 2]}', '{"origin": [1, 2, NaN]}', '{"origin": ["a", 2, 3]}', "{"):
+        (tmp_path / "coordinates.json").write_text(text)
+        with pytest.raises(InputError, match=r"coordinates\.json"):
+            read_coordinates(tmp_path)
+    write_coordinates(tmp_path, {"origin": [1.0, 2.0, 3.0]})
+    assert json.loads((tmp_path / "coordinates.json").read_text()) == read_coordinates(tmp_path)
+    write_coordinates(tmp_path, None)
+    assert read_coordinates(tmp_path) is None

@@ -1,0 +1,102 @@
+"""Models of synthetic matches, whose cameras are known: which mapper wins, what is joined, what is added."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from warp_splat.config import SfmConfig
+from warp_splat.sfm import mapping
+
+COUNT = 20
+CONFIG = SfmConfig("", "", threads=1, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """A database with matches of known cameras, and the model that has them."""
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_points3D=200)
+    options.num_frames_per_rig = COUNT
+    database = tmp_path_factory.mktemp("mapping") / "database.db"
+    with pycolmap.Database.open(database) as connection:
+        return database, pycolmap.synthesize_dataset(options, connection)
+
+
+def part_of(model, folder: Path, numbers, moved=None):
+    """The model of these of its images alone, in another frame."""
+    some = pycolmap.Reconstruction(model)
+    for index, number in enumerate(sorted(model.reg_image_ids())):
+        if index not in numbers:
+            some.deregister_frame(some.image(number).frame_id)
+    some.transform(moved or pycolmap.Sim3d())
+    folder.mkdir(parents=True)
+    some.write(folder)
+    return pycolmap.Reconstruction(folder)
+
+
+def farthest(model, truth):
+    """The largest error of a camera's center, in the truth's frame, as a share of its extent."""
+    numbers = model.reg_image_ids()
+    found, expected = (np.array([each.image(i).projection_center() for i in numbers]) for each in (model, truth))
+    errors = np.linalg.norm(pycolmap.estimate_sim3d(found, expected) * found - expected, axis=1)
+    return errors.max() / np.ptp(expected, axis=0).max()
+
+
+def test_models_that_share_photographs_are_joined(truth, tmp_path):
+    database, model = truth
+    moved = pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.1, 0.5, 0.2])), np.array([1.0, 2, 3]))
+    parts = [range(8), range(5, 14), range(14, COUNT)]
+    models = [part_of(model, tmp_path / str(k), part, moved if k else None) for k, part in enumerate(parts)]
+    joined, others = mapping.join(models, database, tmp_path, tmp_path, 1)
+    assert joined.num_reg_images() == 14 and farthest(joined, model) < 1e-4
+    assert [len(other.reg_image_ids()) for other in others if not set(other.reg_image_ids()) <= set(joined.images)] == [
+        6
+    ]
+    assert joined.compute_mean_reprojection_error() < 0.01
+
+
+def test_the_better_mapper_is_taken_and_completed(truth, tmp_path, monkeypatch):
+    """Global finds 12, incremental 9 of other photographs: they are joined, and the rest is added."""
+    database, model = truth
+
+    def found(numbers):
+        return lambda database, root, config, part, **_: part_of(model, part / "0", numbers)
+
+    stepwise = mapping._map_stepwise
+    monkeypatch.setattr(mapping, "_map_globally", found(range(12)))
+    monkeypatch.setattr(
+        mapping, "_map_stepwise", lambda *a, **k: stepwise(*a, **k) if len(a) > 4 else found(range(8, 17))(*a, **k)
+    )
+    lines: list[str] = []
+    shutil.copy(database, tmp_path)
+    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
+    assert list(models) == [0] and models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-4
+    assert len(lines) == 1 and "global mapping" in lines[0] and "global 12" in lines[0] and "incremental 9" in lines[0]
+
+
+def test_incremental_mapping_is_spared_where_it_could_add_little(truth, tmp_path, monkeypatch):
+    database, model = truth
+    shutil.copy(database, tmp_path)
+    monkeypatch.setattr(mapping, "MANY", COUNT - 1)
+    monkeypatch.setattr(mapping, "_map_stepwise", lambda *a, **k: pytest.fail("incremental mapping was begun"))
+    lines: list[str] = []
+    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
+    assert models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-3
+    assert "incremental" not in lines[0]
+
+
+def test_a_mapper_that_was_complete_is_not_begun_again(truth, tmp_path, monkeypatch):
+    database, model = truth
+    shutil.copy(database, tmp_path)
+    for name in ("global", "incremental"):
+        part_of(model, tmp_path / "mapping" / name / "0", range(COUNT))
+    (tmp_path / "models.part").mkdir()  # it was killed then
+    monkeypatch.setattr(mapping, "_map_globally", lambda *a, **k: pytest.fail("global mapping was begun"))
+    monkeypatch.setattr(mapping, "_map_stepwise", lambda *a, **k: pytest.fail("incremental mapping was begun"))
+    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, print)
+    assert models[0].num_reg_images() == COUNT
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db", "models"]

@@ -1,0 +1,169 @@
+"""A model in the world: scale, up and origin from positions of the cameras, of GPS or of a file, or from distances."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import AXES, MODEL_FROM_WORLD
+from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.scene.colmap_library import pycolmap
+from warp_splat.sfm.stages import opened
+from warp_splat.text import few
+
+POSITIONS, DISTANCES = ["name", "x", "y", "z"], ["name", "other", "distance"]  # first lines of files
+LEAST = 3  # positions
+UP = np.array((0.0, 0.0, 1.0))  # in the world
+LOOSE = 0.05  # of the positions' extent: what RANSAC takes for right
+OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
+COARSE = 0.1  # of the extent: GPS that errs by more is not taken
+LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
+
+
+def georeference(
+    model: pycolmap.Reconstruction, database: Path, source: str, seed: int, say: Callable[[str], object]
+) -> dict | None:
+    """Turn, scale and move ``model`` into the frame of ``formats/coordinates.py``.
+
+    Args:
+        model: it is changed.
+        database: whose photographs may have GPS.
+        source: "auto", GPS if the photographs have it, and it is precise enough; "none"; or a CSV file whose first line
+            is name,x,y,z (positions of cameras, x east, y north, z up) or name,other,distance (between cameras).
+        seed: of the robust estimation.
+        say: called with a line of what was found.
+
+    Returns:
+        What ``coordinates.json`` is to say, or None if the model stays as it is.
+
+    Raises:
+        InputError: if the file cannot be read, or does not fit to the cameras.
+    """
+    images = {image.name: image for image in map(model.image, model.reg_image_ids())}
+    centers = {name: image.projection_center() for name, image in images.items()}
+    down = [image.cam_from_world().rotation.matrix()[1] for image in images.values()]
+    up = -np.mean(down, axis=0) / np.linalg.norm(np.mean(down, axis=0))
+    if source == "none":
+        return None
+    if source != "auto":
+        kind, rows = _read(Path(source))
+        if kind == DISTANCES:
+            return _by_distances(model, centers, up, rows, source)
+        known, reference = {name: np.array(numbers) for (name, *_), numbers in rows}, Path(source).name
+    else:
+        known, reference = _gps(database)
+    names = sorted(set(known) & set(centers))
+    if len(names) < LEAST:
+        if source == "auto":
+            return None
+        raise InputError(
+            f"{source}: expected positions of at least {LEAST} photographs that were registered, found {len(names)}; "
+            f"the first column has their names, such as {min(centers)}."
+        )
+    world = np.array([known[name] for name in names])
+    origin = np.round(np.median(world, axis=0))
+    fitted, residuals, right = fit(np.array([centers[name] for name in names]), world - origin, up, seed)
+    extent = _extent(world[right])
+    error = float(np.median(residuals[right])) if right.any() else np.inf
+    if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
+        text = f"the positions of {reference} err by {error:.2g} m (median), and reach over {extent:.3g} m"
+        if source != "auto":
+            raise InputError(f"{source}: expected positions that fit to the cameras, but {text}; check their order.")
+        say(f"no coordinates: {text}")
+        return None
+    _move(model, fitted)
+    left_out = [name for name, good in zip(names, right, strict=True) if not good]
+    rest = f"; left out: {few(left_out)}" if left_out else ""
+    say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")
+    return _described(origin, reference, fitted.scale, dict(zip(names, residuals.tolist(), strict=True)), left_out)
+
+
+def fit(
+    centers: np.ndarray, world: np.ndarray, up: np.ndarray, seed: int
+) -> tuple[pycolmap.Sim3d, np.ndarray, np.ndarray]:
+    """The similarity that takes camera centers [N, 3] to positions [N, 3], robustly.
+
+    Positions along a line leave a turn about it open: ``up`` [3] of the cameras, which goes to z, then closes it.
+
+    Returns:
+        The similarity; residuals [N] in the unit of ``world``; which positions were taken for right [N].
+    """
+    spans = np.linalg.svd(centers - centers.mean(0), compute_uv=False)
+    pairs = centers, world
+    if spans[1] < LINE * spans[0]:  # the same points again, lifted
+        apart = [np.linalg.norm(each - np.roll(each, len(each) // 2, axis=0), axis=1) for each in pairs]
+        lift, scale = _extent(centers), np.median(apart[1] / np.maximum(apart[0], 1e-9))
+        pairs = np.concatenate([centers, centers + lift * up]), np.concatenate([world, world + scale * lift * UP])
+    options = pycolmap.RANSACOptions(max_error=LOOSE * _extent(world), random_seed=seed)
+    found = pycolmap.estimate_sim3d_robust(*pairs, options)
+    right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(pairs[0]), bool)
+    fitted = pycolmap.Sim3d()
+    for _ in range(3):  # again, with the spread of those that fit
+        fitted = pycolmap.estimate_sim3d(pairs[0][right], pairs[1][right]) or fitted
+        residuals = np.linalg.norm(fitted * pairs[0] - pairs[1], axis=1)
+        right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 1e-9 * _extent(world)
+    return fitted, residuals[: len(world)], right[: len(world)]
+
+
+def _extent(points: np.ndarray) -> float:
+    return float(np.linalg.norm(points - points.mean(0), axis=1).max()) if len(points) else 0.0
+
+
+def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str) -> dict:
+    """The scale alone from distances [m] between cameras; up from the cameras, the origin in their middle."""
+    known = [(*names, numbers[0]) for names, numbers in rows if set(names) <= set(centers)]
+    if not known:
+        raise InputError(f"{source}: expected names of two photographs that were registered, found none; check them.")
+    measured = np.array([np.linalg.norm(centers[a] - centers[b]) for a, b, _ in known])
+    true = np.array([distance for _, _, distance in known])
+    scale = float(np.median(true / measured))
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    level = np.stack([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up])
+    middle = np.mean(list(centers.values()), axis=0)
+    _move(model, pycolmap.Sim3d(scale, pycolmap.Rotation3d(level), -scale * level @ middle))
+    residuals = {f"{a} to {b}": float(r) for (a, b, _), r in zip(known, np.abs(scale * measured - true), strict=True)}
+    return _described(np.zeros(3), Path(source).name, scale, residuals, [])
+
+
+def _move(model: pycolmap.Reconstruction, world_from_old: pycolmap.Sim3d) -> None:
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(MODEL_FROM_WORLD), np.zeros(3)) * world_from_old)
+
+
+def _described(origin: np.ndarray, reference: str, scale: float, residuals: dict, left_out: list[str]) -> dict:
+    found = {"origin": origin.tolist(), "axes": AXES, "reference": reference, "scale": scale}
+    return {**found, "residuals": residuals, "left_out": left_out}
+
+
+def _gps(database: Path) -> tuple[dict[str, np.ndarray], str]:
+    """Positions in UTM [m], by the names of the photographs whose EXIF has latitude, longitude and altitude."""
+    with opened(database) as connection:
+        names = {image.image_id: image.name for image in connection.read_all_images()}
+        priors = connection.read_all_pose_priors()
+    found = {names[prior.corr_data_id.id]: prior.position for prior in priors if np.isfinite(prior.position).all()}
+    if not found:
+        return {}, ""
+    places, zone = pycolmap.GPSTransform().ellipsoid_to_utm(list(found.values()))
+    south = np.mean([place[0] for place in found.values()]) < 0
+    return dict(zip(found, places, strict=True)), f"UTM zone {zone} {'south' if south else 'north'}, WGS 84, from GPS"
+
+
+def _read(path: Path) -> tuple[list[str], list[tuple[list[str], list[float]]]]:
+    """The first line of a CSV file, and of the others the names and the numbers."""
+    with reading(path, f"a CSV file that begins with {','.join(POSITIONS)} or {','.join(DISTANCES)}"):
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            first, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+        if first not in (POSITIONS, DISTANCES):
+            raise Unexpected(f"{','.join(first):.80}")
+        text = 1 if first == POSITIONS else 2
+        try:
+            found = [(row[:text], [float(cell) for cell in row[text:]]) for row in rows]
+        except ValueError as error:
+            raise Unexpected(f"a line without numbers ({error})") from error
+        short = [row for row in rows if len(row) != len(first)]
+        if short or not all(np.isfinite(numbers).all() for _, numbers in found):
+            raise Unexpected(f"the line {','.join((short or rows)[0]):.80}")
+        return first, found

@@ -1,0 +1,177 @@
+"""Cameras and points of photographs that are matched: by global mapping, by incremental where that is better.
+
+Models that share photographs become one, and photographs that are left are added to it. Each step has its folder, which
+gets its name when it is complete, so a run that was stopped goes on at the step.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from warp_splat.config import SfmConfig
+from warp_splat.scene.colmap_library import pycolmap
+from warp_splat.sfm.stages import opened, run_watched
+
+# Global mapping alone is enough if it registers this share of more photographs than that: incremental mapping takes
+# longer the more there are, and could add little.
+ENOUGH, MANY = 0.98, 100
+SHARED = 3  # photographs that two models need to have in common to become one
+RELAXED = {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.1, "abs_pose_max_error": 16.0}  # 30, 0.25, 12
+SECONDS_PER_MATCH = 1e-4  # of global mapping on two cores, for the time that the bar says is left
+
+
+def reconstruct(
+    database: Path, root: Path, models: Path, config: SfmConfig, say: Callable[[str], object]
+) -> dict[int, pycolmap.Reconstruction]:
+    """The models in the folder ``models`` by their names, "0" the one to take; none if no two photographs fit."""
+    if not models.is_dir():
+        images, matches = _sizes(database)
+        begun = models.with_name("mapping")
+        begun.mkdir(exist_ok=True)
+        mappers = {"global": partial(_map_globally, seconds=SECONDS_PER_MATCH * matches), "incremental": _map_stepwise}
+        found: dict[str, list[pycolmap.Reconstruction]] = {}
+        for name, mapper in mappers.items():
+            found[name] = _made(begun / name, partial(mapper, database, root, config))
+            if images > MANY and found[name] and found[name][0].num_reg_images() >= ENOUGH * images:
+                break
+        best = max(found, key=lambda name: goodness(found[name][0]) if found[name] else (0, 0.0))
+        told = ", ".join(f"{name} {_told(each[0]) if each else 'none'}" for name, each in found.items())
+        say(f"cameras by {best} mapping; photographs of {images}: {told}")
+        every = found[best] + [model for name, each in found.items() if name != best for model in each]
+        _made(models, partial(_finish, database, root, config, every, images))
+        shutil.rmtree(begun)
+    return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir()}
+
+
+def goodness(model: pycolmap.Reconstruction) -> tuple[int, float]:
+    """What makes one model better than another: photographs; at as many, points seen for each pixel of error."""
+    error = model.compute_mean_reprojection_error()
+    return model.num_reg_images(), model.compute_num_observations() / max(error, 1e-3)
+
+
+def _told(model: pycolmap.Reconstruction) -> str:
+    error = model.compute_mean_reprojection_error()
+    return f"{model.num_reg_images()} ({model.compute_num_observations()} points seen, {error:.2f} px)"
+
+
+def _sizes(database: Path) -> tuple[int, int]:
+    with opened(database) as connection:
+        return connection.num_images(), connection.num_inlier_matches()
+
+
+def _made(folder: Path, make: Callable[[Path], object]) -> list[pycolmap.Reconstruction]:
+    """The models in ``folder``, the best first; ``make`` has written them there, now or before."""
+    if not folder.is_dir():
+        part = folder.with_suffix(".part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        make(part)
+        os.replace(part, folder)
+    found = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir())]
+    return sorted(found, key=goodness, reverse=True)
+
+
+def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, seconds: float) -> None:
+    """Global mapping (GLOMAP, Pan et al. 2024), with focal lengths from the view graph where no file says them."""
+    with opened(database) as connection:
+        known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
+    options = pycolmap.GlobalPipelineOptions(num_threads=config.threads, random_seed=config.seed)
+
+    def work() -> None:
+        calibrated = database
+        if not known:
+            calibrated = Path(shutil.copyfile(database, part / database.name))  # it is written to
+            pycolmap.calibrate_view_graph(calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=config.seed))
+        pycolmap.global_mapping(calibrated, root, part, options)
+
+    began = time.monotonic()
+    run_watched("cameras", round(seconds) + 1, work, lambda: int(time.monotonic() - began), config.quiet, stops=False)
+    (part / database.name).unlink(missing_ok=True)
+
+
+def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, start: Path | None = None) -> None:
+    """Incremental mapping; from the model ``start`` on, with thresholds that are relaxed, if there is one."""
+    options = pycolmap.IncrementalPipelineOptions(num_threads=config.threads, random_seed=config.seed)
+    options.mapper.random_seed = options.triangulation.random_seed = config.seed
+    if start:
+        options.multiple_models = False
+        for name, value in RELAXED.items():
+            setattr(options.mapper, name, value)
+    registered = [1] * (pycolmap.Reconstruction(start).num_reg_images() if start else 0)
+    found = {
+        "initial_image_pair_callback": lambda: registered.extend((1, 1)),
+        "next_image_callback": lambda: registered.append(1),
+    }
+    work = partial(pycolmap.incremental_mapping, database, root, part, options, input_path=start or "", **found)
+    run_watched("cameras", _sizes(database)[0], work, lambda: len(registered), config.quiet)
+
+
+def _finish(
+    database: Path, root: Path, config: SfmConfig, models: list[pycolmap.Reconstruction], images: int, part: Path
+) -> None:
+    """Write the first of ``models``, joined with others and completed, and those that show other photographs."""
+    if not models:
+        return
+    model, others = join(models, database, root, part, config.threads)
+    (part / "0").mkdir()
+    model.write(part / "0")
+    if 0 < model.num_reg_images() < images:
+        (part / "more").mkdir()
+        _map_stepwise(database, root, config, part / "more", part / "0")
+        if (part / "more" / "images.bin").is_file():  # where it begins with a model, it writes one there
+            more = pycolmap.Reconstruction(part / "more")
+            model = more if more.num_reg_images() > model.num_reg_images() else model
+            model.write(part / "0")
+        shutil.rmtree(part / "more")
+    seen = set(model.reg_image_ids())
+    for number, other in enumerate([each for each in others if not seen.intersection(each.reg_image_ids())], 1):
+        (part / str(number)).mkdir()
+        other.write(part / str(number))
+
+
+def join(
+    models: list[pycolmap.Reconstruction], database: Path, root: Path, part: Path, threads: int
+) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
+    """The first of ``models`` with the cameras of all that share photographs with it, and the models that do not.
+
+    Points are triangulated anew from all matches, and then all is adjusted. ``part`` is a folder to work in.
+    """
+    model, others = models[0], models[1:]
+    while True:
+        for other in others:
+            mine, theirs = set(model.reg_image_ids()), set(other.reg_image_ids())
+            if theirs <= mine or len(theirs & mine) < SHARED:
+                continue
+            model_from_other = pycolmap.align_reconstructions_via_reprojections(other, model)
+            if model_from_other is None:
+                continue
+            other.transform(model_from_other)
+            model = _with_cameras(model, other, database)
+            options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
+            model = pycolmap.triangulate_points(model, database, root, part / "joined", options=options)
+            pycolmap.bundle_adjustment(model)
+            shutil.rmtree(part / "joined")
+            break
+        else:
+            return model, others
+
+
+def _with_cameras(
+    model: pycolmap.Reconstruction, other: pycolmap.Reconstruction, database: Path
+) -> pycolmap.Reconstruction:
+    """The cameras of ``model``, and those of ``other`` that it lacks; no points."""
+    both = pycolmap.Reconstruction()
+    with opened(database) as connection:
+        both.load(pycolmap.DatabaseCache.create(connection, pycolmap.DatabaseCacheOptions()))
+    for each in (other, model):  # whose lenses are to stay
+        for number, camera in each.cameras.items():
+            both.camera(number).params = camera.params
+        for number in each.reg_frame_ids():
+            both.frame(number).rig_from_world = each.frame(number).rig_from_world
+            both.register_frame(number)
+    return both
