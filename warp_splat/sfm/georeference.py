@@ -101,7 +101,7 @@ def fit(
     options = pycolmap.RANSACOptions(max_error=LOOSE * _extent(world), random_seed=seed)
     found = pycolmap.estimate_sim3d_robust(*pairs, options)
     right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(pairs[0]), bool)
-    fitted = pycolmap.Sim3d()
+    fitted, residuals = pycolmap.Sim3d(), np.zeros(len(pairs[0]))
     for _ in range(3):  # again, with the spread of those that fit
         fitted = pycolmap.estimate_sim3d(pairs[0][right], pairs[1][right]) or fitted
         residuals = np.linalg.norm(fitted * pairs[0] - pairs[1], axis=1)
