@@ -24,7 +24,7 @@ def tables(path, count, coefficients):
 @pytest.mark.parametrize("coefficients", [1, 4, 16])
 def test_bytes_are_those_that_other_programs_read(tmp_path, coefficients):
     file = some_file(300, coefficients, antialiased=True)
-    (means, sh, opacities, scales, quats), _ = save_gaussians(tmp_path / "a.compressed.ply", file, report=silent)
+    (means, sh, opacities, scales, quats), *_ = save_gaussians(tmp_path / "a.compressed.ply", file, report=silent)
     header, chunks, words, harmonics = tables(tmp_path / "a.compressed.ply", 300, coefficients)
     assert "comment SplatRenderMode: mip" in header and "element chunk 2" in header
     assert ("element sh 300" in header) == (coefficients > 1)
