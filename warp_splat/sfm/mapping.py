@@ -117,7 +117,7 @@ def _finish(
     """Write the first of ``models``, joined with others and completed, and those that show other photographs."""
     if not models:
         return
-    model, others = join(models, database, root, part, config.threads)
+    model, others = joined(models, database, root, part, config.threads)
     (part / "0").mkdir()
     model.write(part / "0")
     if 0 < model.num_reg_images() < images:
@@ -134,7 +134,7 @@ def _finish(
         other.write(part / str(number))
 
 
-def join(
+def joined(
     models: list[pycolmap.Reconstruction], database: Path, root: Path, part: Path, threads: int
 ) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
     """The first of ``models`` with the cameras of all that share photographs with it, and the models that do not.
@@ -153,9 +153,9 @@ def join(
             other.transform(model_from_other)
             model = _with_cameras(model, other, database)
             options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
-            model = pycolmap.triangulate_points(model, database, root, part / "joined", options=options)
+            model = pycolmap.triangulate_points(model, database, root, part / "triangulated", options=options)
             pycolmap.bundle_adjustment(model)
-            shutil.rmtree(part / "joined")
+            shutil.rmtree(part / "triangulated")
             break
         else:
             return model, others
