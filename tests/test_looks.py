@@ -31,12 +31,12 @@ def overlapping(order):
 @pytest.mark.parametrize("mixed", [False, True])
 def test_photographs_that_overlap_are_found_and_order_counts_where_it_means_something(mixed):
     order = np.random.default_rng(2).permutation(COUNT) if mixed else np.arange(COUNT)
-    described = looks.describe(features(order), COUNT, 0)
-    assert np.array_equal(described, looks.describe(features(order), COUNT, 0))
+    described = looks.described_by_words(features(order), COUNT, 0)
+    assert np.array_equal(described, looks.described_by_words(features(order), COUNT, 0))
     near = looks.alike(described)
     true = overlapping(order)
     assert len(true - set(near)) < 0.02 * len(true) and len(near) < COUNT * looks.NEAREST
-    beside = looks.in_order(range(COUNT), near)
+    beside = looks.next_in_order(range(COUNT), near)
     assert len(beside) == (0 if mixed else sum(min(COUNT - 1 - a, looks.NEIGHBORS) for a in range(COUNT)))
 
 

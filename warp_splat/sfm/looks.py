@@ -27,7 +27,7 @@ THROUGH = 150  # features that two photographs share with others, from which on 
 ORDERED = 0.5  # share of photographs next to one of their NEAREST, from which on their order means something
 
 
-def describe(features: Callable[[int], np.ndarray], count: int, seed: int) -> np.ndarray:
+def described_by_words(features: Callable[[int], np.ndarray], count: int, seed: int) -> np.ndarray:
     """Descriptions [count, WORDS * 128] float32 of unit length, zeros without features.
 
     Args:
@@ -77,7 +77,7 @@ def alike(described: np.ndarray, most: int = NEAREST) -> Pairs:
     return sorted(pairs)
 
 
-def in_order(order: Sequence[int], looks: Pairs) -> Pairs:
+def next_in_order(order: Sequence[int], looks: Pairs) -> Pairs:
     """Neighbors in an ``order`` of the photographs; none if neighbors do not look alike, and so it means nothing."""
     beside = set(looks)
     pair = [(min(pair), max(pair)) for pair in pairwise(order)]

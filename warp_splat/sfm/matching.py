@@ -99,9 +99,9 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
             return connection.read_descriptors(numbers[index]).data
 
         with bar:
-            described = looks.describe(features, len(images), config.seed)
+            described = looks.described_by_words(features, len(images), config.seed)
     alike = looks.alike(described)
-    pairs = sorted({*alike, *looks.in_order(range(len(images)), alike)})
+    pairs = sorted({*alike, *looks.next_in_order(range(len(images)), alike)})
     places = {number: place for place, number in enumerate(numbers)}
     tried, matched = set(), {}
     while pairs:
