@@ -18,9 +18,8 @@ from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.cuda import adjoint
 from warp_splat.kernels.splat import BlendVariant
-from warp_splat.raster.cuda import THREADS, spread_upstream
 from warp_splat.raster.data import Gaussians, Pixels, alphas_of, variant_of
-from warp_splat.raster.drivers import CUDA
+from warp_splat.raster.drivers import CUDA, THREADS
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, launch_blocks, view
 
@@ -87,16 +86,16 @@ class Blends:
         self.rows = new(len(self.bins.gaussians), 9)
 
     def forward(self) -> None:
-        pixels, (self.final, self.stopped, _) = CUDA.blend(self.bins, self.camera, self.background, self.options, False)
+        pixels, self.saved = CUDA.blend(self.bins, self.camera, self.background, self.options, False)
         self.image = pixels.image
 
     def upstream(self, slots: torch.Tensor) -> None:
-        states = (self.background, self.final, self.stopped)
-        found = spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
+        states = (self.background, self.saved)
+        found = CUDA.spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
         (self.up, self.adj_final), _, _, self.steps = found
 
     def reverse(self, kernel: wp.Kernel, rows: torch.Tensor) -> None:
-        states = [view(self.final, wp.float32), view(self.stopped, wp.int32), view(self.steps, wp.int32)]
+        states = [*CUDA.view_walk(*self.saved[:2]), view(self.steps, wp.int32)]
         upstream = [view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
         inputs = [self.bins.view(), alphas_of(self.options), *states, *upstream]
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)

@@ -23,7 +23,6 @@ from common import interleaved, parse, write_table
 from made_up import NEVER, steps_of
 from step import GIVEN, synthetic, trained
 
-from warp_splat.raster import cpu
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Bins, Gaussians
 from warp_splat.raster.drivers import CPU, using
@@ -113,8 +112,8 @@ def whole_lists(_: Trainer) -> AbstractContextManager:
         steps.copy_(bins.ranges[:, 1] - bins.ranges[:, 0])
         original(mode, bins, chosen, saved, upstream, steps, slots)
 
-    original = cpu.differentiate
-    return patch.object(cpu, "differentiate", differentiate)
+    original = CPU.differentiate
+    return patch.object(CPU, "differentiate", differentiate)
 
 
 CASES = (

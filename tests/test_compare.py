@@ -152,7 +152,7 @@ def test_on_a_gpu_the_same_is_measured_by_the_kernels_of_a_gpu(monkeypatch):
 
 
 def test_stored_that_does_not_fit_is_a_row(monkeypatch):
-    monkeypatch.setattr("warp_splat.raster.bin.available_memory", lambda device: 2**10)
+    monkeypatch.setattr("warp_splat.runtime.launch.available_memory", lambda device: 2**10)
     monkeypatch.setattr(adjoints, "REPEATS", 2)
     measured = adjoints.run_adjoints([workload()], ["stored"], lambda _: None)
     row = next(item for item in measured if item.variant == "stored")

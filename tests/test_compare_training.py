@@ -86,7 +86,7 @@ def test_cap_of_one_entry_costs_quality(scene):
 
 
 def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("warp_splat.raster.bin.available_memory", lambda device: 0)
+    monkeypatch.setattr("warp_splat.runtime.launch.available_memory", lambda device: 0)
     said = []
     results = trained.run_trainings(
         tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append

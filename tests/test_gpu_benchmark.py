@@ -14,7 +14,7 @@ from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
 from warp_splat.gsplat import rasterization
 from warp_splat.raster.api import render
-from warp_splat.raster.blend import blend
+from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
@@ -44,7 +44,7 @@ def test_atomics_and_slots_give_the_gradients_of_the_product(fibers):
     splats, options = project(gaussians, camera, RasterOptions()), RasterOptions()
     leaves = [tensor.detach().requires_grad_() for tensor in splats[:4]]
     splats = Splats2D(*leaves, *splats[4:])
-    image = blend(splats, CPU.bin(splats, camera, options), torch.zeros(3), camera, options).image
+    image = blend(splats, torch.zeros(3), Blending(CPU.bin(splats, camera, options), camera, options, CPU)).image
     expected = torch.autograd.grad(image.sum(), leaves)
     assert (blends.image - image).abs().max() < 1e-6 and len(blends.slots) > 1500
     for way, gradients in found.items():

@@ -17,7 +17,7 @@ from warp_splat import InputError, RasterOptions
 from warp_splat.compare import oracle
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ADJOINTS
-from warp_splat.raster import bin
+from warp_splat.runtime import launch
 
 IMAGE_MAX, IMAGE_MEAN = 1e-4, 1e-5  # allowed error of image and alpha
 SHARE = 0.02  # at a fragile pixel: the largest weight that one decision moves is about 1e-2
@@ -208,7 +208,7 @@ def test_modes_share_the_image_and_agree_on_the_gradients(name, adjoint, device)
 
 
 def test_stored_refuses_what_does_not_fit(device, monkeypatch):
-    monkeypatch.setattr(bin, "available_memory", lambda device: 2**20)
+    monkeypatch.setattr(launch, "available_memory", lambda device: 2**20)
     scene = SCENES["dense_tile"]().to(device)
     with pytest.raises(InputError, match=r"'stored': the transmittances of \d+ tile instances take .* GiB"):
         rasterize(scene, leaves_of(scene), adjoint="stored")

@@ -16,7 +16,6 @@ from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.falloff import LN_2
 from warp_splat.kernels.harmonics import C0
-from warp_splat.kernels.simd import Types
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import lanes_of, launch_in_lanes
@@ -33,12 +32,12 @@ def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tens
 
 
 def _launch_activation(make, inputs: Sequence[torch.Tensor], outputs: Sequence[torch.Tensor]) -> None:
-    def arguments(types: Types, rows: slice) -> tuple[list, list]:
-        given, found = ([tensor[rows] for tensor in tensors] for tensors in (inputs, outputs))
-        return lanes_of(types.number, *given), lanes_of(types.number, *found)
+    def number_by_number(tensor: torch.Tensor):
+        return lambda types, rows: lanes_of(types.number, tensor[rows])[0]
 
+    given, made = ([number_by_number(tensor) for tensor in tensors] for tensors in (inputs, outputs))
     device = outputs[1].device
-    launch_in_lanes(make, driver_of(device).lanes, len(outputs[1]), arguments, device)
+    launch_in_lanes(make, driver_of(device).lanes, len(outputs[1]), given, made, device)
 
 
 class Activate(torch.autograd.Function):

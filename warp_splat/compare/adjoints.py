@@ -1,7 +1,7 @@
 """Adjoint against adjoint: error, time and memory, by scene and parameter.
 
 All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
-instance (:mod:`warp_splat.raster.cpu` says where they differ). Beside the modes of ``rasterize`` stand
+instance (:mod:`warp_splat.raster.drivers` says where they differ). Beside the modes of ``rasterize`` stand
 ``generated`` (``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong),
 ``tape`` (``manual`` between Warp's arrays, with what that adds), the thesis's loop cap, and central differences.
 """

@@ -10,9 +10,9 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.gsplat.arguments import Request
 from warp_splat.gsplat.seen import Seen
-from warp_splat.raster.beside import Blended, absolute_gradients, blend_channels
-from warp_splat.raster.blend import blend
-from warp_splat.raster.data import Bins, Dropped, Splats2D, Walk
+from warp_splat.raster.beside import absolute_gradients, blend_channels
+from warp_splat.raster.blend import Blending, blend
+from warp_splat.raster.data import Bins, Splats2D
 from warp_splat.raster.drivers import driver_of
 
 LEAST = 1e-10  # alpha that a mean depth is divided by
@@ -26,9 +26,9 @@ class _Magnitudes(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, image, others, depth, alpha, channels, background, into, drawn, blended):
+    def forward(ctx, image, others, depth, alpha, channels, background, into, drawn, blending):
         ctx.save_for_backward(channels, background)
-        ctx.into, ctx.drawn, ctx.blended = into, drawn, blended
+        ctx.into, ctx.drawn, ctx.blending = into, drawn, blending
         return image.clone(), others.clone(), depth.clone(), alpha.clone()
 
     @staticmethod
@@ -37,7 +37,7 @@ class _Magnitudes(torch.autograd.Function):
         channels, background = ctx.saved_tensors
         adj_alpha_alone = adj_alpha - (adj_image * background).sum(-1, keepdim=True)
         parts = [adj_image, adj_others, *([adj_depth] if adj_depth.numel() else []), adj_alpha_alone]
-        found = absolute_gradients(channels, torch.cat(parts, -1), ctx.blended)
+        found = absolute_gradients(channels, torch.cat(parts, -1), ctx.blending)
         ctx.into.copy_(found if len(ctx.into) == len(found) else found[ctx.drawn])
         return adj_image, adj_others, adj_depth, adj_alpha, *[None] * 5
 
@@ -82,17 +82,17 @@ def _draw_view(
     splats = splats._replace(**{name: getattr(splats, name).contiguous() for name in splats._fields})
     frame = Camera(request.width, request.height, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))  # its size counts
     driver, options = driver_of(device), RasterOptions(depth=wanted[-1] in ("D", "ED"), alpha_max=ALPHA_MAX)
-    bins, walk, dropped = driver.bin(splats, frame, options), Walk(), Dropped()
-    image, alpha, depth = blend(splats, bins, background, frame, options, "manual", driver, dropped, walk)
-    blended = Blended(bins, walk, frame, options, "manual", driver, dropped)
+    bins = driver.bin(splats, frame, options)
+    blending = Blending(bins, frame, options, driver)
+    image, alpha, depth = blend(splats, background, blending)
     alpha, depth, others = alpha[..., None], depth[..., None], image[..., :0]
     if colors.shape[1] > 3:
-        others = blend_channels(splats, colors[:, 3:], blended)
+        others = blend_channels(splats, colors[:, 3:], blending)
     if into is not None:
         channels = [first, colors[:, 3:], *([seen.depths[:, None]] if options.depth else []), first.new_ones(count, 1)]
         channels = torch.cat(channels, 1)
         image, others, depth, alpha = _Magnitudes.apply(
-            image, others, depth, alpha, channels, background, into, seen.drawn, blended
+            image, others, depth, alpha, channels, background, into, seen.drawn, blending
         )
     parts = [image[..., : 3 - spare], others + (1 - alpha) * behind[3:]]
     if options.depth:

@@ -18,7 +18,7 @@ import torch
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.behind import put_behind
-from warp_splat.raster.blend import blend
+from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
@@ -68,7 +68,7 @@ def carried(gaussians: Gaussians, view: View, setting: ViewSetting, upstream: to
     bins = driver.bin(splats, camera, options)
     background = setting.background
     color = background if background.dim() == 1 else background.new_zeros(3)
-    image, alpha, _ = blend(splats, bins, color, camera, options, "manual", driver, dropped)
+    image, alpha, _ = blend(splats, color, Blending(bins, camera, options, driver, dropped=dropped))
     if background.dim() == 2:
         image = put_behind(image, alpha, background, camera)
     return Carried(splats, *torch.autograd.grad(image, (colors, opacities), upstream))

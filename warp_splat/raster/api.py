@@ -15,8 +15,8 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.behind import put_behind
-from warp_splat.raster.beside import Blended, blend_beside
-from warp_splat.raster.blend import blend
+from warp_splat.raster.beside import blend_beside
+from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.checks import (
     check_background,
@@ -27,7 +27,7 @@ from warp_splat.raster.checks import (
     explain_invalid,
     own_explained,
 )
-from warp_splat.raster.data import Dropped, Gaussians, Room, Walk
+from warp_splat.raster.data import Dropped, Gaussians, Room
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing
@@ -187,7 +187,7 @@ def render(
     The background may be harmonics [16, 3], too: see :func:`put_behind`. With ``room`` for tile instances, a GPU need
     not stop for their number; if there is too little, the view is rendered again.
     """
-    driver, dropped, walk = driver_of(gaussians.means.device), Dropped(), Walk()
+    driver, dropped = driver_of(gaussians.means.device), Dropped()
     with stage("project"):
         splats = project(gaussians, camera, options, driver, dropped)
     seen = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
@@ -198,14 +198,14 @@ def render(
         bins = driver.bin(drawn, seen, options, None if adjoint == "stored" else room)
     with stage("blend"):
         color = background if background.dim() == 1 else background.new_zeros(3)
-        image, alpha, depth = blend(drawn, bins, color, seen, options, adjoint, driver, dropped, walk)
+        blending = Blending(bins, seen, options, driver, adjoint, dropped)
+        image, alpha, depth = blend(drawn, color, blending)
     if background.dim() == 2:
         image = put_behind(image, alpha, background, camera)
     more = {}
     if features is not None or options.normals or options.median_depth or options.strongest:
         with stage("channels"):
-            blended = Blended(bins, walk, seen, options, adjoint, driver, dropped)
-            more = blend_beside(features, gaussians, drawn, camera, blended, crossing)
+            more = blend_beside(features, gaussians, drawn, camera, blending, crossing)
     if room and room.overflowed():
         return render(gaussians, camera, background, options, adjoint, features, room)
     all_valid = isinstance(bins.invalid, int) and not bins.invalid  # a GPU would have to stop for the answer

@@ -11,11 +11,11 @@ from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.kernels.environment import RUN, make_adj_put_behind, make_put_behind
-from warp_splat.kernels.simd import Types, vec48
+from warp_splat.kernels.simd import vec48
 from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
+from warp_splat.runtime.launch import PerGroup, launch_in_lanes, load, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -71,14 +71,9 @@ class _PutBehind(torch.autograd.Function):
         ctx.rotation = wp.mat33(*rotation.ravel())
         behind, made = torch.empty_like(image), torch.empty_like(image)
         ctx.save_for_backward(alpha, rays, behind)
-
-        def arguments(types: Types, rows: slice) -> tuple[list, list]:
-            tables = (table.view(-1, 3)[rows] for table in (rays, image, behind, made))
-            seen, colors, *out = lanes_of(types.row3, *tables)
-            alphas = lanes_of(types.number, alpha.view(-1)[rows])
-            return [ctx.rotation, *lanes_of(vec48, harmonics), seen, *alphas, colors], out
-
-        launch_in_lanes(make_put_behind, driver_of(image.device).lanes, alpha.numel(), arguments, image.device)
+        inputs = [ctx.rotation, view(harmonics.view(1, 48), vec48), rays, alpha.view(-1), image.view(-1, 3)]
+        outputs, lanes = [behind.view(-1, 3), made.view(-1, 3)], driver_of(image.device).lanes
+        launch_in_lanes(make_put_behind, lanes, alpha.numel(), inputs, outputs, image.device)
         return made
 
     @staticmethod
@@ -89,13 +84,7 @@ class _PutBehind(torch.autograd.Function):
             adj, lanes, count = adj.contiguous(), driver_of(alpha.device).lanes, alpha.numel()
             runs = -(-(count // lanes) // RUN)
             adj_alpha, sums = torch.empty_like(alpha), alpha.new_empty(runs + -(-(count % lanes) // RUN), 48)
-
-            def arguments(types: Types, rows: slice) -> tuple[list, list]:
-                tables = (table.view(-1, 3)[rows] for table in (rays, behind, adj))
-                alphas, adj_alphas = lanes_of(types.number, alpha.view(-1)[rows], adj_alpha.view(-1)[rows])
-                seen, colors, given = lanes_of(types.row3, *tables)
-                made = lanes_of(vec48, sums[runs if rows.start else 0 :])
-                return [ctx.rotation, seen, alphas, colors, given], [adj_alphas, *made]
-
-            launch_in_lanes(make_adj_put_behind, lanes, count, arguments, alpha.device, run=RUN)
+            inputs = [ctx.rotation, rays, alpha.view(-1), behind.view(-1, 3), adj.view(-1, 3)]
+            outputs = [adj_alpha.view(-1), PerGroup(sums, vec48)]
+            launch_in_lanes(make_adj_put_behind, lanes, count, inputs, outputs, alpha.device, run=RUN)
             return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None

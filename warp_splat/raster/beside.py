@@ -1,7 +1,7 @@
 """What is blended beside the color: features of the user's own, normals; and which Gaussians a pixel shows.
 
-The color is blended first. These kernels repeat its weights, from what it has found (:class:`.data.Walk`), and so cost
-nothing where they are not asked for. Channels go in groups, so that memory does not grow with their number.
+The color is blended first. These kernels repeat its weights, from what it has found (:class:`.blend.Blending`), and so
+cost nothing where they are not asked for. Channels go in groups, so that memory does not grow with their number.
 """
 
 from __future__ import annotations
@@ -13,30 +13,18 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
-from warp_splat.config import TILE, RasterOptions
-from warp_splat.errors import InputError
+from warp_splat.config import TILE
 from warp_splat.kernels.slots import CHANNEL
+from warp_splat.raster.blend import Blending
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.data import Bins, Dropped, Gaussians, Splats2D, Walk, alphas_of, variant_of
+from warp_splat.raster.data import Bins, Gaussians, Splats2D, alphas_of, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
-from warp_splat.runtime.launch import available_memory, view
+from warp_splat.runtime.launch import check_memory, view
 from warp_splat.runtime.timers import stage
 
 WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
 MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them
-
-
-class Blended(NamedTuple):
-    """What is known once the color is blended; see :func:`warp_splat.raster.blend.blend`."""
-
-    bins: Bins
-    walk: Walk
-    camera: Camera
-    options: RasterOptions
-    adjoint: str
-    driver: Driver
-    dropped: Dropped
 
 
 class Strongest(NamedTuple):
@@ -52,14 +40,14 @@ def blend_beside(
     gaussians: Gaussians,
     splats: Splats2D,
     camera: Camera | CameraParameters,
-    blended: Blended,
+    blending: Blending,
     crossing: Crossing,
 ) -> dict[str, torch.Tensor]:
     """What is asked for beside the color, by its name in :class:`warp_splat.RenderOutput`.
 
     ``splats`` have copies of the Gaussians that cross the seam of a panorama (:mod:`.seam`).
     """
-    channels, found, options = {}, {}, blended.options
+    channels, found, options = {}, {}, blending.options
     if features is not None:
         channels["features"] = features
     if options.normals:
@@ -68,11 +56,11 @@ def blend_beside(
         widths = [channel.shape[1] for channel in channels.values()]
         together = torch.cat(list(channels.values()), 1) if len(channels) > 1 else next(iter(channels.values()))
         together = with_copies(together, crossing)
-        image = blend_channels(splats, together, blended)
+        image = blend_channels(splats, together, blending)
         parts = image.split(widths, 2) if len(widths) > 1 else [image]  # the adjoint of a split copies
         found |= zip(channels, parts, strict=True)
     if options.strongest or options.median_depth:
-        strongest = find_strongest(splats, blended)
+        strongest = find_strongest(splats, blending)
         if options.strongest:
             owners = with_copies(torch.arange(len(gaussians.means), device=splats.means2d.device), crossing)
             numbers = strongest.gaussians
@@ -83,28 +71,28 @@ def blend_beside(
     return found
 
 
-def blend_channels(splats: Splats2D, features: torch.Tensor, blended: Blended) -> torch.Tensor:
+def blend_channels(splats: Splats2D, features: torch.Tensor, blending: Blending) -> torch.Tensor:
     """Sums of weight times ``features`` [N, C], [H, W, C]; differentiable in them and in the splats."""
-    return Channels.apply(splats.means2d, splats.conics, splats.opacities, features, blended)
+    return Channels.apply(splats.means2d, splats.conics, splats.opacities, features, blending)
 
 
-def find_strongest(splats: Splats2D, blended: Blended) -> Strongest:
+def find_strongest(splats: Splats2D, blending: Blending) -> Strongest:
     """The ``options.strongest`` Gaussians of each pixel; weights are differentiable in the splats, the median in z."""
-    bins, camera, options = blended.bins, blended.camera, blended.options
+    bins, camera, options = blending.bins, blending.camera, blending.options
     shape, most, device = (camera.height, camera.width), options.strongest, splats.means2d.device
     ranks, weights = (
         torch.empty(*shape, most, dtype=torch.int32, device=device),
         torch.empty(*shape, most, device=device),
     )
     median = torch.empty(shape, dtype=torch.int32, device=device)
-    kernel = blended.driver.channels.strongest(variant_of(options), most)
-    _, count = blended.driver.view_walk(blended.walk)
-    inputs = [bins.view(), alphas_of(options), count, view(blended.walk.steps, wp.int32)]
+    kernel = blending.driver.channels.strongest(variant_of(options), most)
+    _, count = blending.view_walk()
+    inputs = [bins.view(), alphas_of(options), count, view(blending.steps, wp.int32)]
     outputs = [view(ranks, wp.int32), view(weights, wp.float32), view(median, wp.int32)]
-    blended.driver.launch_tiles(kernel, bins, inputs, outputs)
+    blending.driver.launch_tiles(kernel, bins, inputs, outputs)
     gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
     if most:
-        weights = Weights.apply(splats.means2d, splats.conics, splats.opacities, weights, ranks, blended)
+        weights = Weights.apply(splats.means2d, splats.conics, splats.opacities, weights, ranks, blending)
     # an embedding, whose adjoint sums in one order, on a GPU as well; the last row is that of no Gaussian
     depths = torch.cat([splats.depths, splats.depths.new_zeros(1)])[:, None]
     median_depth = torch.nn.functional.embedding(middle % len(depths), depths)
@@ -146,18 +134,18 @@ class Channels(torch.autograd.Function):
     """Features to pixels; the adjoint walks the lists back to front, once for every group of channels."""
 
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, features, blended):
-        bins, walk, camera, options, _, driver, _ = blended
+    def forward(ctx, means2d, conics, opacities, features, blending):
+        bins, camera, driver = blending.bins, blending.camera, blending.driver
         features = features.contiguous()
         image = features.new_empty(camera.height, camera.width, features.shape[1])
-        kernel, steps = driver.channels.blend(variant_of(options)), walk.steps
-        _, count = driver.view_walk(walk)
+        kernel, steps = driver.channels.blend(variant_of(blending.options)), blending.steps
+        _, count = blending.view_walk()
         for begin, rows in _groups(bins, features, driver):
-            inputs = [bins.view(), alphas_of(options), count, view(steps, wp.int32), view(rows, wp.float32)]
+            inputs = [bins.view(), alphas_of(blending.options), count, view(steps, wp.int32), view(rows, wp.float32)]
             group = min(features.shape[1] - begin, driver.channels.at_once)
             driver.launch_tiles(kernel, bins, [*inputs, begin, group], [view(image, wp.float32)])
         ctx.save_for_backward(features)
-        ctx.blended = blended
+        ctx.blending = blending
         return image
 
     @staticmethod
@@ -165,12 +153,12 @@ class Channels(torch.autograd.Function):
     def backward(ctx, adj_image):
         with stage("adjoint of channels"):
             (features,) = ctx.saved_tensors
-            adj_image = _without_bad(adj_image, ctx.blended)
+            adj_image = _without_bad(adj_image, ctx.blending)
             adj_features = torch.empty_like(features)
             total: list[torch.Tensor] = []
-            for begin, rows in _groups(ctx.blended.bins, features, ctx.blended.driver):
-                group = min(features.shape[1] - begin, ctx.blended.driver.channels.at_once)
-                geometry, part = _differentiate(ctx.blended, rows, None, begin, group, adj_image)
+            for begin, rows in _groups(ctx.blending.bins, features, ctx.blending.driver):
+                group = min(features.shape[1] - begin, ctx.blending.driver.channels.at_once)
+                geometry, part = _differentiate(ctx.blending, rows, None, begin, group, adj_image)
                 adj_features[:, begin : begin + group] = part
                 total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
         return *total, adj_features, None
@@ -180,9 +168,9 @@ class Weights(torch.autograd.Function):
     """The weights of the strongest Gaussians, which a kernel has found already, tied to the splats."""
 
     @staticmethod
-    def forward(ctx, means2d, conics, opacities, weights, ranks, blended):
+    def forward(ctx, means2d, conics, opacities, weights, ranks, blending):
         ctx.save_for_backward(ranks)
-        ctx.blended = blended
+        ctx.blending = blending
         return weights.clone()
 
     @staticmethod
@@ -191,8 +179,8 @@ class Weights(torch.autograd.Function):
         with stage("adjoint of channels"):
             (ranks,) = ctx.saved_tensors
             rows = adj_weights.new_empty(0, 0)
-            adj_weights = _without_bad(adj_weights, ctx.blended)
-            geometry, _ = _differentiate(ctx.blended, rows, ranks, 0, ranks.shape[2], adj_weights)
+            adj_weights = _without_bad(adj_weights, ctx.blending)
+            geometry, _ = _differentiate(ctx.blending, rows, ranks, 0, ranks.shape[2], adj_weights)
         return *geometry, None, None, None
 
 
@@ -206,19 +194,19 @@ def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
         yield begin, rows
 
 
-def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blended: Blended) -> torch.Tensor:
+def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:
     """Sums over pixels of the magnitudes of the 2D means' gradients, [N, 2].
 
     By all that a pixel blends: ``channels`` [N, C] of one group, with their upstream gradients [H, W, C].
     """
-    ((_, rows),) = _groups(blended.bins, channels, blended.driver)
+    ((_, rows),) = _groups(blending.bins, channels, blending.driver)
     adj_pixels = adj_pixels.contiguous()
-    (means2d, *_), _ = _differentiate(blended, rows, None, 0, channels.shape[1], adj_pixels, "absolute")
+    (means2d, *_), _ = _differentiate(blending, rows, None, 0, channels.shape[1], adj_pixels, "absolute")
     return means2d
 
 
 def _differentiate(
-    blended: Blended,
+    blending: Blending,
     rows: torch.Tensor,
     ranks: torch.Tensor | None,
     begin: int,
@@ -230,14 +218,14 @@ def _differentiate(
 
     With ``ranks``, by the weights of those Gaussians instead of channels.
     """
-    bins, walk, _, options, adjoint, driver, _ = blended
-    mode = mode or ("manual" if adjoint == "manual" else "stepwise")
+    bins, options, driver = blending.bins, blending.options, blending.driver
+    mode = mode or ("manual" if blending.adjoint == "manual" else "stepwise")
     most, width = (0, next(width for width in WIDTHS if width >= group)) if ranks is None else (group, 0)
     width = 0 if mode == "absolute" else width
     slots = _new_slots(bins, CHANNEL + width)
     kernel = driver.channels.adjoint(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
-    inputs = [bins.view(), alphas_of(options), *driver.view_walk(walk), view(walk.steps, wp.int32)]
+    inputs = [bins.view(), alphas_of(options), *blending.view_walk(), view(blending.steps, wp.int32)]
     inputs += [view(rows, wp.float32), view(ranks, wp.float32), begin, group, view(adj_pixels, wp.float32)]
     driver.launch_tiles(kernel, bins, inputs, [view(slots, wp.float32)])
     tables = [slots.new_empty(bins.gaussian_count, columns) for columns in (2, 3, 1, width) if columns]
@@ -248,20 +236,17 @@ def _differentiate(
 def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
     """A row of gradients per tile instance. Raises InputError if there is no room for them."""
     count, device = len(bins.instances), bins.instances.device
-    needed = 4 * count * columns
-    if needed > MANY and needed > (available := available_memory(device)):
-        raise InputError(
-            f"rasterize: the gradients of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
-            f"{available / 2**30:.1f} GiB are free; render a smaller image or fewer, smaller Gaussians."
-        )
+    if (needed := 4 * count * columns) > MANY:
+        what = f"rasterize: the gradients of {count} tile instances take"
+        check_memory(what, needed, device, "render a smaller image or fewer, smaller Gaussians")
     return torch.empty(count, columns, dtype=torch.float32, device=device)
 
 
-def _without_bad(adj_pixels: torch.Tensor, blended: Blended) -> torch.Tensor:
+def _without_bad(adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:
     """Upstream gradients [H, W, C]; those of a pixel are dropped and counted, where one of them is not finite."""
     adj_pixels = adj_pixels.contiguous()
-    if blended.driver.peeks and bool(adj_pixels.sum().isfinite()):
+    if blending.driver.peeks and bool(adj_pixels.sum().isfinite()):
         return adj_pixels
     bad = ~adj_pixels.isfinite().all(2)
-    blended.dropped.pixel_count += bad.sum()
+    blending.dropped.pixel_count += bad.sum()
     return torch.where(bad[..., None], 0.0, adj_pixels)

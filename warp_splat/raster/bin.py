@@ -18,7 +18,7 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.raster.depth_order import begins_of, in_place, order_by_depth
-from warp_splat.runtime.launch import available_memory, empty, launch, read_later, view
+from warp_splat.runtime.launch import check_memory, empty, launch, read_later, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, get_threads, in_slices, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
@@ -218,10 +218,9 @@ def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -
         raise InputError(
             f"{touch}, more than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
         )
-    if count > MANY and BYTES * count > (available := available_memory(device)):
-        raise InputError(
-            f"{touch}, which takes {BYTES * count / 2**30:.1f} GiB, but only {available / 2**30:.1f} GiB are free; "
-            "render a smaller image or fewer, smaller Gaussians."
+    if count > MANY:
+        check_memory(
+            f"{touch}, which takes", BYTES * count, device, "render a smaller image or fewer, smaller Gaussians"
         )
 
 
@@ -231,22 +230,6 @@ def _check_longest(count: int) -> None:
             f"rasterize: one tile of {TILE} x {TILE} pixels lists {count} Gaussians, more than the {MAX_TILE} that "
             "fit; render fewer Gaussians."
         )
-
-
-def room_for_states(bins: Bins) -> torch.Tensor:
-    """Room for the T of every tile instance at every pixel of its tile, [M, TILE TILE]: 1 KiB per instance.
-
-    Raises:
-        InputError: if that does not fit.
-    """
-    count, device = len(bins.instances), bins.instances.device
-    needed, available = 4 * TILE * TILE * count, available_memory(device)
-    if needed > 0.8 * available:
-        raise InputError(
-            f"adjoint 'stored': the transmittances of {count} tile instances take {needed / 2**30:.1f} GiB, but only "
-            f"{available / 2**30:.1f} GiB are free; use 'reversible', which needs none, or a smaller image."
-        )
-    return torch.empty(count, TILE * TILE, dtype=torch.float32, device=device)
 
 
 def balanced_slices(ends: np.ndarray) -> list[int]:

@@ -2,36 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+
 import torch
 from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.raster.data import Bins, Dropped, Pixels, Splats2D, Walk, plus
-from warp_splat.raster.drivers import Driver, driver_of
+from warp_splat.raster.data import Bins, Dropped, Pixels, Saved, Splats2D, plus
+from warp_splat.raster.drivers import Driver
 from warp_splat.runtime.timers import stage
 
 
-def blend(
-    splats: Splats2D,
-    bins: Bins,
-    background: torch.Tensor,
-    camera: Camera,
-    options: RasterOptions,
-    adjoint: str = "manual",
-    driver: Driver | None = None,
-    dropped: Dropped | None = None,
-    walk: Walk | None = None,
-) -> Pixels:
-    """The pixels of ``splats``, which ``bins`` have packed; ``dropped`` counts what the adjoint refuses to spread.
+@dataclass
+class Blending:
+    """One image to blend; the color comes first, and with it what channels beside it read."""
 
-    ``walk`` is filled in, if given.
-    """
-    driver = driver or driver_of(background.device)
+    bins: Bins  # the splats, packed, and which of them each tile lists
+    camera: Camera  # its size is the image's
+    options: RasterOptions
+    driver: Driver
+    adjoint: str = "manual"
+    dropped: Dropped = field(default_factory=Dropped)  # counts what the adjoint refuses to spread
+    # where the color stopped in each pixel, in the layout of the device, once it is blended
+    final: torch.Tensor = field(init=False)  # transmittance behind the last Gaussian
+    count: torch.Tensor = field(init=False)  # instances walked before the pixel stopped
+
+    @property
+    def steps(self) -> torch.Tensor:
+        """Instances of each tile that a pixel blends, [T] int32."""
+        return self.count.flatten(1).amax(1).int()
+
+    def view_walk(self) -> list:
+        """Final transmittances and counts, as kernels take them."""
+        return self.driver.view_walk(self.final, self.count)
+
+
+def blend(splats: Splats2D, background: torch.Tensor, blending: Blending) -> Pixels:
+    """The pixels of ``splats``, on a background [3]."""
     anchors = (splats.means2d, splats.conics, splats.opacities, splats.colors, splats.depths)
-    chosen = (camera, options, adjoint, driver, dropped or Dropped(), walk or Walk())
-    return Pixels(*Blend.apply(*anchors, background, bins, *chosen))
+    return Pixels(*Blend.apply(*anchors, background, blending))
 
 
 class Blend(torch.autograd.Function):
@@ -41,45 +52,29 @@ class Blend(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx,
-        means2d,
-        conics,
-        opacities,
-        colors,
-        depths,
-        background,
-        bins,
-        camera,
-        options,
-        adjoint,
-        driver,
-        dropped,
-        walk,
-    ):
-        differentiated = any(ctx.needs_input_grad)
+    def forward(ctx, _means2d, _conics, _opacities, _colors, _depths, background, blending):
+        adjoint, options, differentiated = blending.adjoint, blending.options, any(ctx.needs_input_grad)
         if adjoint == "manual" and options.falloff is not None and differentiated:
             raise InputError(
                 "adjoint: 'manual' is the derivative of the Gaussian, and options.falloff is another falloff; use "
                 "'stepwise', 'reversible' or 'stored'."
             )
-        keep = adjoint == "stored" and differentiated
-        background = background.contiguous()
-        pixels, saved = driver.blend(bins, camera, background, options, keep)
-        walk.final, walk.count, _ = saved
+        ctx.blending = replace(blending)  # without what it finds, which goes with the graph
+        keep, background = adjoint == "stored" and differentiated, background.contiguous()
+        pixels, saved = blending.driver.blend(blending.bins, blending.camera, background, options, keep)
+        blending.final, blending.count, _ = saved
         ctx.save_for_backward(background, *saved)
-        ctx.bins, ctx.options, ctx.adjoint, ctx.driver, ctx.dropped = bins, options, adjoint, driver, dropped
         return tuple(pixels)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *adj_pixels):
         with stage("adjoint of blend"):
-            background, *saved = ctx.saved_tensors
+            (background, *saved), it = ctx.saved_tensors, ctx.blending
             adj_pixels = Pixels(*(adj.contiguous() for adj in adj_pixels))
-            slots, adj_background, dropped = ctx.driver.adjoint(
-                ctx.adjoint, ctx.bins, ctx.options, background, saved, adj_pixels
+            slots, adj_background, dropped = it.driver.adjoint(
+                it.adjoint, it.bins, it.options, background, Saved(*saved), adj_pixels
             )
-            ctx.dropped.pixel_count = plus(ctx.dropped.pixel_count, dropped.sum())
-            grads = ctx.driver.gather(ctx.bins, slots)
-        return *grads, adj_background, *[None] * 7
+            it.dropped.pixel_count = plus(it.dropped.pixel_count, dropped.sum())
+            grads = it.driver.gather(it.bins, slots)
+        return *grads, adj_background, None

@@ -14,12 +14,11 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.kernels.project.adj_camera import make_adj_intrinsics, make_adj_pose
 from warp_splat.kernels.project.camera_view import CameraView
-from warp_splat.kernels.simd import Types
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import cross, rotated
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.moving import Tangent
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes, view
+from warp_splat.runtime.launch import PerGroup, launch_in_lanes
 from warp_splat.runtime.sums import in_pairs
 
 LONGEST = 2.0 * math.pi  # rotation vector; a longer one says what a shorter one does
@@ -120,13 +119,8 @@ def pose_gradient(
     camera: Camera, cam: CameraView, lanes: int, gaussians: Gaussians, adj: Gaussians, adj_placed: torch.Tensor
 ) -> Tangent:
     """Of the pose; ``adj_placed`` is the part of ``adj.means`` that did not come through colors."""
-
-    def arguments(types: Types, rows: slice) -> list:
-        means = lanes_of(types.row3, gaussians.means[rows], adj.means[rows], adj_placed[rows])
-        quats = lanes_of(types.row4, gaussians.quats[rows], adj.quats[rows])
-        return [cam, means[0], quats[0], means[1], means[2], quats[1]]
-
-    sums = _sums(make_adj_pose, lanes, gaussians.means, 6, arguments)
+    inputs = [cam, gaussians.means, gaussians.quats, adj.means, adj_placed, adj.quats]
+    sums = _sums(make_adj_pose, lanes, 6, gaussians.means, inputs)
     turn, shift = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
     return Tangent(*(part[0] + part[1] + part[2] for part in (turn, shift)))
 
@@ -150,34 +144,18 @@ def intrinsics_gradient(
     time: np.ndarray,
 ) -> torch.Tensor:
     """Of the intrinsics, like them; ``time`` [2]: what they get through the time of a row (:mod:`.moving`)."""
-
-    def arguments(types: Types, rows: slice) -> list:
-        found = [cam, *lanes_of(types.number, opacities[rows])]
-        for part in (splats, adj):
-            found += lanes_of(types.row2, part.means2d[rows]) + lanes_of(types.row3, part.conics[rows])
-            found += lanes_of(types.number, part.opacities[rows])
-        return found
-
-    sums = _sums(make_adj_intrinsics, lanes, opacities, 4, arguments)
+    inputs = [cam, opacities, splats.means2d, splats.conics, splats.opacities]
+    inputs += [adj.means2d, adj.conics, adj.opacities]
+    sums = _sums(make_adj_intrinsics, lanes, 4, opacities, inputs)
     sums = sums / [camera.fx, camera.fy, 1.0, 1.0]
     return torch.tensor(sums + np.array([0.0, time[0], 0.0, time[1]]) / camera.height).to(intrinsics)
 
 
-def _sums(
-    make: Callable[[int], wp.Kernel],
-    lanes: int,
-    like: torch.Tensor,
-    columns: int,
-    arguments: Callable[[Types, slice], list],
-) -> np.ndarray:
+def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> np.ndarray:
     """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
     count = len(like)
     sums = like.new_empty(count // lanes + count % lanes, columns)
-
-    def with_output(types: Types, rows: slice) -> tuple[list, list]:
-        return arguments(types, rows), [view(sums[rows.start // lanes :], wp.float32)]
-
-    launch_in_lanes(make, lanes, count, with_output, like.device)
+    launch_in_lanes(make, lanes, count, inputs, [PerGroup(sums, wp.float32)], like.device)
     return in_pairs(sums).cpu().numpy()
 
 

@@ -6,7 +6,7 @@ N Gaussians, V splats, M tile instances (a splat in the list of a tile), T tiles
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -147,20 +147,12 @@ class Pixels(NamedTuple):
         return pack_struct(PixelsView, **self._asdict())
 
 
-@dataclass
-class Walk:
-    """Where the blend of the color stopped in each pixel: what other channels are blended and differentiated by.
+class Saved(NamedTuple):
+    """What a blend leaves for its adjoint, in the layout of its device."""
 
-    The blend fills it in. Kernels read it in the layout of their device.
-    """
-
-    final: torch.Tensor = field(default_factory=lambda: torch.empty(0))  # transmittance behind the last Gaussian
-    count: torch.Tensor = field(default_factory=lambda: torch.empty(0))  # instances walked before the pixel stopped
-
-    @property
-    def steps(self) -> torch.Tensor:
-        """Instances of each tile that a pixel blends, [T] int32."""
-        return self.count.flatten(1).amax(1).int()
+    final: torch.Tensor  # [T, a tile's pixels] transmittance behind the last Gaussian
+    count: torch.Tensor  # [T, a tile's pixels] instances walked before the pixel stopped
+    kept: torch.Tensor  # [M, a tile's pixels] every transmittance; [0, ...] if not asked for
 
 
 def plus(counted: int | torch.Tensor, more: torch.Tensor) -> torch.Tensor:

@@ -31,7 +31,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.raster.api import RenderOutput, render
-from warp_splat.raster.blend import blend
+from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.camera_parts import natural_size, parts_of, put_together
 from warp_splat.raster.data import Gaussians
@@ -136,8 +136,10 @@ class MovableScene:
         key = "opacities" if name == "opacities2d" else name
         extents = (self.splats.extents * _growth(self, name, step)).float()
         splats = self.splats._replace(extents=extents, **{key: moved})
-        bins = driver_of(moved.device).bin(splats, self.camera, self.options)
-        image, alpha, depth = blend(splats, bins, self.inputs["background"], self.camera, self.options, self.adjoint)
+        driver = driver_of(moved.device)
+        bins = driver.bin(splats, self.camera, self.options)
+        blending = Blending(bins, self.camera, self.options, driver, self.adjoint)
+        image, alpha, depth = blend(splats, self.inputs["background"], blending)
         return self._stack(image, alpha, depth / alpha.clamp_min(1e-10) if self.options.depth else None).double()
 
     def _render(self, inputs: dict[str, torch.Tensor]) -> RenderOutput:

@@ -1,4 +1,10 @@
-"""How a device renders: a driver for each, chosen once per render. The only place that asks which device it is."""
+"""How a device renders: a driver for each, chosen once per render. The only place that asks which device it is.
+
+On a CPU, kernels take sixteen pixels of a tile at once (lanes), on a GPU a block of threads has one each. What is
+launched, and in which order, is the same. The modes share the forward kernel, the tile lists, the upstream gradients,
+the rows and their summation; they differ in the kernel between them alone. Two exceptions: ``stored`` has a forward
+kernel that writes every T, and ``generated`` (for the comparison) reads a copy of the Gaussian per tile instance.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +17,25 @@ import torch
 import warp as wp
 
 from warp_splat.camera import Camera
-from warp_splat.config import RasterOptions
-from warp_splat.kernels.cpu import channels as lanes
+from warp_splat.config import TILE, RasterOptions
+from warp_splat.kernels.cpu import adjoint as lanes_adjoint
+from warp_splat.kernels.cpu import blend as lanes_blend
+from warp_splat.kernels.cpu import channels as lanes_channels
 from warp_splat.kernels.cpu import strongest as lanes_strongest
-from warp_splat.kernels.cuda import channels as blocks
+from warp_splat.kernels.cpu import taped as lanes_taped
+from warp_splat.kernels.cuda import adjoint as blocks_adjoint
+from warp_splat.kernels.cuda import blend as blocks_blend
+from warp_splat.kernels.cuda import channels as blocks_channels
 from warp_splat.kernels.cuda import strongest as blocks_strongest
-from warp_splat.kernels.simd import LANES
-from warp_splat.kernels.splat import BlendVariant
-from warp_splat.raster import bin, cpu, cuda
-from warp_splat.raster.data import Bins, Pixels, Walk
+from warp_splat.kernels.cuda import taped as blocks_taped
+from warp_splat.kernels.simd import LANES, vec16
+from warp_splat.kernels.splat import BlendVariant, Splat2D
+from warp_splat.kernels.structs import BinsView
+from warp_splat.raster import bin, gather
+from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
+from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, view
+
+THREADS = TILE * TILE
 
 
 class ChannelKernels(NamedTuple):
@@ -31,35 +47,186 @@ class ChannelKernels(NamedTuple):
     strongest: Callable[[BlendVariant, int], wp.Kernel]
 
 
-Saved = tuple[torch.Tensor, ...]  # what a driver's blend leaves for its adjoint
+class TileKernels(NamedTuple):
+    """What makes the kernels that take a tile."""
+
+    blend: Callable[[BlendVariant], wp.Kernel]
+    upstream: Callable[[BlendVariant], wp.Kernel]
+    reverse: Callable[[str, BlendVariant], wp.Kernel]  # "manual" and "stepwise"
+    walk: Callable[[str, BlendVariant], wp.Kernel]  # the modes whose loop Warp differentiates
 
 
-@dataclass(frozen=True)
+class TileLayout(NamedTuple):
+    """How these kernels hold what belongs to the pixels of a tile."""
+
+    shape: tuple[int, ...]  # of a number for each pixel
+    number: type  # an element of that, for kernels
+    count: type  # likewise, of a number of instances
+    counts: torch.dtype
+    upstream: type  # an element of the upstream gradients
+    upstream_shape: Callable[[int], tuple[int, ...]]  # of their tensor, by the number of channels
+    slot: Callable[[int], type]  # an element of the slots that are cleared, by their columns
+
+
+@dataclass(eq=False)
 class Driver:
-    """What one device does otherwise than another; the functions are described where the CPU's are."""
+    """What one device does otherwise than another, and what all do alike with it."""
 
     lanes: int  # Gaussians, or pixels, that a kernel takes at once
     peeks: bool  # whether to look at a result between two kernels: on a GPU the host would have to wait for it
     bin: Callable[..., Bins]
-    blend: Callable[[Bins, Camera, torch.Tensor, RasterOptions, bool], tuple[Pixels, Saved]]
-    adjoint: Callable[[str, Bins, RasterOptions, torch.Tensor, Saved, Pixels], tuple[torch.Tensor, ...]]
     gather: Callable[..., list[torch.Tensor]]
+    launch_tiles: Callable[..., None]  # a kernel for each tile: kernel, bins, inputs, outputs
+    kernels: TileKernels
+    layout: TileLayout
     channels: ChannelKernels
-    launch_tiles: Callable[[wp.Kernel, Bins, list, list], None]
-    view_walk: Callable[[Walk], list]
+
+    def blend(
+        self, bins: Bins, camera: Camera, background: torch.Tensor, options: RasterOptions, keep: bool
+    ) -> tuple[Pixels, Saved]:
+        """The pixels, and what the adjoint reads.
+
+        Args:
+            bins: the splats, and which of them each tile lists.
+            camera: its size is the image's.
+            background: [3].
+            options: what to compute.
+            keep: store every transmittance, for the adjoint "stored".
+        """
+        tile_count, new, shape = len(bins.ranges), background.new_empty, self.layout.shape
+        pixels = Pixels.empty(camera, options, background)
+        final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.layout.counts)
+        saved = Saved(final, count, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
+        kernel = self.kernels.blend(variant_of(options, keep))
+        inputs = [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32)]
+        self.launch_tiles(kernel, bins, inputs, [pixels.view(), *self.view_walk(*saved)])
+        return pixels, saved
+
+    def adjoint(
+        self, mode: str, bins: Bins, options: RasterOptions, background: torch.Tensor, saved: Saved, adj_pixels: Pixels
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Gradients of the slots [M, 9 or 10] and of the background [3], and the number of pixels dropped in each tile.
+
+        Args:
+            mode: one of ADJOINTS.
+            bins: as in the forward pass, like the next two.
+            options: what was computed.
+            background: [3].
+            saved: what :meth:`blend` returned last.
+            adj_pixels: upstream gradients; dense.
+        """
+        slots = bins.new_slots(options)
+        upstream, adj_background, dropped, steps = self.spread_upstream(
+            bins, options, background, saved, adj_pixels, slots
+        )
+        self.differentiate(mode, bins, options, saved, upstream, steps, slots)
+        if self.peeks:  # numpy's sum is one after another, whatever the number of torch's threads
+            return slots, torch.from_numpy(adj_background.numpy().sum(0)), dropped
+        return slots, adj_background.sum(0), dropped
+
+    def spread_upstream(
+        self, bins: Bins, options: RasterOptions, background, saved: Saved, adj_pixels: Pixels, slots: torch.Tensor
+    ) -> tuple:
+        """(Upstream gradients by pixel, dL/dT behind), dL/dbackground, dropped and steps of each tile.
+
+        Zeros in ``slots``, for the instances that the adjoint does not walk.
+        """
+        tile_count, new = len(bins.ranges), background.new_empty
+        up = new(tile_count, *self.layout.upstream_shape(variant_of(options).channels))
+        adj_final, adj_background = torch.empty_like(saved.final), new(tile_count, 3)
+        dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
+        inputs = [bins.view(), view(background, wp.float32), *self.view_walk(saved.final, saved.count)]
+        outputs = [view(up, self.layout.upstream), view(adj_final, self.layout.number)]
+        outputs += [view(adj_background, wp.float32), view(dropped, wp.int32), view(steps, wp.int32)]
+        outputs.append(view(slots, self.layout.slot(slots.shape[1])))
+        self.launch_tiles(self.kernels.upstream(variant_of(options)), bins, [*inputs, adj_pixels.view()], outputs)
+        return (up, adj_final), adj_background, dropped, steps
+
+    def differentiate(
+        self, mode: str, bins: Bins, options: RasterOptions, saved: Saved, upstream, steps, slots: torch.Tensor
+    ) -> None:
+        """Fill ``slots`` [M, 9 or 10]; ``upstream`` and ``steps`` [T] are those of :meth:`spread_upstream`."""
+        final, count, kept = self.view_walk(*saved)
+        lists, steps, rows = bins.view(), view(steps, wp.int32), view(slots, wp.float32)
+        upstream = [view(upstream[0], self.layout.upstream), view(upstream[1], self.layout.number)]
+        if mode in ("manual", "stepwise"):
+            inputs = [lists, alphas_of(options), final, count, steps, *upstream]
+            self.launch_tiles(self.kernels.reverse(mode, variant_of(options)), bins, inputs, [rows])
+            return
+        inputs = [alphas_of(options), final, count, kept, steps, rows]
+        if mode == "generated":
+            copies, copies.grad = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
+            copies.assign(bins.splats.numpy()[bins.instances.numpy()])
+            copies.grad.zero_()
+            lists.splats = copies
+        # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``rows``
+        adjoint = {"adj_inputs": [BinsView(), *[None] * len(inputs)], "adj_outputs": upstream}
+        self.launch_tiles(self.kernels.walk(mode, variant_of(options)), bins, [lists, *inputs], upstream, **adjoint)
+        if mode == "generated":
+            launch(lanes_taped.rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [rows])
+
+    def view_walk(self, final: torch.Tensor, count: torch.Tensor, *kept: torch.Tensor) -> list:
+        """Final transmittances, counts and kept transmittances, as kernels take them."""
+        numbers = [view(tensor, self.layout.number) for tensor in (final, *kept)]
+        return [numbers[0], view(count, self.layout.count), *numbers[1:]]
+
+
+def _room_for_states(bins: Bins) -> torch.Tensor:
+    """Room for the T of every tile instance at every pixel of its tile, [M, TILE TILE]: 1 KiB per instance.
+
+    Raises:
+        InputError: if that does not fit.
+    """
+    count, device = len(bins.instances), bins.instances.device
+    what = f"adjoint 'stored': the transmittances of {count} tile instances take"
+    check_memory(what, 4 * TILE * TILE * count, device, "use 'reversible', which needs none, or a smaller image", 0.8)
+    return torch.empty(count, TILE * TILE, dtype=torch.float32, device=device)
+
+
+def _launch_slices(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list, **adjoint) -> None:
+    launch(kernel, len(bins.ranges), inputs, outputs, bounds=bins.slices, **adjoint)
+
+
+def _launch_blocks(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list, **adjoint) -> None:
+    launch_blocks(kernel, len(bins.ranges), inputs, outputs, bins.instances.device, **adjoint)
 
 
 CPU = Driver(
-    *(LANES, True, bin.bin_by_counting, cpu.blend, cpu.adjoint, cpu.gather),
-    ChannelKernels(lanes.AT_ONCE, lanes.make_blend_channels, lanes.make_adj_channels, lanes_strongest.make_strongest),
-    *(cpu.launch_tiles, cpu.view_walk),
+    *(LANES, True, bin.bin_by_counting, gather.gather_by_splat, _launch_slices),
+    TileKernels(lanes_blend.make_blend, lanes_blend.make_upstream, lanes_adjoint.make_reverse, lanes_taped.make_walk),
+    TileLayout(
+        (lanes_blend.BLOCKS, LANES),
+        *(vec16, vec16, torch.float32),
+        *(vec16, lambda channels: (lanes_blend.BLOCKS * channels, LANES)),
+        lambda columns: wp.types.vector(length=columns, dtype=float),
+    ),
+    ChannelKernels(
+        lanes_channels.AT_ONCE,
+        lanes_channels.make_blend_channels,
+        lanes_channels.make_adj_channels,
+        lanes_strongest.make_strongest,
+    ),
 )
 CUDA = Driver(
-    *(1, False, bin.bin_by_sorting, cuda.blend, cuda.adjoint, cuda.gather),
-    ChannelKernels(
-        blocks.AT_ONCE, blocks.make_blend_channels, blocks.make_adj_channels, blocks_strongest.make_strongest
+    *(1, False, bin.bin_by_sorting, gather.gather_by_warp, _launch_blocks),
+    TileKernels(
+        blocks_blend.make_blend_block,
+        blocks_adjoint.make_upstream_block,
+        blocks_adjoint.make_reverse_block,
+        blocks_taped.make_walk_block,
     ),
-    *(cuda.launch_tiles, cuda.view_walk),
+    TileLayout(
+        (THREADS,),
+        *(wp.float32, wp.int32, torch.int32),
+        *(wp.vec4, lambda _channels: (THREADS, 4)),
+        lambda _columns: wp.float32,
+    ),
+    ChannelKernels(
+        blocks_channels.AT_ONCE,
+        blocks_channels.make_blend_channels,
+        blocks_channels.make_adj_channels,
+        blocks_strongest.make_strongest,
+    ),
 )
 #: By torch's name of the device.
 DRIVERS = {"cpu": CPU, "cuda": CUDA}

@@ -7,9 +7,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
-from warp_splat.kernels.simd import Types
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
+from warp_splat.runtime.launch import PerGroup, launch_in_lanes, load, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -77,13 +76,9 @@ class _ColorMap(torch.autograd.Function):
     def forward(ctx, image, numbers):
         image = image.detach().contiguous()
         ctx.save_for_backward(image, numbers)
-        weights, mapped = lanes_of(vec12, numbers.detach())[0], torch.empty_like(image)
-
-        def arguments(types: Types, rows: slice) -> tuple[list, list]:
-            colors, made = lanes_of(types.row3, image.view(-1, 3)[rows], mapped.view(-1, 3)[rows])
-            return [weights, colors], [made]
-
-        launch_in_lanes(make_map_colors, driver_of(image.device).lanes, image.numel() // 3, arguments, image.device)
+        mapped, lanes, count = torch.empty_like(image), driver_of(image.device).lanes, image.numel() // 3
+        inputs = [view(numbers.detach().view(1, 12), vec12), image.view(-1, 3)]
+        launch_in_lanes(make_map_colors, lanes, count, inputs, [mapped.view(-1, 3)], image.device)
         return mapped
 
     @staticmethod
@@ -92,15 +87,10 @@ class _ColorMap(torch.autograd.Function):
         with stage("adjoint of exposure"):
             image, numbers = ctx.saved_tensors
             adj, lanes, count = adj.contiguous(), driver_of(image.device).lanes, image.numel() // 3
-            weights, adj_image = lanes_of(vec12, numbers)[0], torch.empty_like(image)
-            sums = image.new_empty(count // lanes + count % lanes, 12)
-
-            def arguments(types: Types, rows: slice) -> tuple[list, list]:
-                tables = (table.view(-1, 3)[rows] for table in (image, adj, adj_image))
-                colors, given, made = lanes_of(types.row3, *tables)
-                return [weights, colors, given], [made, *lanes_of(vec12, sums[rows.start // lanes :])]
-
-            launch_in_lanes(make_adj_map_colors, lanes, count, arguments, image.device)
+            adj_image, sums = torch.empty_like(image), image.new_empty(count // lanes + count % lanes, 12)
+            inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.view(-1, 3)]
+            outputs = [adj_image.view(-1, 3), PerGroup(sums, vec12)]
+            launch_in_lanes(make_adj_map_colors, lanes, count, inputs, outputs, image.device)
             return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
 
 

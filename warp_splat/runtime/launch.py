@@ -15,11 +15,13 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import psutil
 import torch
 import warp as wp
 
+from warp_splat.errors import InputError
 from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_threads
@@ -72,6 +74,15 @@ def available_memory(device: torch.device) -> int:
     return torch.cuda.mem_get_info(device)[0] + reserve
 
 
+def check_memory(what: str, needed: int, device: torch.device, instead: str, share: float = 1.0) -> None:
+    """Raise InputError if ``needed`` bytes are more than this share of what can be had.
+
+    ``what`` takes them, a clause, and what to do ``instead``, another.
+    """
+    if needed > share * (available := available_memory(device)):
+        raise InputError(f"{what} {needed / 2**30:.1f} GiB, but only {available / 2**30:.1f} GiB are free; {instead}.")
+
+
 def launch(
     kernel: wp.Kernel,
     dim: int,
@@ -112,26 +123,50 @@ def launch(
     in_slices(run, bounds)
 
 
+class PerGroup(NamedTuple):
+    """A table for :func:`launch_in_lanes` with a row for each index of the kernel."""
+
+    rows: torch.Tensor
+    dtype: type
+
+
 def launch_in_lanes(
     make: Callable[[int], wp.Kernel],
     lanes: int,
     count: int,
-    arguments: Callable[[Types, slice], tuple[list, list]],
+    inputs: Sequence,
+    outputs: Sequence,
     device: torch.device | str = "cpu",
     run: int = 1,
 ) -> None:
     """Launch ``make(lanes)``, a kernel for so many rows at once, on ``count`` rows, ``make(1)`` on those left over.
 
-    ``arguments`` gives inputs and outputs for a slice of the rows, as arrays of those types (:func:`lanes_of`). An
-    index of the kernel takes ``run`` groups of rows.
+    Inputs and outputs are dense tensors of ``count`` rows of 1 to 4 numbers, functions of the kernel's types and a
+    slice of the rows, :class:`PerGroup` (of groups first, then of those left over), or else the same for all. An index
+    of the kernel takes ``run`` groups of rows.
     """
-    whole = count - count % lanes
+    whole, first = count - count % lanes, 0
     for size, rows in ((lanes, slice(0, whole)), (1, slice(whole, count))):
-        groups = (rows.stop - rows.start) // size
-        if groups:
-            runs = -(-groups // run)
+        runs = -(-((rows.stop - rows.start) // size) // run)
+        if runs:
             bounds = even_slices(runs, max(SMALLEST_SLICE // (size * run), 1))
-            launch(make(size), runs, *arguments(TYPES[size], rows), bounds=bounds, device=device)
+            groups = slice(first, first + runs)
+            given, made = (
+                [_in_lanes(table, TYPES[size], count, rows, groups) for table in tables] for tables in (inputs, outputs)
+            )
+            launch(make(size), runs, given, made, bounds=bounds, device=device)
+            first += runs
+
+
+def _in_lanes(table: Any, types: Types, count: int, rows: slice, groups: slice) -> Any:
+    """The part of a table that a kernel gets; see :func:`launch_in_lanes`."""
+    if isinstance(table, PerGroup):
+        return view(table.rows[groups], table.dtype)
+    if isinstance(table, torch.Tensor):
+        narrow = types.integer if table.dtype == torch.int32 else types.number
+        by_width = {1: narrow, 2: types.row2, 3: types.row3, 4: types.row4}
+        return lanes_of(by_width[table.numel() // count], table[rows])[0]
+    return table(types, rows) if callable(table) else table
 
 
 def read_later(values: torch.Tensor) -> Callable[[], list]:

@@ -46,15 +46,16 @@ def _launch(tables: list, numbers: list, keyed: list[int], count: int, radii: to
     widths, keys = (torch.tensor(values, dtype=torch.int32, device="cpu") for values in (sizes, keyed))
     of_tables = torch.tensor(numbers, dtype=torch.float32, device="cpu")
 
-    def arguments(_types: Types, rows: slice) -> tuple[list, list]:
-        addresses = torch.tensor(_addresses(tables, sizes, rows.start), dtype=torch.int64, device="cpu")
-        shown = widths if radii is None else radii[rows]
-        inputs = [rows.start, view(widths, wp.int32), view(keys, wp.int32), view(of_tables, wp.float32)]
-        inputs.append(view(shown, wp.int32))
-        return inputs, [view(addresses, wp.uint64)]
+    def addresses(_types: Types, rows: slice):
+        return view(torch.tensor(_addresses(tables, sizes, rows.start), dtype=torch.int64, device="cpu"), wp.uint64)
 
+    def shown(_types: Types, rows: slice):
+        return view(widths if radii is None else radii[rows], wp.int32)
+
+    inputs = [lambda _types, rows: rows.start, *(view(table, wp.int32) for table in (widths, keys))]
+    inputs += [view(of_tables, wp.float32), shown]
     make = partial(make_adam, sparse=radii is not None, halves=tables[0][-1].dtype == HALF)
-    launch_in_lanes(make, LANES, count, arguments)
+    launch_in_lanes(make, LANES, count, inputs, [addresses])
 
 
 def _addresses(tables: list, widths: list[int], row: int) -> list[list[int]]:

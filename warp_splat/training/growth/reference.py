@@ -13,11 +13,10 @@ import warp as wp
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import activate
-from warp_splat.kernels.simd import Types
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes, load
+from warp_splat.runtime.launch import launch_in_lanes, load
 from warp_splat.training.growth import ReferenceOptions
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting, Step
@@ -61,14 +60,9 @@ class Reference:
         grad, (height, width) = out.means2d.grad, out.image.shape[:2]
         if grad is None or step.iteration >= self.options.densify_until_iter:
             return
-
-        def arguments(types: Types, rows: slice) -> tuple[list, list]:
-            given = [*lanes_of(types.row2, grad[rows]), *lanes_of(types.integer, out.radii[rows])]
-            return [wp.vec2(0.5 * width, 0.5 * height), *given], lanes_of(
-                types.number, self.gradient[rows], self.views[rows]
-            )
-
-        launch_in_lanes(make_observe, driver_of(grad.device).lanes, len(grad), arguments, grad.device)
+        inputs = [wp.vec2(0.5 * width, 0.5 * height), grad, out.radii]
+        lanes, device = driver_of(grad.device).lanes, grad.device
+        launch_in_lanes(make_observe, lanes, len(grad), inputs, [self.gradient, self.views], device)
         if self.options.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
 
