@@ -162,8 +162,8 @@ def _checked(
     background = check_background(background, means.device)
     if features is not None:
         check_features(features, means)
-    outputs = []
-    sizes = ((base.width, base.height) for base in (getattr(camera, "base", camera) for camera in cameras))
+    outputs, bases = [], (camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras)
+    sizes = ((base.width, base.height) for base in bases)
     advice = "render smaller images (Camera.resized) or fewer Gaussians"
     with own_explained(options), memory_explained(means.device, means, sizes, advice):
         for camera in cameras:
