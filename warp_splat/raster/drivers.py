@@ -31,7 +31,7 @@ from warp_splat.kernels.cuda import taped as blocks_taped
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant, Splat2D
 from warp_splat.kernels.structs import BinsView
-from warp_splat.raster import bin, gather
+from warp_splat.raster import bin, gathering
 from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
 from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, view
 
@@ -192,7 +192,7 @@ def _launch_blocks(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list, *
 
 
 CPU = Driver(
-    *(LANES, True, bin.bin_by_counting, gather.gather_by_splat, _launch_slices),
+    *(LANES, True, bin.bin_by_counting, gathering.gather_by_splat, _launch_slices),
     TileKernels(lanes_blend.make_blend, lanes_blend.make_upstream, lanes_adjoint.make_reverse, lanes_taped.make_walk),
     TileLayout(
         (lanes_blend.BLOCKS, LANES),
@@ -208,7 +208,7 @@ CPU = Driver(
     ),
 )
 CUDA = Driver(
-    *(1, False, bin.bin_by_sorting, gather.gather_by_warp, _launch_blocks),
+    *(1, False, bin.bin_by_sorting, gathering.gather_by_warp, _launch_blocks),
     TileKernels(
         blocks_blend.make_blend_block,
         blocks_adjoint.make_upstream_block,
