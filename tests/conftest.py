@@ -12,6 +12,8 @@ import warp as wp
 from fake_viser import FakeServer
 from filelock import FileLock
 
+from warp_splat import get_threads, set_threads
+from warp_splat.cli import main
 from warp_splat.config import RasterOptions
 from warp_splat.kernels import ssim
 from warp_splat.kernels.cpu.adjoint import make_reverse
@@ -63,6 +65,44 @@ def pytest_sessionstart():
 def device(request) -> str:
     """Every device that the renderer supports."""
     return request.param
+
+
+@pytest.fixture
+def threads():
+    """Sets the number of threads; afterwards it is as before."""
+    before = get_threads()
+    yield set_threads
+    set_threads(before)
+
+
+@pytest.fixture
+def fails(capsys):
+    """Runs a command that fails, and returns its one sentence."""
+
+    def run(*arguments):
+        assert main([*map(str, arguments)]) == 1
+        message = capsys.readouterr().err.strip()
+        assert message.startswith("warp-splat: error: ") and "Traceback" not in message and "\n" not in message
+        return message
+
+    return run
+
+
+@pytest.fixture
+def spoil(monkeypatch):
+    """Lets a function change the list of gradients that an autograd function's backward returns."""
+
+    def run(function, change):
+        backward = function.backward
+
+        def spoiled(ctx, *upstream):
+            gradients = list(backward(ctx, *upstream))
+            change(gradients)
+            return tuple(gradients)
+
+        monkeypatch.setattr(function, "backward", staticmethod(spoiled))
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -119,20 +119,9 @@ def build(launch: Launch, sanitizer: str, folder: Path) -> Path:
         source = re.sub(instruction, code, source)
     shared = max(sizes[f"{name}_smem_bytes"], 1)
     (folder / "program.cpp").write_text(PROGRAM.format(shared=shared, source=source, kernel=name))
-    flags = [
-        "-std=c++17",
-        "-O1",
-        "-g",
-        "-w",
-        "-fpermissive",
-        f"-fsanitize={sanitizer}",
-        "-I",
-        HERE,
-        "-I",
-        folder / "native",
-    ]
-    command = [COMPILER, *flags, folder / "program.cpp", "-o", folder / "program"]
-    subprocess.run(command, check=True)
+    flags = ["-std=c++17", "-O1", "-g", "-w", "-fpermissive", f"-fsanitize={sanitizer}"]
+    flags += ["-I", HERE, "-I", folder / "native"]
+    subprocess.run([COMPILER, *flags, folder / "program.cpp", "-o", folder / "program"], check=True)
     return folder / "program"
 
 

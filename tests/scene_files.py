@@ -40,6 +40,72 @@ def texture(width=WIDTH, height=HEIGHT, channels=3, dtype=np.uint8):
     return noise.astype(dtype)
 
 
+def radial(x, y, k1, k2=0.0, p1=0.0, p2=0.0):
+    """COLMAP's (and OpenCV's) radial and tangential distortion of normalized coordinates."""
+    return full_radial(x, y, k1, k2, p1, p2)
+
+
+def full_radial(x, y, k1, k2, p1, p2, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
+    """OpenCV's rational model."""
+    r2 = x * x + y * y
+    factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return (
+        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+    )
+
+
+def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
+    """OpenCV's equidistant fisheye model."""
+    r = np.hypot(x, y)
+    t = np.arctan(r)
+    bent = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8)
+    return x * bent / r, y * bent / r
+
+
+def thin_prism(x, y, k1, k2, p1, p2, k3, k4, s1, s2):
+    """Weng et al. 1992 on the angles of a fisheye, in COLMAP's order of the parameters."""
+    x, y = fisheye(x, y)
+    dx, dy = full_radial(x, y, k1, k2, p1, p2, k3)
+    r2 = x * x + y * y
+    return dx + x * k4 * r2**4 + s1 * r2, dy + y * k4 * r2**4 + s2 * r2
+
+
+def field_of_view(x, y, omega):
+    """Devernay and Faugeras 2001."""
+    r = np.hypot(x, y)
+    factor = np.arctan(2 * r * np.tan(omega / 2)) / (r * omega)
+    return x * factor, y * factor
+
+
+def pattern(x, y):
+    """A smooth picture on the plane at depth 1, 0..1."""
+    return np.stack([0.5 + 0.4 * np.sin(9 * x), 0.5 + 0.4 * np.cos(8 * y), 0.5 + 0.4 * np.sin(6 * (x + y))], axis=-1)
+
+
+def distorted_picture(distort, params, width, height, fx, fy, cx, cy):
+    """What a lens shows of the pattern, in 16 bits."""
+    v, u = np.mgrid[:height, :width] + 0.5
+    goal = (u - cx) / fx, (v - cy) / fy
+    x, y = goal
+    for _ in range(200):  # the fixed point of x = x + goal - distort(x)
+        bent = distort(x, y, *params)
+        x, y = x + goal[0] - bent[0], y + goal[1] - bent[1]
+    np.testing.assert_allclose(distort(x, y, *params), goal, atol=1e-9)
+    return np.rint(pattern(x, y) * 65535).astype(np.uint16)
+
+
+def check_ideal(view):
+    """A view shows the pattern as a pinhole would."""
+    camera = view.camera
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    ideal = pattern((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy) * 255
+    assert view.image.shape == ideal.shape
+    error = np.abs(view.image - ideal)
+    assert error[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
+    assert error.max() < 3  # the outermost pixels may lie half a pixel outside of the file
+
+
 def write_model(folder, names, camera=PINHOLE, points=POINTS, binary=False):
     """A COLMAP model in the documented text format; pycolmap turns it into a binary one."""
     folder.mkdir(parents=True)
@@ -105,11 +171,10 @@ def load(root, **options):
     return load_scene(root, report=lines.append, **options), lines
 
 
-def change_json(root, change):
-    path = root / "transforms_train.json"
-    content = json.loads(path.read_text())
+def change_json(root, change, name="transforms_train.json"):
+    content = json.loads((root / name).read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    (root / name).write_text(json.dumps(content))
 
 
 def scale_axes(content, factors):

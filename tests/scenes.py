@@ -9,13 +9,21 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
+from warp_splat import Shutter
 from warp_splat.camera import Camera
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
 from warp_splat.lenses import Lens
+from warp_splat.lenses.formulas import MODELS
 
 C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
 OPENCV, FISHEYE = Lens("OPENCV", (-0.12, 0.02, 0.01, -0.006)), Lens("OPENCV_FISHEYE", (0.03, -0.01, 0.004, -0.001))
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+
+
+SMALL = (0.06, -0.03, 0.004, -0.006, 0.02, -0.01, 0.015, 0.005, 0.003, -0.002, 0.004, 0.001)
+OTHERS = {"FOV": (0.9,), "EUCM": (0.6, 1.1)}
+LENSES = {model: Lens(model, OTHERS.get(model, SMALL[:count])) for model, (_, count) in MODELS.items()}
+SHUTTER = Shutter((0.02, 0.05, -0.03), (0.05, 0.02, -0.08))
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,3 +236,9 @@ SCENES = {
     "far_world": lambda: cloud(17, 100, make_camera(41, 34, seed=8, center=(1000.3, -900.7, 1100.2)), degree=1),
     "negative_color": lambda: cloud(18, 120, make_camera(39, 28), degree=1, low=-1.0, high=1.0, rest=0.4),
 }
+
+
+def scene_of(name):
+    """By its name; "rolling ..." moves while its rows are read."""
+    scene = SCENES[name.removeprefix("rolling ")]()
+    return replace(scene, camera=replace(scene.camera, shutter=SHUTTER)) if "rolling" in name else scene

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import zstandard
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.splats import SplatArrays, SplatFile
@@ -35,15 +36,8 @@ def some_file(count=50, coefficients=16, seed=0, antialiased=False):
 
 
 def covariances(splats):
-    """[N, 3, 3] float64, with the rotation matrix as in the documentation of glTF."""
-    w, x, y, z = (splats.quats.astype(np.float64) / np.linalg.norm(splats.quats, axis=1, keepdims=True)).T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    """[N, 3, 3] float64, by SciPy's rotations."""
+    rotation = Rotation.from_quat(splats.quats.astype(np.float64), scalar_first=True).as_matrix()
     factors = rotation * np.exp(splats.scales.astype(np.float64))[:, None]
     return factors @ factors.transpose(0, 2, 1)
 

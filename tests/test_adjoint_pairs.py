@@ -2,7 +2,9 @@
 
 import ast
 import inspect
+import linecache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +12,8 @@ import warp as wp
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN
 from warp_splat.kernels import falloff, simd, splat
-from warp_splat.kernels.angle import angle as angle_of
-from warp_splat.kernels.columns import columns as columns_of
-from warp_splat.kernels.columns import rows
+from warp_splat.kernels.angle import angle
+from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.falloff import exp2_known, make_exp
 from warp_splat.kernels.simd import vec16
 from warp_splat.kernels.step import opaque
@@ -69,65 +70,50 @@ def adjoints():
     return found[False], found[True]
 
 
+@wp.func
+def mixed(x: Any, y: Any, z: Any):
+    a, b, c = columns(rows(x, y, z))
+    return simd.times(a, simd.times(b, b)) + c
+
+
+#: Text of the pieces in the kernels' language, of x, y, z; and the same in float64, of which differences are taken.
+PIECES = {
+    "times": ("simd.times(x, y)", lambda x, y, z: x * y),
+    "fma": ("simd.fma(x, y, z)", lambda x, y, z: x * y + z),
+    "over": ("simd.over(x, y)", lambda x, y, z: x / y),
+    "where_less": (
+        "simd.where_less(y, z, simd.times(x, x), simd.times(y, z))",
+        lambda x, y, z: np.where(y < z, x * x, y * z),
+    ),
+    "fraction": ("simd.fraction(x, simd.whole(y))", lambda x, y, z: x - np.trunc(y)),
+    "inverse": ("simd.inverse(x)", lambda x, y, z: 1 / x),
+    "root": ("simd.root(x)", lambda x, y, z: np.sqrt(x)),
+    "halved": ("simd.halved(x, simd.whole(y))", lambda x, y, z: x * 0.5 ** np.trunc(y)),
+    "pick": (
+        "simd.pick(simd.less(x, simd.fill(1.0, x)), simd.times(y, y), simd.times(z, x))",
+        lambda x, y, z: np.where(x < 1, y * y, z * x),
+    ),
+    "columns": ("mixed(x, y, z)", lambda x, y, z: x * y * y + z),
+    "angle": ("angle(x, y)", lambda x, y, z: np.arctan2(x, y)),
+    "exp2_known": ("exp2_known(x, y)", lambda x, y, z: np.exp2(-x)),  # what it was given is the value itself
+    "opaque": (
+        "opaque(x, wp.vec2(ALPHA_MIN, ALPHA_MAX), y, z)",
+        lambda x, y, z: np.where(y < z, np.where(x < ALPHA_MIN, 0, np.minimum(x, ALPHA_MAX)), 0),
+    ),
+}
+#: What the texts speak of.
+KNOWN = {"simd": simd, "wp": wp, "angle": angle, "exp2_known": exp2_known, "opaque": opaque, "mixed": mixed}
+KNOWN |= {"ALPHA_MIN": ALPHA_MIN, "ALPHA_MAX": ALPHA_MAX}
+COVERED = {*PIECES, "rows"}  # rows are made where columns are taken
+
+
 def make_piece(name, number):
     """A kernel of x, y, z that calls the piece ``name``."""
-
-    @wp.func
-    def inverse(x: number, y: number, z: number):
-        return simd.inverse(x)
-
-    @wp.func
-    def root(x: number, y: number, z: number):
-        return simd.root(x)
-
-    @wp.func
-    def halved(x: number, y: number, z: number):
-        return simd.halved(x, simd.whole(y))
-
-    @wp.func
-    def times(x: number, y: number, z: number):
-        return simd.times(x, y)
-
-    @wp.func
-    def fma(x: number, y: number, z: number):
-        return simd.fma(x, y, z)
-
-    @wp.func
-    def over(x: number, y: number, z: number):
-        return simd.over(x, y)
-
-    @wp.func
-    def where_less(x: number, y: number, z: number):
-        return simd.where_less(y, z, simd.times(x, x), simd.times(y, z))
-
-    @wp.func
-    def fraction(x: number, y: number, z: number):
-        return simd.fraction(x, simd.whole(y))
-
-    @wp.func
-    def pick(x: number, y: number, z: number):
-        return simd.pick(simd.less(x, simd.fill(1.0, x)), simd.times(y, y), simd.times(z, x))
-
-    @wp.func
-    def columns(x: number, y: number, z: number):
-        a, b, c = columns_of(rows(x, y, z))
-        return simd.times(a, simd.times(b, b)) + c
-
-    @wp.func
-    def known(x: number, y: number, z: number):
-        return exp2_known(x, y)
-
-    @wp.func
-    def clamped(x: number, y: number, z: number):
-        return opaque(x, wp.vec2(ALPHA_MIN, ALPHA_MAX), y, z)
-
-    @wp.func
-    def angle(x: number, y: number, z: number):
-        return angle_of(x, y)
-
-    pieces = {"exp2_known": known, "opaque": clamped, "inverse": inverse, "root": root, "halved": halved}
-    pieces |= {"times": times, "fma": fma, "over": over, "where_less": where_less, "fraction": fraction}
-    piece = (pieces | {"pick": pick, "columns": columns, "angle": angle})[name]
+    path, names = f"<piece {name} of {number.__name__}>", {**KNOWN, "number": number}
+    source = f"def piece(x: number, y: number, z: number):\n    return {PIECES[name][0]}\n"
+    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
+    exec(compile(source, path, "exec"), names)
+    piece = wp.func(names["piece"])
 
     @wp.kernel(module="unique")
     def evaluate(x: wp.array[number], y: wp.array[number], z: wp.array[number], values_out: wp.array[number]):
@@ -135,25 +121,6 @@ def make_piece(name, number):
         values_out[i] = piece(x[i], y[i], z[i])
 
     return evaluate
-
-
-#: The same in float64, of which differences are taken; what `exp2_known` was given is the value itself.
-TRUTH = {
-    "times": lambda x, y, z: x * y,
-    "fma": lambda x, y, z: x * y + z,
-    "over": lambda x, y, z: x / y,
-    "where_less": lambda x, y, z: np.where(y < z, x * x, y * z),
-    "fraction": lambda x, y, z: x - np.trunc(y),
-    "inverse": lambda x, y, z: 1 / x,
-    "root": lambda x, y, z: np.sqrt(x),
-    "halved": lambda x, y, z: x * 0.5 ** np.trunc(y),
-    "pick": lambda x, y, z: np.where(x < 1, y * y, z * x),
-    "columns": lambda x, y, z: x * y * y + z,
-    "angle": lambda x, y, z: np.arctan2(x, y),
-    "exp2_known": lambda x, y, z: np.exp2(-x),
-    "opaque": lambda x, y, z: np.where(y < z, np.where(x < ALPHA_MIN, 0, np.minimum(x, ALPHA_MAX)), 0),
-}
-COVERED = {*TRUTH, "rows"}  # rows are made where columns are taken
 
 
 def test_every_derivative_by_hand_is_tested():
@@ -164,9 +131,9 @@ def test_every_derivative_by_hand_is_tested():
 
 
 @pytest.mark.parametrize("lanes", [1, simd.LANES])
-@pytest.mark.parametrize("name", TRUTH)
+@pytest.mark.parametrize("name", PIECES)
 def test_against_differences(name, lanes):
-    number, truth = simd.TYPES[lanes].number, TRUTH[name]
+    number, truth = simd.TYPES[lanes].number, PIECES[name][1]
     given = np.random.default_rng(0).uniform(LOW, HIGH, (3, 50, lanes))
     given = given[:, (np.abs(given[0] - 1) > 0.02).all(1) & (np.abs(given[1] - given[2]) > 0.02).all(1)]
     if name == "exp2_known":

@@ -7,12 +7,11 @@ import pytest
 import torch
 import warp as wp
 
-from warp_splat import Camera, InputError, RasterOptions, set_threads
+from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.raster import api, bin, depth_order
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Bins, Gaussians, Room
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.runtime.pool import get_threads
 
 SIZE = (70, 53)
 PLAIN = RasterOptions()
@@ -65,26 +64,22 @@ def test_places_are_those_of_each_splat():
 
 
 @pytest.mark.parametrize("width", [9, 10])
-def test_rows_are_summed_by_gaussian(width):
+def test_rows_are_summed_by_gaussian(width, threads):
     """Whoever shares the work: bit for bit the sums that one gets from first to last."""
     camera, projected = project(5000)
-    threads = get_threads()
-    try:
-        for driver in (CPU, CUDA):
-            bins = driver.bin(projected, camera, PLAIN)
-            slots = torch.randn(len(bins.instances), width, generator=torch.Generator().manual_seed(1))
-            sums = np.zeros((5000, width), np.float32)
-            first_to_last = bins.gaussians.numpy()[bins.instances.numpy()[bins.places.numpy()]]
-            np.add.at(sums, first_to_last, slots.numpy()[bins.places.numpy()])
-            for count in (1, 2, 3):
-                set_threads(count)
-                with using(driver):
-                    found = driver.gather(bins, slots)
-                assert [grad.shape[1:].numel() for grad in found] == [2, 3, 1, 3, 1]
-                assert width == 10 or not found[4].any()
-                assert (torch.cat([grad.view(5000, -1) for grad in found], 1)[:, :width].numpy() == sums).all()
-    finally:
-        set_threads(threads)
+    for driver in (CPU, CUDA):
+        bins = driver.bin(projected, camera, PLAIN)
+        slots = torch.randn(len(bins.instances), width, generator=torch.Generator().manual_seed(1))
+        sums = np.zeros((5000, width), np.float32)
+        first_to_last = bins.gaussians.numpy()[bins.instances.numpy()[bins.places.numpy()]]
+        np.add.at(sums, first_to_last, slots.numpy()[bins.places.numpy()])
+        for count in (1, 2, 3):
+            threads(count)
+            with using(driver):
+                found = driver.gather(bins, slots)
+            assert [grad.shape[1:].numel() for grad in found] == [2, 3, 1, 3, 1]
+            assert width == 10 or not found[4].any()
+            assert (torch.cat([grad.view(5000, -1) for grad in found], 1)[:, :width].numpy() == sums).all()
 
 
 def test_rows_are_summed_in_any_mode_of_torch():
@@ -93,8 +88,7 @@ def test_rows_are_summed_in_any_mode_of_torch():
     slots = torch.rand(len(bins.instances), 9)
     expected = CPU.gather(bins, slots)
     with torch.inference_mode():
-        found = CPU.gather(bins, slots)
-    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+        assert all(map(torch.equal, CPU.gather(bins, slots), expected))
 
 
 def test_without_gaussians_or_instances_sums_are_zero():
@@ -134,37 +128,27 @@ def crowded(count, width):
     return Bins(count, gaussians, None, nothing, places, begins, nothing, [], 1, 0), rows, counts
 
 
-def test_depths_are_sorted_in_bands(monkeypatch):
+def test_depths_are_sorted_in_bands(monkeypatch, threads):
     """Whatever their sign and size, ties by index; and the depths stay as they are."""
     monkeypatch.setattr(depth_order, "SMALLEST_BAND", 1000)
-    random, threads = np.random.default_rng(0), get_threads()
+    random = np.random.default_rng(0)
     depths = (random.choice([-1.0, 1.0], 7003) * 10.0 ** random.uniform(-30, 30, 7003)).astype(np.float32)
     depths[random.integers(0, 7003, 3000)] = 2.5
     before = depths.copy()
-    try:
-        for count in (1, 2, 5):
-            set_threads(count)
-            assert (depth_order.order_by_depth(depths) == np.argsort(depths, kind="stable")).all()
-            assert (depths == before).all()
-    finally:
-        set_threads(threads)
+    for count in (1, 2, 5):
+        threads(count)
+        assert (depth_order.order_by_depth(depths) == np.argsort(depths, kind="stable")).all()
+        assert (depths == before).all()
 
 
-def test_the_number_of_threads_changes_nothing(monkeypatch):
+def test_the_number_of_threads_changes_nothing(monkeypatch, threads):
     monkeypatch.setattr(depth_order, "SMALLEST_BAND", 1000)
-    threads = get_threads()
-    camera, projected = project(5000)
-    try:
-        results = []
-        for count in (1, 2, 3):
-            set_threads(count)
-            results.append(CPU.bin(projected, camera, RasterOptions()))
-    finally:
-        set_threads(threads)
-    for other in results[1:]:
-        assert all(
-            torch.equal(getattr(other, name), getattr(results[0], name)) for name in ("instances", "places", "ranges")
-        )
+    (camera, projected), results = project(5000), []
+    for count in (1, 2, 3):
+        threads(count)
+        bins = CPU.bin(projected, camera, RasterOptions())
+        results.append([bins.instances, bins.places, bins.ranges])
+    assert all(map(torch.equal, results[0], results[1])) and all(map(torch.equal, results[0], results[2]))
 
 
 def counted_and_sorted(camera, projected, options=PLAIN):
@@ -262,13 +246,19 @@ def test_images_and_gradients_are_the_same_from_sorted_lists():
     assert all(torch.equal(first, second) for first, second in zip(*results, strict=True))
 
 
-def test_counts_past_32_bits_are_refused_with_the_sizes(monkeypatch):
+@pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
+def test_too_many_for_a_list_or_a_tile_are_refused_with_the_sizes(bin_on, monkeypatch):
     camera, projected = project()
+    longest = max(map(len, lists(CPU.bin(projected, camera, PLAIN))))
+    monkeypatch.setattr(bin, "MAX_TILE", longest)
+    bin_on(projected, camera, PLAIN)
+    monkeypatch.setattr(bin, "MAX_TILE", longest - 1)
+    message = f"one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {longest - 1} that fit"
+    with pytest.raises(InputError, match=message):
+        bin_on(projected, camera, PLAIN)
     monkeypatch.setattr(bin, "MAX_INSTANCES", 100)
     with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        CPU.bin(projected, camera, RasterOptions())
-    with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        bin.bin_by_sorting(projected, camera, RasterOptions())
+        bin_on(projected, camera, PLAIN)
 
 
 @pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
@@ -281,15 +271,3 @@ def test_the_count_does_not_wrap(bin_on):
         projected.conics[:] = torch.tensor([1e-10, 0.0, 1e-10])
     with pytest.raises(InputError, match=f"touch tiles {70_000 * 188 * 182} times, more than the 2147483647"):
         bin_on(projected, camera, RasterOptions(extent="ellipse"))
-
-
-@pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])
-def test_one_tile_with_too_many_is_refused(bin_on, monkeypatch):
-    camera, projected = project()
-    longest = max(map(len, lists(CPU.bin(projected, camera, PLAIN))))
-    monkeypatch.setattr(bin, "MAX_TILE", longest)
-    bin_on(projected, camera, PLAIN)
-    monkeypatch.setattr(bin, "MAX_TILE", longest - 1)
-    message = f"one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {longest - 1} that fit"
-    with pytest.raises(InputError, match=message):
-        bin_on(projected, camera, PLAIN)

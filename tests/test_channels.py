@@ -1,6 +1,5 @@
 """What is blended beside the color, on both drivers: against float64, and one channel against many."""
 
-import contextlib
 import functools
 
 import pytest
@@ -10,9 +9,9 @@ from scenes import PARAMETERS, SCENES, cloud, make_camera
 from test_rasterize import GRADIENT, IMAGE_MAX, relative_error
 
 import warp_splat
-from warp_splat import InputError, RasterOptions, get_threads, rasterize_views, set_threads, tape
+from warp_splat import InputError, RasterOptions, rasterize_views, tape
 from warp_splat.compare import oracle
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA, using
 
 ALL = RasterOptions(normals=True, median_depth=True, strongest=3)
 DRIVERS = ("lanes", "blocks")
@@ -22,7 +21,7 @@ NARROW = 1e-3  # of a transmittance around 1/2, or of two weights: float32 may d
 @pytest.fixture(params=DRIVERS)
 def driver(request):
     """The CPU's, then that of a GPU in fibers."""
-    with using(CUDA) if request.param == "blocks" else contextlib.nullcontext():
+    with using(CUDA if request.param == "blocks" else CPU):
         yield request.param
 
 
@@ -113,24 +112,15 @@ def test_color_is_the_same_beside_channels(driver):
     assert out.features.shape == (*out.alpha.shape, 512) and out.strongest.shape == (*out.alpha.shape, 3)
 
 
-def test_the_same_bits_for_any_number_of_threads():
-    scene, before, found = cloud(3, 4000, make_camera(200, 150)), get_threads(), []
-    for threads in (1, 3):
-        set_threads(threads)
-        try:
-            leaves = leaves_of(scene, features_of(scene, 3))
-            out = render(scene, leaves, ALL)
-            (out.features.sum() + out.normals.sum() + out.median_depth.sum() + out.strongest_weights.sum()).backward()
-            found.append(
-                [
-                    out.features,
-                    out.median_depth,
-                    out.strongest,
-                    *(leaf.grad for leaf in leaves if leaf.grad is not None),
-                ]
-            )
-        finally:
-            set_threads(before)
+def test_the_same_bits_for_any_number_of_threads(threads):
+    scene, found = cloud(3, 4000, make_camera(200, 150)), []
+    for count in (1, 3):
+        threads(count)
+        leaves = leaves_of(scene, features_of(scene, 3))
+        out = render(scene, leaves, ALL)
+        (out.features.sum() + out.normals.sum() + out.median_depth.sum() + out.strongest_weights.sum()).backward()
+        grads = [leaf.grad for leaf in leaves if leaf.grad is not None]
+        found.append([out.features, out.median_depth, out.strongest, *grads])
     assert all(map(torch.equal, *found))
 
 

@@ -4,22 +4,22 @@ import json
 import multiprocessing
 import os
 import random
-import resource
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from commands import ROOT, SCENE, SHORT, full_disk, started, train
 from scene_files import pose, write_colmap
 from splat_files import some_splats
-from test_distributed import Pretended, torchrun
-from test_train import ROOT, SCENE, SHORT, fails, train
+from test_distributed import torchrun
+from trainings import SCHEDULE, Pretended, begin, check_same, resumed, state_of, steps
 
 from warp_splat.cli import main, parse
 from warp_splat.errors import InputError
@@ -32,42 +32,10 @@ from warp_splat.formats.splats import SplatFile
 from warp_splat.training.command import train as command_train
 from warp_splat.training.config_file import load_options
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.record import Run, finish, keep, restore, save_model
+from warp_splat.training.record import finish, keep, restore, save_model
 from warp_splat.training.trainer import Trainer
 
 STOP = 33  # of 60; densification has added Gaussians and the opacities were reset
-#: Densifies, prunes, resets opacities and raises the SH degree within 50 steps.
-SCHEDULE = {
-    "device": "cpu",
-    "iterations": 50,
-    "densify_from_iter": 10,
-    "densification_interval": 10,
-    "densify_until_iter": 45,
-    "opacity_reset_interval": 20,
-    "sh_interval": 15,
-    "densify_grad_threshold": 0.00005,
-}
-
-
-def begin(scene, folder, **options):
-    """A trainer and its run, as :func:`warp_splat.training.command.train` starts them."""
-    return Trainer(scene, TrainConfig(**{**SCHEDULE, **options})), Run(folder, time.perf_counter())
-
-
-def steps(trainer, run, end):
-    """Train until the loss of iteration ``end`` is differentiated, which is where models and checkpoints are saved."""
-    for iteration in range(run.iteration + 1, end + 1):
-        if run.iteration:
-            trainer.update(run.iteration)
-        run.losses.append(trainer.differentiate(iteration))
-        run.iteration = iteration
-
-
-def state_of(trainer, run):
-    """All that the state holds, as bytes and values."""
-    tensors, facts = trainer.state()
-    tensors["losses"] = torch.stack(run.losses)
-    return {name: (tensor.dtype, tensor.shape, tensor.numpy().tobytes()) for name, tensor in tensors.items()}, facts
 
 
 @pytest.mark.slow
@@ -85,22 +53,36 @@ def state_of(trainer, run):
 )
 def test_a_run_that_stops_again_and_again_ends_in_the_same_bytes(options, scene, tmp_path):
     """At the start, after one step, where the set is about to change and opacities to be reset, and in between."""
-    trainer, run = begin(scene, tmp_path, **options)
-    steps(trainer, run, 50)
-    expected, facts = state_of(trainer, run)
-    trainer, run = begin(scene, tmp_path, **options)
-    for stop in (0, 1, 20, 37):
-        steps(trainer, run, stop)
-        keep(trainer, run)
-        trainer, run = begin(scene, tmp_path, **options)
-        trainer.warm_up()
-        restore(trainer, run, load_checkpoint(tmp_path))
-        assert run.iteration == stop
-    steps(trainer, run, 50)
-    found, found_facts = state_of(trainer, run)
-    assert found_facts == facts and found.keys() == expected.keys()
-    assert [name for name in expected if found[name] != expected[name]] == []
-    assert expected["parameters.means"][1][0] not in (4500, 0) or options.get("max_gaussians")
+    expected = resumed(scene, tmp_path, [50], **options)
+    check_same(resumed(scene, tmp_path, [0, 1, 20, 37, 50], **options), expected)
+    assert len(expected[0].model) not in (4500, 0) or options.get("max_gaussians")
+
+
+ALL = {"parts": "sky,exposure,pose,depth,floaters", "vignetting": True}
+POSE = {"parts": "pose", "pose_from_iter": 5}
+
+
+@pytest.mark.parametrize(
+    ("options", "learned"),
+    [
+        ({"parts": "floaters", "opacity_reg": 0.5}, ""),
+        ({"parts": "floaters", "opacity_reg": 0.5, "optimizer_type": "sparse_adam"}, ""),
+        *(({**ALL, "exposure": kind}, "exposure vignetting pose") for kind in ("gain", "affine", "bilateral")),
+        ({**POSE, "pose_intrinsics": ""}, "pose"),
+        *(({**POSE, "pose_intrinsics": lens}, "pose lens") for lens in ("focal", "all")),
+    ],
+    ids=str,
+)
+def test_what_parts_learn_is_kept(options, learned, scene, tmp_path):
+    """Also where the file that a run with poses started from has gone."""
+    trainer, run = expected = resumed(scene, tmp_path, [34], **options)
+    state, _ = state_of(trainer, run)
+    assert {name for name in ("exposure", "vignetting", "pose", "lens") if f"parameters.{name}" in state} == {
+        *learned.split()
+    }
+    assert all(state[f"parameters.{name}"] != state[f"gradients.{name}"] for name in learned.split())
+    then = replace(scene, points=scene.points[::3]) if options["parts"] == "pose" else None
+    check_same(resumed(scene, tmp_path, [3, 20, 34], then, **options), expected)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +113,11 @@ def results(folder):
     return [{k: v for k, v in item.items() if k not in timed} for item in (*history, entry)]
 
 
-def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
+def files_of(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys, fails):
     """Through the command line, with another number of threads; then beyond the end, and what is refused."""
     folder = tmp_path / "model"
     with monkeypatch.context() as patch:
@@ -153,13 +139,13 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys):
     assert results(folder) == results(whole)
     assert not list(folder.glob(".tmp-*")) and "To continue" not in capsys.readouterr().out
 
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert "already holds" in fails(capsys, "train", "-s", str(SCENE), "-m", str(folder))
-    assert f"--resume {folder}" in fails(capsys, "train", "--resume", str(named))
-    assert "expected at least 60, as in" in fails(capsys, "train", "--resume", str(folder), "--iterations", "59")
+    before = files_of(folder)
+    assert "already holds" in fails("train", "-s", str(SCENE), "-m", str(folder))
+    assert f"--resume {folder}" in fails("train", "--resume", str(named))
+    assert "expected at least 60, as in" in fails("train", "--resume", str(folder), "--iterations", "59")
     for option, value in (("sh_degree", "2"), ("optimizer_type", "sparse_adam"), ("seed", "1"), ("preset", "fast")):
-        assert f"--{option} {value}: expected" in fails(capsys, "train", "--resume", str(folder), f"--{option}", value)
-    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+        assert f"--{option} {value}: expected" in fails("train", "--resume", str(folder), f"--{option}", value)
+    assert files_of(folder) == before
 
 
 def test_an_evaluation_that_fails_loses_no_history(scene, tmp_path, monkeypatch):
@@ -176,15 +162,15 @@ def test_an_evaluation_that_fails_loses_no_history(scene, tmp_path, monkeypatch)
     assert (tmp_path / "training.png").is_file()
 
 
-def test_another_arithmetic_is_refused(tmp_path, monkeypatch, capsys):
+def test_another_arithmetic_is_refused(tmp_path, monkeypatch, fails):
     """By the flag, and by the environment that this program was started in."""
     for name, portable in (("with", True), ("without", False)):
         options = TrainConfig(source_path=str(SCENE), portable=portable).flat()
         save_checkpoint(tmp_path / name / LAST, {}, {"options": options, "iteration": 3})
-    sentence = fails(capsys, "train", "--resume", str(tmp_path / "without"), "--portable")
+    sentence = fails("train", "--resume", str(tmp_path / "without"), "--portable")
     assert "--portable True: expected False, as in" in sentence
     monkeypatch.setattr("warp_splat.training.opening.PORTABLE", True)
-    sentence = fails(capsys, "train", "--resume", str(tmp_path / "without"))
+    sentence = fails("train", "--resume", str(tmp_path / "without"))
     assert "WARP_SPLAT_PORTABLE: expected it unset, as in" in sentence
     monkeypatch.setattr("warp_splat.training.opening.PORTABLE", False)
     with pytest.raises(InputError, match="WARP_SPLAT_PORTABLE: expected it 1, as in"):  # --resume alone would set it
@@ -199,12 +185,10 @@ def test_at_the_end_and_into_another_folder(whole, tmp_path):
     ply_path(folder, 60).unlink()  # as if killed after the last checkpoint
     assert main(["train", "--resume", str(folder)]) == 0
     assert ply_path(folder, 60).read_bytes() == ply_path(whole, 60).read_bytes() and results(folder) == results(whole)
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-    branch = tmp_path / "branch"
+    before, branch = files_of(folder), tmp_path / "branch"
     assert main(["train", "--start_checkpoint", str(folder / "chkpnt20.safetensors"), "-m", str(branch), *SHORT]) == 0
     assert ply_path(branch, 60).read_bytes() == ply_path(whole, 60).read_bytes()
-    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert files_of(folder) == before
 
 
 @pytest.mark.slow
@@ -258,14 +242,13 @@ def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
     assert models[0] == models[1]
 
 
-def test_another_scene_is_refused(whole, tmp_path, capsys):
-    options = ["--resume", str(whole), "--iterations", "70", "-m", str(tmp_path / "a")]
-    assert "training views" in fails(capsys, "train", *options, "--no-eval")
-    message = fails(capsys, "train", *options, "-s", str(tmp_path))
-    assert str(tmp_path) in message
-    before = {path: path.read_bytes() for path in whole.iterdir() if path.is_file()}
-    fails(capsys, "train", *options[:4], "--no-eval")
-    assert {path: path.read_bytes() for path in whole.iterdir() if path.is_file()} == before
+def test_another_scene_is_refused(whole, tmp_path, fails):
+    options = ["--resume", whole, "--iterations", "70", "-m", tmp_path / "a"]
+    assert "training views" in fails("train", *options, "--no-eval")
+    assert str(tmp_path) in fails("train", *options, "-s", tmp_path)
+    before = files_of(whole)
+    fails("train", *options[:4], "--no-eval")
+    assert files_of(whole) == before
 
 
 def test_resume_on(device, scene, tmp_path):
@@ -332,8 +315,7 @@ for count in itertools.count():
 def test_a_writer_that_is_killed_leaves_a_whole_checkpoint(moments, tmp_path):
     path, moment = tmp_path / LAST, random.Random(0)
     for _ in range(moments):
-        command = [sys.executable, "-c", WRITER, path]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": ROOT})
+        process = started("-c", WRITER, path)
         assert process.stdout.readline() == "0\n"
         time.sleep(moment.uniform(0, 0.1))
         process.kill()
@@ -380,34 +362,12 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, 
         runs, reached = runs + 1, 0
 
 
-@pytest.mark.long
-def test_the_command_that_is_printed_continues(tmp_path):
-    command = [sys.executable, "train.py", "-s", SCENE, "-m", tmp_path, "-r", "8", "--iterations", "100000"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
-    for line in process.stderr:
-        if "it/s" in line:
-            break
-    process.send_signal(signal.SIGINT)
-    out = process.communicate(timeout=120)[0]
-    line = next(line for line in out.splitlines() if line.startswith("To continue after iteration "))
-    reached, continued = line.removeprefix("To continue after iteration ").split(": ", 1)
-    end = str(int(reached) + 5)
-    run = subprocess.run(
-        f"{continued} --iterations {end}", shell=True, check=True, capture_output=True, text=True, cwd=ROOT
-    )
-    assert f"Done after {end} iterations" in run.stdout
-
-
 def test_a_disk_that_is_full_costs_the_checkpoint_only(tmp_path, monkeypatch, capsys):
     path = tmp_path / LAST
     save_checkpoint(path, {"a": np.zeros(3, np.float32)}, {"count": 1})
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, limits[1]))
-    try:
-        with pytest.raises(InputError, match=r"checkpoint.safetensors: could not be written .* is untouched"):
-            save_checkpoint(path, {"a": np.zeros(2**20, np.float32)}, {"count": 2})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    refused = pytest.raises(InputError, match=r"checkpoint.safetensors: could not be written .* is untouched")
+    with full_disk(2**20), refused:
+        save_checkpoint(path, {"a": np.zeros(2**20, np.float32)}, {"count": 2})
     assert load_checkpoint(path).count("count") == 1 and os.listdir(tmp_path) == [LAST]
 
     def full(path, *rest):

@@ -77,20 +77,6 @@ def test_two_runs_give_the_same_bits(blocks):
     assert all(torch.equal(gradients[key], again[key]) for key in gradients)
 
 
-def test_pixels_that_are_not_finite_are_dropped(blocks):
-    expected = truth("degree1", PLAIN)
-    upstream = {key: weight.clone() for key, weight in expected.upstream.items()}
-    results = []
-    for value in (0.0, float("nan")):
-        upstream["image"][5, 7], upstream["alpha"][5, 7] = value, 0.0
-        leaves = [tensor.clone().requires_grad_() for tensor in expected.scene.parameters()]
-        out = api.rasterize(*leaves, expected.scene.camera, expected.scene.background)
-        torch.autograd.backward([out.image, out.alpha], [upstream["image"], upstream["alpha"]])
-        results.append([leaf.grad for leaf in leaves])
-        assert out.dropped.pixels == (value != 0.0)
-    assert all(map(torch.equal, *results))
-
-
 def test_loop_cap():
     options = RasterOptions(max_steps=100)
     with using(CUDA):

@@ -83,7 +83,20 @@ def check_clean(program, launch):
 def check_controls(program, launch, barriers):
     """A barrier that is taken out is reported: all but one, which stands beside another."""
     silent = [barrier for barrier in barriers if run(program, launch, without=barrier).code == 0]
-    assert len(silent) <= 1 and len(silent) < len(barriers), silent
+    assert len(silent) <= 1 and len(silent) < max(len(barriers), 1), silent
+
+
+def check(launches, sanitizer, tmp_path):
+    """Each of them is clean; against the sanitizer of threads, none of its barriers is in vain."""
+    for number, launch in enumerate(launches):
+        (folder := tmp_path / str(number)).mkdir()
+        program = build(launch, sanitizer, folder)
+        barriers = check_clean(program, launch)
+        if sanitizer == "thread":
+            check_controls(program, launch, barriers)
+
+
+BOTH = pytest.mark.parametrize("sanitizer", ["thread", "address"])
 
 
 def test_adjoint_has_no_races(monkeypatch, tmp_path):
@@ -94,15 +107,10 @@ def test_adjoint_has_no_races(monkeypatch, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+@BOTH
 @pytest.mark.parametrize("case", CASES)
 def test_every_kernel(case, sanitizer, monkeypatch, tmp_path):
-    for number, launch in enumerate(launches_of(case, monkeypatch, small())):
-        (folder := tmp_path / str(number)).mkdir()
-        program = build(launch, sanitizer, folder)
-        barriers = check_clean(program, launch)
-        if sanitizer == "thread" and barriers:
-            check_controls(program, launch, barriers)
+    check(launches_of(case, monkeypatch, small()), sanitizer, tmp_path)
 
 
 @pytest.mark.long
@@ -113,7 +121,7 @@ def test_more_than_a_batch(monkeypatch, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+@BOTH
 def test_magnitudes(sanitizer, monkeypatch, tmp_path):
     """Sums of magnitudes, which gsplat's function asks for; it repeats kernels that others watch."""
     scene = small()
@@ -126,39 +134,28 @@ def test_magnitudes(sanitizer, monkeypatch, tmp_path):
         image, *_ = rasterization(*leaves, pose[None], lens[None], camera.width, camera.height, **more)
         image.square().sum().backward()
     (launch,) = (launch for launch in launches if launch.kernel.key.startswith("make_adj_channels"))
-    program = build(launch, sanitizer, tmp_path)
-    barriers = check_clean(program, launch)
-    if sanitizer == "thread":
-        check_controls(program, launch, barriers)
+    check([launch], sanitizer, tmp_path)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+@BOTH
 def test_loss(sanitizer, monkeypatch, tmp_path):
     """Two strips of two bands: of 256 numbers, 30 only lend theirs."""
     image, target = torch.rand(2, 70, 80, 3, generator=torch.Generator().manual_seed(0))
     with using(CUDA), recorded(monkeypatch) as launches:
         image_loss(image.requires_grad_(), target).backward()
     assert [launch.blocks for launch in launches] == [4, 4]
-    for number, launch in enumerate(launches):
-        (folder := tmp_path / str(number)).mkdir()
-        program = build(launch, sanitizer, folder)
-        barriers = check_clean(program, launch)
-        if sanitizer == "thread":
-            check_controls(program, launch, barriers)
+    check(launches, sanitizer, tmp_path)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sanitizer", ["thread", "address"])
+@BOTH
 def test_sums_of_splats_of_many_tiles(sanitizer, monkeypatch, tmp_path):
     """The path that no scene of a few tiles takes."""
     bins, slots, _ = crowded(40, 9)
     with using(CUDA), recorded(monkeypatch) as launches:
         CUDA.gather(bins, slots)
-    program = build(launches[0], sanitizer, tmp_path)
-    barriers = check_clean(program, launches[0])
-    if sanitizer == "thread":
-        check_controls(program, launches[0], barriers)
+    check(launches[:1], sanitizer, tmp_path)
 
 
 @pytest.mark.long

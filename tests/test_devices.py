@@ -1,14 +1,19 @@
-"""Which device is chosen, why a GPU is refused, and a self-test that finds one that computes nothing, or wrongly."""
+"""Devices and launches: which is chosen and why one is refused, the self-test, blocks of fibers, memory of torch's."""
 
+import gc
+import weakref
+
+import numpy as np
 import pytest
 import torch
 import warp as wp
+from commands import python
 
 from warp_splat import InputError
 from warp_splat.config import ADJOINTS
 from warp_splat.raster import bin, drivers, selftest
 from warp_splat.raster.drivers import CPU
-from warp_splat.runtime import devices, launch
+from warp_splat.runtime import devices, launch, pool
 
 HOST = torch.device("cpu")
 
@@ -76,10 +81,7 @@ def test_kernels_that_do_nothing_are_found(monkeypatch):
 
 
 def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
-    def fail(device, adjoint):
-        raise InputError("wrong.")
-
-    monkeypatch.setattr(selftest, "check_device", fail)
+    monkeypatch.setattr(selftest, "check_device", failing(InputError("wrong.")))
     said = []
     assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append) == HOST
     assert "wrong. Going on with the CPU." in said[-1]
@@ -90,16 +92,33 @@ def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
     assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append).type == "cuda"
 
 
-@pytest.mark.parametrize("factor", [0.0, 1.001, float("nan")])
-def test_a_wrong_gradient_is_found(factor, monkeypatch):
-    right = CPU.adjoint
+def failing(error):
+    def fail(*arguments):
+        raise error
 
+    return fail
+
+
+def scaled(factor, right=CPU.adjoint):
     def wrong(*arguments):
         slots, adj_background, bad = right(*arguments)
         return factor * slots, adj_background, bad
 
-    monkeypatch.setattr(CPU, "adjoint", wrong)
-    with pytest.raises(InputError, match=r"self-test expected \S+ as a gradient"):
+    return wrong
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        *(({"adjoint": scaled(f)}, r"self-test expected \S+ as a gradient") for f in (0.0, 1.001, float("nan"))),
+        ({"blend": failing(RuntimeError("CUDA error 700\nmore"))}, r"CUDA error 700\).* or use another device"),
+        ({"blend": failing(torch.OutOfMemoryError("x"))}, "not enough memory.* or use another device"),
+    ],
+)
+def test_kernels_that_err_or_cannot_run_are_explained(change, message, monkeypatch):
+    for name, function in change.items():
+        monkeypatch.setattr(CPU, name, function)
+    with pytest.raises(InputError, match=f"--device cpu: .*{message}"):
         selftest.check_device(HOST)
 
 
@@ -115,15 +134,93 @@ def test_lists_that_round_otherwise_when_they_are_written_are_found(monkeypatch)
         selftest.check_device(HOST)
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [(RuntimeError("CUDA error 700\nmore"), r"CUDA error 700\)"), (torch.OutOfMemoryError("x"), "not enough memory")],
-)
-def test_kernels_that_cannot_run_are_explained(error, words, monkeypatch):
-    def fail(*arguments):
-        raise error
+DEVICES = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
-    expected = pytest.raises(InputError, match=f"--device cpu: .*{words}.* or use another device")
-    monkeypatch.setattr(CPU, "blend", fail)
-    with expected:
-        selftest.check_device(HOST)
+
+@wp.kernel
+def add_index(first: int, values: wp.array[float], sums_out: wp.array[float]):
+    i = first + wp.tid()
+    sums_out[i] = values[i] + float(i)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_index_once(device):
+    values, sums = torch.rand(5000, device=device), torch.zeros(5000, device=device)
+    given = [[launch.view(tensor, wp.float32)] for tensor in (values, sums)]
+    for bounds in (None, [0, 1, 1, 4000, 5000]):
+        launch.launch(add_index, 5000, *given, bounds=bounds, device=device)
+        assert torch.equal(sums, values + torch.arange(5000.0, device=device))
+
+
+FIRST_LAUNCH = """
+import torch, warp as wp
+from warp_splat.runtime import launch
+
+def stream_from_torch(stream):
+    assert wp._src.context.runtime is not None, "Warp is not initialized"
+
+wp.stream_from_torch = stream_from_torch
+torch.cuda.current_stream = lambda device: "stream"
+launch._stream("cuda")
+"""
+FIRST_ARRAY = 'from warp_splat.runtime import launch; launch.empty(3, float, "cpu")'
+
+
+@pytest.mark.parametrize("code", [FIRST_LAUNCH, FIRST_ARRAY])
+def test_the_first_call_of_a_process_finds_warp_initialized(code):
+    python("-c", code)
+
+
+def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
+    calls = []
+    monkeypatch.setattr(launch, "_stream", lambda device: f"stream of {device}")
+    monkeypatch.setattr(wp, "launch", lambda kernel, **options: calls.append(options))
+    monkeypatch.setattr(wp, "launch_tiled", lambda kernel, **options: calls.append(options))
+    launch.launch(add_index, 9000, ["in"], ["out"], bounds=[0, 4000, 9000], device=torch.device("cuda", 1))
+    launch.launch(add_index, 7, ["in"], ["out"], device="cuda", adj_inputs=["grad"], adj_outputs=["up"])
+    launch.launch_blocks(add_index, 12, ["in"], ["out"], torch.device("cuda", 1))
+    launch.launch(add_index, 0, ["in"], ["out"], device="cuda")
+    launch.launch_blocks(add_index, 0, ["in"], ["out"], "cuda")
+    assert not any(options.pop("record_tape") for options in calls)
+    whole, adjoint, blocks = calls
+    assert whole == {"dim": 9000, "inputs": [0, "in"], "outputs": ["out"], "stream": "stream of cuda:1"}
+    assert adjoint["adjoint"] and adjoint["adj_inputs"] == [None, "grad"] and adjoint["adj_outputs"] == ["up"]
+    assert blocks == {"dim": [12], "inputs": ["in"], "outputs": ["out"], "block_dim": 256, "stream": "stream of cuda:1"}
+
+
+def test_helpers_keep_nothing_alive(threads):
+    """What they worked on last goes when the caller lets it go, though they know of the next job only when it comes."""
+    threads(4)
+    for _ in range(20):
+        tensor = torch.zeros(64)
+        pool.in_slices(lambda low, high, tensor=tensor: tensor[low:high].add_(1.0), list(range(65)))
+        assert (tensor == 1.0).all()
+        alive = weakref.ref(tensor)
+        del tensor
+        assert alive() is None
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_blocks_of_threads(device, monkeypatch):
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False, "block_dim": 256})
+    def total(values: wp.array[float], sums_out: wp.array[float]):
+        block, thread = wp.tid()
+        value = values[block * 256 + thread] + 0.0
+        wp.tile_store(sums_out, wp.tile_sum(wp.tile(value)), offset=block)
+
+    values, sums = torch.arange(3 * 256.0, device=device), torch.zeros(3, device=device)
+    launch.launch_blocks(total, 3, [launch.view(values, wp.float32)], [launch.view(sums, wp.float32)], device)
+    assert torch.equal(sums, values.view(3, 256).sum(1))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_memory_lives_as_long_as_its_array(device):
+    array = launch.empty(1000, wp.vec3, device)
+    array.fill_(7.0)
+    gc.collect()
+    others = [torch.zeros(3000, device=device) for _ in range(20)]
+    assert array.shape == (1000,) and array.dtype == wp.vec3 and len(others) == 20
+    assert (array.numpy() == np.float32(7)).all()
+    assert launch.empty(0, wp.vec3, device).shape == (0,)

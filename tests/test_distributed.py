@@ -8,23 +8,22 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 import torch
+from commands import ROOT, SCENE
 from torchrun_steps import CONFIG, STEPS
+from trainings import Pretended
 
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
-from warp_splat.runtime.distributed import ALONE, Processes, join
+from warp_splat.runtime.distributed import ALONE, join
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
-ROOT = Path(__file__).parents[1]
-SCENE = ROOT / "assets" / "still_life"
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 
@@ -35,13 +34,6 @@ def torchrun(*arguments) -> str:
     run = subprocess.run(command, check=False, capture_output=True, text=True, env=ENVIRONMENT, timeout=300)
     assert run.returncode == 0, run.stderr
     return run.stdout
-
-
-class Pretended(Processes):
-    """One of ``count`` processes whose exchange another hand does."""
-
-    def __init__(self, rank, count):
-        self.rank, self.count = rank, count
 
 
 def gradients_of_ranks(scene, trainers, iteration):

@@ -10,11 +10,12 @@ import textwrap
 from contextlib import redirect_stdout
 from pathlib import Path
 
+import make_pages
 import numpy as np
 import pytest
 import room
+from commands import CtrlC
 from scene_files import write_image
-from serving import CtrlC
 
 from warp_splat.cli import COMMANDS, main, parse
 from warp_splat.flags import flags_of
@@ -37,8 +38,7 @@ PHOTOGRAPHS = 6
 PROOFS = {
     "COLMAP, binary and text": """
         test_scene.py::test_colmap_cameras_points_and_pixels test_scene.py::test_largest_of_several_models
-        test_scene.py::test_undistorted_image_is_the_ideal_pinhole_image
-        test_transforms.py::test_other_models_of_colmap""",
+        test_scene.py::test_undistorted_image_is_the_ideal_pinhole_image""",
     "nerfstudio, instant-ngp": """
         test_transforms.py::test_transforms_cameras_points_and_axes test_transforms.py::test_transforms_with_distortion
         test_transforms.py::test_transforms_intrinsics_of_frames_go_before_those_of_the_file""",
@@ -56,11 +56,11 @@ PROOFS = {
         test_masks.py::test_metrics_do_not_see_what_is_masked""",
     "`--start_ply FILE`": "test_inputs.py::test_start_from_a_file",
     "`.ply`": "test_ply.py:: test_exchange.py::test_round_trip_returns_the_scene",
-    "`.compressed.ply`": "test_compressed_ply.py::",
+    "`.compressed.ply`": "test_packed_formats.py::test_compressed_ply_bytes_are_those_that_other_programs_read",
     "`.splat`": "test_exchange.py::test_splat_bytes_are_the_documented_layout",
     "`.spz`": """
-        test_spz.py::test_spz_bytes_are_the_documented_layout test_spz.py::test_spz_version_2
-        test_spz.py::test_spz_version_4_holds_the_same""",
+        test_packed_formats.py::test_spz_bytes_are_the_documented_layout test_packed_formats.py::test_spz_version_2
+        test_packed_formats.py::test_spz_version_4_holds_the_same""",
     "`.sog`": """
         test_sog.py::test_sog_bytes_are_the_documented_layout test_sog.py::test_a_palette_stands_for_many_harmonics
         test_sog.py::test_archives_of_others_are_read""",
@@ -68,9 +68,6 @@ PROOFS = {
         test_exchange.py::test_gltf_holds_what_the_extension_says
         test_exchange.py::test_gltf_nodes_move_turn_and_scale""",
 }
-
-sys.path.insert(0, str(DOCS))
-import make_pages  # noqa: E402
 
 
 def name_of(page):

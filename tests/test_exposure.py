@@ -2,35 +2,35 @@
 
 import json
 import re
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from test_checkpoints import begin, state_of, steps
-from test_train import SCENE
+from commands import SCENE, train
+from fake_viser import FakeClient, at_rest, drawn, some_gaussians, some_scene
+from make_faults import make_faulty
+from trainings import begin, steps
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
+from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.formats.checkpoint import load_checkpoint
+from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.png import load_png
+from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.runtime import pool
+from warp_splat.rendering.command import make_renderer
+from warp_splat.rendering.photographed import as_photographed
 from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
 from warp_splat.scene.neighbors import guessed
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.record import keep, restore, save_model
+from warp_splat.training.record import save_model
 from warp_splat.training.trial import weigh
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
-
-from make_faults import make_faulty
+from warp_splat.viewer import server
 
 SIZE = (21, 37)  # pixels that are no multiple of sixteen
 KINDS = ("gain", "affine", "bilateral")
@@ -113,23 +113,6 @@ def test_rates_cannot_fall_to_nothing(scene, tmp_path):
         begin(scene, tmp_path, exposure="gain", exposure_lr_final=0.0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_it_resumes_to_the_same_bytes(kind, scene, tmp_path):
-    options = {"parts": "sky,exposure,pose,depth,floaters", "exposure": kind, "vignetting": True}
-    trainer, run = begin(scene, tmp_path, **options)
-    steps(trainer, run, 24)
-    expected, _ = state_of(trainer, run)
-    assert expected["parameters.exposure"] != expected["gradients.exposure"] and "parameters.vignetting" in expected
-    trainer, run = begin(scene, tmp_path, **options)
-    steps(trainer, run, 13)
-    keep(trainer, run)
-    trainer, run = begin(scene, tmp_path, **options)
-    restore(trainer, run, load_checkpoint(tmp_path))
-    steps(trainer, run, 24)
-    found, _ = state_of(trainer, run)
-    assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
-
-
 @pytest.mark.parametrize("kind", ["gain", "affine"])
 def test_the_folder_has_the_maps_in_the_layout_of_the_reference(kind, scene, tmp_path):
     trainer, run = begin(scene, tmp_path, exposure=kind)
@@ -148,11 +131,10 @@ def test_a_held_out_one_is_guessed_where_neighbors_are_alike():
     """Along a walk; and not where each is as it likes."""
     places = np.linspace(0.0, 6.0, 41)
     walk = [Camera(9, 9, 9.0, 9.0, 4.5, 4.5, np.eye(3), (-x, 0.0, 0.0)) for x in places]
-    known, others = ([camera for i, camera in enumerate(walk) if (i % 8 == 4) == held] for held in (False, True))
-    values = np.stack([np.sin(places), np.cos(places)], 1)
-    train, test = (values[[i for i in range(41) if (i % 8 == 4) == held]] for held in (False, True))
-    assert np.abs(guessed(train, known, others, 6.0) - test).max() < 0.03
-    assert np.abs(guessed(1e-3 * train, known, others, 6.0) - 1e-3 * test).max() < 3e-5
+    values, held = np.stack([np.sin(places), np.cos(places)], 1), np.arange(41) % 8 == 4
+    known, others = ([camera for camera, here in zip(walk, chosen, strict=True) if here] for chosen in (~held, held))
+    assert np.abs(guessed(values[~held], known, others, 6.0) - values[held]).max() < 0.03
+    assert np.abs(guessed(1e-3 * values[~held], known, others, 6.0) - 1e-3 * values[held]).max() < 3e-5
     assert not guessed(np.resize([0.1, -0.1], len(known)), known, others, 6.0).any()
     assert not guessed(np.zeros((1, 12)), known[:1], others, 6.0).any()
     assert guessed(values, walk, [], 6.0).shape == (0, 2)
@@ -160,7 +142,7 @@ def test_a_held_out_one_is_guessed_where_neighbors_are_alike():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, capsys):
+def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, fails):
     """In the evaluation as by render.py, of train and test views."""
     model = tmp_path / "model"
     options = ["--exposure", kind, "--vignetting", "--exposure_lr_init", "0.05", "--quiet", "-r", "8"]
@@ -176,21 +158,19 @@ def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, capsys):
     plain = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
     assert all((exposed != mean).any() for exposed, mean in zip(pictures, plain, strict=True))
     path.write_text(text.replace('"kind"', '"sort"'))
-    assert main(["render", "-m", str(model), "--quiet"]) == 1
-    assert "exposures.json: expected exposures as training writes them, found other JSON" in capsys.readouterr().err
+    sentence = fails("render", "-m", model, "--quiet")
+    assert "exposures.json: expected exposures as training writes them, found other JSON" in sentence
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_threads_change_nothing(kind, scene, tmp_path):
-    part, before, found = part_of(scene, tmp_path, exposure=kind, vignetting=True), pool.get_threads(), []
+def test_threads_change_nothing(kind, scene, tmp_path, threads):
+    part, found = part_of(scene, tmp_path, exposure=kind, vignetting=True), []
     image = torch.rand(130, 131, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
-    for threads in (1, 2, 3):
-        pool.set_threads(threads)
+    for count in (1, 2, 3):
+        threads(count)
         made = part.image(image, None, SimpleNamespace(view=scene.train[0]))
         found.append(torch.autograd.grad(made.square().sum(), [image, part.maps, part.falloff]))
-    pool.set_threads(before)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+    assert all(map(torch.equal, found[0], found[1])) and all(map(torch.equal, found[0], found[2]))
 
 
 def test_gains_are_found_from_the_tracks_and_decide_what_auto_takes(faulty):
@@ -233,12 +213,8 @@ def test_faults_are_what_they_say(tmp_path):
 def test_it_learns_gains_to_two_percent_of_light(kind, scene, tmp_path):
     """Of photographs that are what the Gaussians show, brighter or darker; these do not learn."""
     still = dict.fromkeys(("feature_lr", "opacity_lr", "scaling_lr", "rotation_lr"), 0.0)
-    still |= {
-        "position_lr_init": 1e-12,
-        "position_lr_final": 1e-12,
-        "densify_from_iter": 999,
-        "opacity_reset_interval": 999,
-    }
+    still |= dict.fromkeys(("position_lr_init", "position_lr_final"), 1e-12)
+    still |= dict.fromkeys(("densify_from_iter", "opacity_reset_interval"), 999)
     few, gains = scene.train[::6], np.random.default_rng(5).permutation(np.linspace(-0.45, 0.45, 9))
     shown, _ = begin(replace(scene, train=few), tmp_path)
     light = [from_srgb(shown.picture(v.camera) / 255, np.where) * 2**gain for v, gain in zip(few, gains, strict=True)]
@@ -276,3 +252,80 @@ def test_inspect_tells_it_beside_exif(faulty, tmp_path, capsys):
     green = {name: change[1] for name, change in truth.items()}
     assert green[found[3]] < min(green.values()) + 0.05 and green[found[5]] > max(green.values()) - 0.05
     assert (tmp_path / "page.html").read_text().count("<img") == 5
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A model, and its file of exposures, where the second photograph that trains has a gain of 1.5."""
+    folder = tmp_path_factory.mktemp("model")
+    assert train(folder, "--iterations", "6", "-r", "8", "--parts", "exposure") == 0
+    file = folder / "point_cloud" / "iteration_6" / "exposures.json"
+    facts = json.loads(file.read_text())
+    assert len(facts["maps"]) == 50
+    facts["maps"] = {name: [0.5] if name == "view_002.png" else [0.0] for name in facts["maps"]}
+    file.write_text(json.dumps(facts))
+    return folder, file
+
+
+def test_render_shows_photographs_as_they_were_taken(trained):
+    """By a gain on value + 0.055 in float64; and as the mean photograph where there is no file."""
+    (folder, file), written = trained, []
+    for name in ("exposures.json", "away.json"):
+        file.rename(file.with_name(name))
+        assert main(["render", "-m", str(folder)]) == 0
+        written.append([load_png(folder / f"train/ours_6/renders/{place:05d}.png") for place in (0, 1)])
+        file.with_name(name).rename(file)
+    renders, neutral = written
+    expected = 1.5 * (neutral[1] / 255 + 0.055) - 0.055
+    assert np.abs(renders[1] / 255 - expected.clip(0, 1)).max() < 1.5 / 255
+    assert np.array_equal(renders[0], neutral[0])
+
+
+def test_exposures_are_those_beside_the_gaussians(trained):
+    folder, file = trained
+    assert read_exposures(folder, 6) and not read_exposures(folder, 5)
+    assert read_exposures(file.parent / "point_cloud.ply", 0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    ["{", "[]", {"kind": "else"}, {"maps": {"a": [1, 2]}}, {"maps": [1]}, {"falloff": [1e999, 0]}, {"pivot": "x"}],
+    ids=str,
+)
+def test_damaged_exposures_are_one_sentence(changes, trained, fails):
+    folder, file = trained
+    whole = file.read_text()
+    file.write_text(changes if isinstance(changes, str) else json.dumps(json.loads(whole) | changes))
+    assert "exposures.json: expected exposures as training writes them" in fails("render", "-m", str(folder))
+    file.write_text(whole)
+
+
+def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
+    at_rest(monkeypatch)
+    model, client = GaussianModel.from_splats(some_gaussians(50)), FakeClient(1, some_scene().test[0].camera, (120, 60))
+    draw, frames = make_renderer(model, False, RasterOptions()), []
+    for factor in (1.0, 0.25):
+        exposed = lambda image, view, factor=factor: image * factor  # noqa: E731
+        with server.Viewer(draw, lambda: model.parameters["means"], some_scene(), 8080, exposed=exposed) as viewer:
+            client = FakeClient(1, some_scene().train[1].camera, size=(120, 60))
+            viewer.server.enter(client)
+            drawn(viewer)
+            free = client.frames[-1][0]
+            viewer.watchers[1].view.value = "0.png"
+            drawn(viewer)
+            frames.append((free, client.frames[-1][0]))
+    (free, one), (free_again, other) = frames
+    assert np.array_equal(free, free_again)
+    assert np.array_equal(one[:, :30], other[:, :30]) and np.array_equal(one[:, 90:], other[:, 90:])
+    assert one[:, 30:90].any() and np.abs(0.25 * one[:, 30:90] - other[:, 30:90]).max() <= 1
+
+
+@pytest.mark.parametrize("options", [{"exposure": "affine"}, {"exposure": "gain", "vignetting": True}], ids=str)
+def test_training_shows_what_it_compares(options, scene, tmp_path):
+    trainer, run = begin(scene, tmp_path, **options)
+    steps(trainer, run, 12)
+    view, (part,) = scene.train[3], trainer.parts
+    image, exposures = trainer.look(view.camera).image, trainer.exposures
+    expected = part.image(image, None, SimpleNamespace(view=view)).detach()
+    assert torch.equal(as_photographed(image, exposures, view.name), expected)
+    assert as_photographed(image, exposures, "another") is image

@@ -1,22 +1,17 @@
 """The memory that is forecast is the memory that is taken, and the user is told on what grounds."""
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_distributed import Pretended
+import scaling
+from trainings import Pretended
 
 from warp_splat.camera import Camera
 from warp_splat.scene.types import Scene, View
 from warp_splat.training import memory
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-import scaling
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""gsplat's unscented transform through lenses, against its textbook form and OpenCV's formulas in float64."""
+"""gsplat's unscented transform through lenses and rolling shutters, against its textbook form in float64."""
 
 import math
 
@@ -9,11 +9,14 @@ from test_gsplat import call_of, check_agreement, theirs
 from warp_splat import InputError
 from warp_splat.gsplat import rasterization
 
-ALPHA, BETA, KAPPA, BLUR = 0.1, 2.0, 0.0, 0.3
+gsplat = pytest.importorskip("gsplat")
+from gsplat.cuda._wrapper import RollingShutterType as Rolling  # noqa: E402
+
+ALPHA, BETA, BLUR = 0.1, 2.0, 0.3
+SPREAD = 3 * ALPHA**2
 PINHOLE = {"radial_coeffs": [0.1, -0.05, 0.02, 0.03, -0.02, 0.01], "tangential_coeffs": [0.01, -0.02]}
 PINHOLE |= {"thin_prism_coeffs": [0.01, -0.004, -0.02, 0.006]}
 FISHEYE = {"radial_coeffs": [0.05, -0.03, 0.01, -0.002]}
-LENSES = [("pinhole", {}), ("pinhole", PINHOLE), ("fisheye", {}), ("fisheye", FISHEYE)]
 LEAVES = ("means", "quats", "scales", "viewmats", "Ks")
 
 
@@ -27,7 +30,7 @@ def corner_of(call):
     return math.hypot(max(call["width"] - cx, cx), max(call["height"] - cy, cy)) / min(fx, fy)
 
 
-def opencv(points, Ks, corner, radial_coeffs=None, tangential_coeffs=None, thin_prism_coeffs=None):
+def opencv(points, Ks, corner=None, radial_coeffs=None, tangential_coeffs=None, thin_prism_coeffs=None):
     """Pixels [C, N, 7, 2] of points in the camera (OpenCV's documentation); ``corner``: a fisheye's largest angle."""
     x, y = (points[..., axis] / points[..., 2] for axis in (0, 1))
     r = (x * x + y * y).sqrt()
@@ -46,35 +49,46 @@ def opencv(points, Ks, corner, radial_coeffs=None, tangential_coeffs=None, thin_
     return torch.stack([fx * u + cx, fy * v + cy], -1)
 
 
-def textbook(means, quats, scales, viewmats, Ks, corner, **coefficients):
-    """Means and covariances of what seven points show (Wan and van der Merwe 2000)."""
-    axes = theirs._quat_to_rotmat(quats) * scales[:, None]
-    spread = ALPHA**2 * (3 + KAPPA)
-    offsets = spread**0.5 * axes.mT
-    points = torch.cat([means[:, None], means[:, None] + offsets, means[:, None] - offsets], 1)
-    points = torch.einsum("cij,npj->cnpi", viewmats[:, :3, :3], points) + viewmats[:, None, None, :3, 3]
-    places = opencv(points, Ks, corner, **coefficients)
-    weights = torch.full((7,), 0.5 / spread, dtype=torch.float64)
-    weights[0] = 1 - 3 / spread
-    mean = torch.einsum("p,cnpi->cni", weights, places)
-    weights = weights + (1 - ALPHA**2 + BETA) * (torch.arange(7) == 0)
-    off = places - mean[:, :, None]
-    return mean, torch.einsum("p,cnpi,cnpj->cnij", weights, off, off), points[:, :, 0, 2]
+def sigma_points(means, quats, scales):
+    """Seven points [N, 7, 3] of each Gaussian (Wan and van der Merwe 2000)."""
+    offsets = SPREAD**0.5 * (theirs._quat_to_rotmat(quats) * scales[:, None]).mT
+    return torch.cat([means[:, None], means[:, None] + offsets, means[:, None] - offsets], 1)
 
 
-@pytest.mark.parametrize(("model", "coefficients"), LENSES)
-def test_means_and_covariances(model, coefficients):
+def moments(places):
+    """Mean and covariance of what seven points [C, N, 7, 2] show; around the first, which has a large weight."""
+    off, weight = places[:, :, 1:] - places[:, :, :1], 0.5 / SPREAD
+    moved = weight * off.sum(2)
+    covariance = weight * torch.einsum("cnpi,cnpj->cnij", off, off)
+    return places[:, :, 0] + moved, covariance + (BETA - ALPHA**2) * moved[..., :, None] * moved[..., None, :]
+
+
+def conics_of(covariance):
+    return torch.linalg.inv(covariance).flatten(2)[..., [0, 1, 3]]
+
+
+def in_float64(leaves):
+    return {name: leaf.detach().double().requires_grad_() for name, leaf in leaves.items()}
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"), [("pinhole", {}), ("pinhole", PINHOLE), ("fisheye", {}), ("fisheye", FISHEYE)]
+)
+def test_means_and_covariances_through_lenses(model, coefficients):
     lens = lens_of(coefficients)
     call = call_of(packed=False, with_ut=True, camera_model=model, rasterize_mode="antialiased", **lens)
     meta = rasterization(**call)[2]
     leaves = {name: call[name] for name in LEAVES} | lens
-    exact = {name: leaf.detach().double().requires_grad_() for name, leaf in leaves.items()}
-    mean, sharp, depth = textbook(**exact, corner=corner_of(call) if model == "fisheye" else None)
+    exact = in_float64(leaves)
+    means, quats, scales, viewmats, Ks, *_ = exact.values()
+    points = torch.einsum("cij,npj->cnpi", viewmats[:, :3, :3], sigma_points(means, quats, scales))
+    points = points + viewmats[:, None, None, :3, 3]
+    bent = {name: exact[name] for name in lens}
+    mean, sharp = moments(opencv(points, Ks, corner_of(call) if model == "fisheye" else None, **bent))
     blurred = sharp + BLUR * torch.eye(2, dtype=torch.float64)
-    conic = torch.linalg.inv(blurred).flatten(2)[..., [0, 1, 3]]
     share = (torch.linalg.det(sharp) / torch.linalg.det(blurred)).sqrt()
-    truth = {"means2d": mean, "depths": depth, "conics": conic, "opacities": call["opacities"].detach() * share}
-    check_agreement(truth, meta, leaves, exact)
+    truth = {"means2d": mean, "depths": points[:, :, 0, 2], "conics": conics_of(blurred)}
+    check_agreement(truth | {"opacities": call["opacities"].detach() * share}, meta, leaves, exact)
 
 
 def test_of_small_gaussians_it_is_the_linear_projection():
@@ -99,17 +113,112 @@ def test_a_fisheye_is_followed_up_to_its_fold():
     assert (meta["means2d"][0, :, 0] - expected).abs().max() < 1e-2
 
 
+def quaternion(matrix):
+    w = 0.5 * (1 + matrix.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt()
+    x, y, z = (matrix[..., i, j] - matrix[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    return torch.stack([w, x / (4 * w), y / (4 * w), z / (4 * w)], -1)
+
+
+def turned(first, last, time):
+    """Rotations at times between those of two poses: spherical interpolation of quaternions (Shoemake 1985)."""
+    one, other = (quaternion(pose[..., :3, :3]) for pose in (first, last))
+    angle = torch.arccos((one * other).sum(-1, keepdim=True))
+    quats = torch.sin((1 - time) * angle) * one + torch.sin(time * angle) * other
+    return theirs._quat_to_rotmat(quats / torch.sin(angle))
+
+
+def moved_on(first, *quats):
+    """Where cameras stand when the last row is read."""
+    last = first.detach().clone()
+    last[:, :3, :3] = theirs._quat_to_rotmat(torch.tensor(quats)) @ last[:, :3, :3]
+    last[:, :3, 3] += torch.tensor([0.05, -0.04, 0.1])
+    return last
+
+
+def tangent(gradient, pose):
+    """What of a gradient moves a pose: along rotations, and its translation."""
+    part = pose[:, :3, :3].mT.double() @ gradient[:, :3, :3].double()
+    return torch.cat([(part - part.mT).flatten(1), gradient[:, :3, 3]], 1)
+
+
+@pytest.mark.parametrize(
+    ("shutter", "axis", "reverse"),
+    [("TOP_TO_BOTTOM", 1, False), ("LEFT_TO_RIGHT", 0, False), ("BOTTOM_TO_TOP", 1, True), ("RIGHT_TO_LEFT", 0, True)],
+)
+def test_means_covariances_and_gradients_of_a_rolling_shutter(shutter, axis, reverse):
+    """Each point is seen from where the camera stands when its row or column is read."""
+    call = call_of(packed=False, with_ut=True, rolling_shutter=Rolling[f"ROLLING_{shutter}"])
+    last = moved_on(call["viewmats"], [1.0, 0.02, -0.03, 0.01], [1.0, -0.01, 0.02, 0.02])
+    call["viewmats_rs"] = last.requires_grad_()
+    meta = rasterization(**call)[2]
+    leaves = {name: call[name] for name in (*LEAVES, "viewmats_rs")}
+    exact = in_float64(leaves)
+    means, quats, scales, first, Ks, last = exact.values()
+    first, last, size = first[:, None, None], last[:, None, None], (call["width"], call["height"])[axis]
+    points = sigma_points(means, quats, scales)[None].expand(len(first), -1, -1, -1)
+    places = torch.zeros(*points.shape[:-1], 2).double()
+    for _ in range(40):
+        share = (places[..., axis, None] - 0.5) / (size - 1)
+        time = 1 - share if reverse else share
+        seen = (turned(first, last, time) @ points[..., None])[..., 0]
+        places = opencv(seen + (1 - time) * first[..., :3, 3] + time * last[..., :3, 3], Ks)
+    mean, covariance = moments(places)
+    drawn = (meta["radii"] > 0).all(-1)
+    still = rasterization(**call | {"rolling_shutter": None, "viewmats_rs": None})[2]["means2d"]
+    assert (still - meta["means2d"])[drawn].abs().max() > 1.0  # px
+    tangents = lambda name, gradient: tangent(gradient, call[name].detach()) if "viewmats" in name else gradient  # noqa: E731
+    truth = {"means2d": mean, "conics": conics_of(covariance + BLUR * torch.eye(2))}
+    check_agreement(truth, meta, leaves, exact, tangents)
+
+
+def test_a_camera_that_stands_still_sees_as_ever():
+    """Also in the image, whose colors are those of the middle of the way."""
+    call = call_of("degree1", with_ut=True)
+    image = rasterization(**call)[0]
+    rolling = {"rolling_shutter": Rolling.ROLLING_TOP_TO_BOTTOM, "viewmats_rs": call["viewmats"].detach()}
+    same = rasterization(**call, **rolling)[0]
+    assert (image - same).abs().max() < 1e-5
+    same.sum().backward()
+    assert all(call[name].grad.isfinite().all() for name in LEAVES)
+
+
+def test_the_image_is_that_of_cameras_that_stand_still_row_by_row():
+    """Up to the shear that one Gaussian cannot show."""
+    call = call_of("degree2", cameras=1, with_ut=True)
+    first, rows = call["viewmats"].detach(), call["height"]
+    last = moved_on(first, [1.0, 0.02, -0.03, 0.01])
+    rolling = {"rolling_shutter": Rolling.ROLLING_BOTTOM_TO_TOP, "viewmats_rs": last}
+    with torch.no_grad():
+        image, still = (rasterization(**call | more)[0][0] for more in (rolling, {}))
+        by_rows = torch.zeros_like(image)
+        for row in range(rows):
+            time = 1 - row / (rows - 1)
+            pose = torch.lerp(first, last, time)
+            pose[:, :3, :3] = turned(first.double(), last.double(), time).float()
+            by_rows[row] = rasterization(**call | {"viewmats": pose})[0][0, row]
+    assert (image - by_rows).abs().mean() < 0.1 * (still - by_rows).abs().mean()
+
+
+UNSCENTED, ROLLING = {"with_ut": True}, {"rolling_shutter": Rolling.ROLLING_LEFT_TO_RIGHT}
+FISHEYE_CAMERA = UNSCENTED | {"camera_model": "fisheye"}
+NEEDS = "rolling_shutter: expected with_ut=True and viewmats_rs"
+
+
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
         ({"radial_coeffs": torch.zeros(2, 6)}, "radial_coeffs: expected None without with_ut=True"),
-        ({"with_ut": True, "radial_coeffs": torch.zeros(2, 4)}, r"radial_coeffs: expected a tensor \[2, 6\]"),
-        ({"with_ut": True, "thin_prism_coeffs": torch.full((2, 4), torch.nan)}, "thin_prism_coeffs: expected finite"),
+        (UNSCENTED | {"radial_coeffs": torch.zeros(2, 4)}, r"radial_coeffs: expected a tensor \[2, 6\]"),
+        (UNSCENTED | {"thin_prism_coeffs": torch.full((2, 4), torch.nan)}, "thin_prism_coeffs: expected finite"),
         (
-            {"with_ut": True, "camera_model": "fisheye", "tangential_coeffs": torch.zeros(2, 2)},
+            FISHEYE_CAMERA | {"tangential_coeffs": torch.zeros(2, 2)},
             "tangential_coeffs: expected None without with_ut=True and camera_model pinhole",
         ),
-        ({"with_ut": True, "camera_model": "ortho"}, "camera_model: expected pinhole or fisheye where with_ut is True"),
+        (UNSCENTED | {"camera_model": "ortho"}, "camera_model: expected pinhole or fisheye where with_ut is True"),
+        (ROLLING | UNSCENTED, f"{NEEDS} with ROLLING_LEFT_TO_RIGHT"),
+        (ROLLING | {"viewmats_rs": torch.eye(4).repeat(2, 1, 1)}, NEEDS),
+        (ROLLING | UNSCENTED | {"viewmats_rs": torch.eye(4)}, r"viewmats_rs: expected a tensor \[2, 4, 4\]"),
+        (ROLLING | UNSCENTED | {"viewmats_rs": torch.zeros(2, 4, 4)}, "viewmats_rs: expected matrices from world to"),
     ],
 )
 def test_bad_input(changes, found):

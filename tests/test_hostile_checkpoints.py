@@ -4,18 +4,15 @@ import json
 import random
 import struct
 import time
-import tracemalloc
 import warnings
 
 import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from hypothesis import HealthCheck, given, settings
+from hostile import changed, changed_json, little_memory, one_sentence, tried
 from hypothesis import strategies as st
-from test_checkpoints import begin, steps
-from test_hostile_files import changed, changed_json
-from test_train import fails
+from trainings import begin, steps
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import LAST, load_checkpoint, save_checkpoint
@@ -35,12 +32,6 @@ def kept(scene, tmp_path_factory):
     return trainer, load_checkpoint(folder)
 
 
-def one_sentence(error, path):
-    message = str(error.value if hasattr(error, "value") else error)
-    assert message.startswith(str(path)) and "\n" not in message and len(message) < 600 + 2 * len(str(path))
-    return message
-
-
 def test_damage_is_found(kept, tmp_path):
     """Cut anywhere, or one bit changed anywhere: the file is refused, in little memory."""
     data, path, place = kept[1].path.read_bytes(), tmp_path / "a.safetensors", random.Random(0)
@@ -53,13 +44,9 @@ def test_damage_is_found(kept, tmp_path):
     files += [struct.pack("<Q", 10**18), struct.pack("<Q", len(lie)) + lie, struct.pack("<Q", 90_000) + b"[" * 90_000]
     for content in files:
         path.write_bytes(content)
-        tracemalloc.start()
-        with pytest.raises(InputError) as error:
+        with little_memory(3 * len(content) + 2**20), pytest.raises(InputError) as error:
             load_checkpoint(path)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        one_sentence(error, path)
-        assert peak < 3 * len(content) + 2**20
+        assert one_sentence(error, path).startswith(str(path))
 
 
 @pytest.mark.parametrize(
@@ -76,7 +63,7 @@ def test_damage_is_found(kept, tmp_path):
     ],
     ids=str,
 )
-def test_what_is_no_checkpoint(content, words, tmp_path, capsys):
+def test_what_is_no_checkpoint(content, words, tmp_path, fails):
     path = tmp_path / "a.safetensors"
     if content:
         path = tmp_path / content.get("name", path.name)
@@ -84,7 +71,7 @@ def test_what_is_no_checkpoint(content, words, tmp_path, capsys):
     with pytest.raises(InputError) as error:
         load_checkpoint(path)
     assert all(word in one_sentence(error, path) for word in words)
-    assert str(path) in fails(capsys, "train", "--resume", str(path))
+    assert str(path) in fails("train", "--resume", str(path))
 
 
 def test_a_folder_without_its_last_checkpoint(kept, tmp_path):
@@ -156,34 +143,24 @@ def forged(draw, arrays, facts):
     return arrays, facts
 
 
-def survive(path, trainer):
-    """Load and restore; if that is not refused, train for a step. Whether it was restored."""
-    try:
-        load_options(path)
-        checkpoint = load_checkpoint(path)
-        run = Run(path.parent, time.perf_counter())
-        restore(trainer, run, checkpoint)
-    except InputError as error:
-        one_sentence(error, path)
-        return False
-    with warnings.catch_warnings(action="error"):
-        trainer.update(12)
-        trainer.differentiate(13)
-    return True
-
-
 @pytest.mark.parametrize("examples", [60, pytest.param(1000, marks=pytest.mark.long)])
 def test_forged_checkpoints(examples, kept, scene, tmp_path):
-    trainer = begin(scene, tmp_path)[0]
-    arrays, facts, path = kept[1].arrays, kept[1].facts, tmp_path / LAST
+    """Load and restore; if that is not refused, train for a step."""
+    trainer, path = begin(scene, tmp_path)[0], tmp_path / LAST
 
-    @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck), database=None)
-    @given(forged(arrays, facts))
-    def check(content):
+    def run(content):
         save_checkpoint(path, *content)
-        survive(path, trainer)
+        try:
+            load_options(path)
+            restore(trainer, Run(tmp_path, time.perf_counter()), load_checkpoint(path))
+        except InputError as error:
+            assert one_sentence(error, path).startswith(str(path))
+            return
+        with warnings.catch_warnings(action="error"):
+            trainer.update(12)
+            trainer.differentiate(13)
 
-    check()
+    tried(examples, forged(kept[1].arrays, kept[1].facts), run, seeded=True)
 
 
 @pytest.mark.parametrize("examples", [100, pytest.param(5000, marks=pytest.mark.long)])
@@ -193,18 +170,12 @@ def test_changed_bytes(examples, tmp_path, kept):
     save_checkpoint(path, {"losses": np.zeros(3, np.float32), "radii": np.zeros(4, np.int32)}, kept[1].facts)
     data = path.read_bytes()
 
-    @st.composite
-    def other(draw):
-        return changed(draw, data)
-
-    @settings(max_examples=examples, deadline=None, suppress_health_check=list(HealthCheck), database=None)
-    @given(other())
-    def check(content):
+    def run(content):
         path.write_bytes(content)
         for load in (load_checkpoint, load_options):
             try:
                 load(path)
             except InputError as error:
-                one_sentence(error, path)
+                assert one_sentence(error, path).startswith(str(path))
 
-    check()
+    tried(examples, st.composite(lambda draw: changed(draw, data))(), run, seeded=True)

@@ -5,18 +5,16 @@ The short run is part of every test run; the long one is marked long. Both try t
 gate a change and nothing else; the long one tries others with ``--hypothesis-seed=N``.
 """
 
-import copy
 import gzip
 import io
 import json
 import struct
-import tracemalloc
 import warnings
 import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hostile import changed, changed_json, little_memory, one_sentence, tried
 from hypothesis import strategies as st
 from splat_files import glb_bytes, glb_parts, sog_bytes, some_file, spz2, spz4
 
@@ -26,7 +24,6 @@ from warp_splat.formats.exchange import load_gaussians, save_gaussians
 QUICK, LONG = 150, 2_000  # examples for each reader
 MEMORY = 200 * 2**20  # bytes for a file of a few kilobytes: JSON of many lists and the smallest limits of SPZ fit in
 KINDS = ("ply", "text.ply", "compressed.ply", "splat", "2.spz", "3.spz", "4.spz", "sog", "glb", "gltf")
-NUMBERS = [0, -1, 1, 2**31, 2**32, 10**12, 2**63, 10**400, 0.5, -0.0, 1e308, True, None, "", [], {}, [[]], "..", 5126]
 
 WORDS = b"0 1 3 5 -1 1000000000000 99999999999999 1e3 float double uchar int8 list vertex face x nx f_rest_0 opacity"
 WORDS = [*WORDS.split(), b"comment", b"element", b"property", b"ascii", b"binary_big_endian", b"", b"\xff", b"\0"]
@@ -57,78 +54,18 @@ def valid(tmp_path_factory):
 
 def survive(folder, kind, data):
     """Read ``data`` as a file of ``kind``; whether it was read at all."""
-    path = folder / f"hostile.{kind}"
+    path, lines = folder / f"hostile.{kind}", []
     path.write_bytes(data)
-    lines = []
-    tracemalloc.start()
     try:
-        with warnings.catch_warnings(action="error"):
+        with little_memory(MEMORY + 100 * len(data)), warnings.catch_warnings(action="error"):
             splats, antialiased, _ = load_gaussians(path, report=lines.append)
     except InputError as error:
-        assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 600 + 2 * len(str(path))
+        one_sentence(error, path)
         return False
-    finally:
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < MEMORY + 100 * len(data)
     assert all(array.dtype == np.float32 and np.isfinite(array).all() for array in splats)
     assert isinstance(antialiased, bool) and len({len(array) for array in splats}) == 1
     assert all("\n" not in line for line in lines)
     return True
-
-
-def changed(draw, data):
-    """``data`` with a few bytes changed, inserted, removed or repeated, or cut."""
-    data = bytearray(data)
-    for _ in range(draw(st.integers(1, 4))):
-        place = draw(st.integers(0, max(0, len(data) - 1)))
-        match draw(st.sampled_from(["set", "word", "insert", "remove", "cut", "repeat"])):
-            case "set":
-                data[place : place + 1] = draw(st.binary(min_size=1, max_size=1))
-            case "word":
-                word = draw(st.sampled_from([0, 1, 2**31 - 1, 2**31, 2**32 - 1, 0x7F800000, 0x7FC00000, 10**9]))
-                data[place : place + 4] = struct.pack("<I", word)
-            case "insert":
-                data[place:place] = draw(st.binary(max_size=40))
-            case "remove":
-                del data[place : place + draw(st.integers(1, 40))]
-            case "cut":
-                del data[place:]
-            case "repeat":
-                data[place:place] = data[place : place + draw(st.integers(1, 200))]
-    return bytes(data)
-
-
-def places(value, path=()):
-    """Where the values of a JSON value are."""
-    yield path
-    if isinstance(value, dict | list):
-        for key in value if isinstance(value, dict) else range(len(value)):
-            yield from places(value[key], (*path, key))
-
-
-def changed_json(draw, document):
-    """``document`` with a few values replaced by awkward ones, by others of it, or removed."""
-    document = copy.deepcopy(document)
-    for _ in range(draw(st.integers(1, 3))):
-        paths = [path for path in places(document) if path]
-        if not paths:
-            break
-        *way, last = draw(st.sampled_from(paths))
-        holder = document
-        for key in way:
-            holder = holder[key]
-        match draw(st.sampled_from(["number", "number", "other", "remove"])):
-            case "number":
-                holder[last] = copy.deepcopy(draw(st.sampled_from(NUMBERS)))
-            case "other":
-                value = document
-                for key in draw(st.sampled_from(paths)):
-                    value = value[key]
-                holder[last] = copy.deepcopy(value)
-            case "remove":
-                del holder[last]
-    return document
 
 
 def changed_header(draw, data):
@@ -179,35 +116,13 @@ def hostile(draw, kind, files):
     return changed(draw, data)
 
 
-def attack(kind, files, folder, examples, seeded=False):
-    (folder / "data.bin").write_bytes(files["data.bin"])
-    assert survive(folder, kind, files[kind])
-    found = [0, 0]
-
-    @settings(
-        max_examples=examples,
-        deadline=None,
-        database=None,
-        derandomize=not seeded,
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(data=hostile(kind, files))
-    def run(data):
-        found[survive(folder, kind, data)] += 1
-
-    run()
-    print(f"{kind}: {found[0]} inputs refused, {found[1]} read")
-
-
+@pytest.mark.parametrize("examples", [QUICK, pytest.param(LONG, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_hostile_bytes(tmp_path, valid, kind):
-    attack(kind, valid, tmp_path, QUICK)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", KINDS)
-def test_hostile_bytes_for_long(tmp_path, valid, kind, pytestconfig):
-    attack(kind, valid, tmp_path, LONG, pytestconfig.getoption("--hypothesis-seed") is not None)
+def test_hostile_bytes(tmp_path, valid, kind, examples, pytestconfig):
+    (tmp_path / "data.bin").write_bytes(valid["data.bin"])
+    assert survive(tmp_path, kind, valid[kind])
+    seeded = examples == LONG and pytestconfig.getoption("--hypothesis-seed") is not None
+    tried(examples, hostile(kind, valid), lambda data: survive(tmp_path, kind, data), seeded)
 
 
 @pytest.mark.parametrize("bits", [0x7F800001, 0xFFBFFFFF, 0x7F7FFFFF])
@@ -231,11 +146,6 @@ def test_every_cut(tmp_path, valid, kind):
         assert not read or whole or last_digits, f"{length} of {len(valid[kind])} bytes were taken for a file"
 
 
-def bomb(version, count, size):
-    """Few bytes that expand to ``size`` zeros, with a header that asks for ``count`` Gaussians."""
-    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, 3, 12, 0, 0) + bytes(size))
-
-
 @pytest.mark.parametrize(
     ("count", "size", "sentence"),
     [
@@ -246,89 +156,82 @@ def bomb(version, count, size):
     ],
 )
 def test_gzip_bombs(tmp_path, count, size, sentence):
-    (tmp_path / "a.spz").write_bytes(bomb(3, count, size))
-    tracemalloc.start()
-    with pytest.raises(InputError, match=rf"a\.spz.*({sentence})"):
+    """Few bytes that expand to many zeros, with a header that asks for many Gaussians."""
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, count, 3, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + bytes(size)))
+    with little_memory(2**25), pytest.raises(InputError, match=rf"a\.spz.*({sentence})"):
         load_gaussians(tmp_path / "a.spz")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 2**25
 
 
-def edited(valid, folder, **changes):
-    """The .gltf file with values replaced: "nodes__0__mesh" is the way to one."""
-    document = json.loads(valid["gltf"])
-    for way, value in changes.items():
-        *keys, last = (int(key) if key.isdecimal() else key for key in way.split("__"))
-        holder = document
-        for key in keys:
-            holder = holder[key]
-        holder[last] = value
-    (folder / "data.bin").write_bytes(valid["data.bin"])
-    (folder / "a.gltf").write_text(json.dumps(document))
-    return folder / "a.gltf"
+URI, COUNT, VIEW = "buffers__0__uri", "accessors__0__count", "bufferViews__0__byte"
+PRIMITIVE = "meshes__0__primitives__0__"
+EXTENSION = f"{PRIMITIVE}extensions__KHR_gaussian_splatting__"
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("way", "value", "sentence"),
     [
-        ({"buffers__0__uri": "../data.bin"}, "a buffer outside of its folder"),
-        ({"buffers__0__uri": "%2e%2e/data.bin"}, "a buffer outside of its folder"),
-        ({"buffers__0__uri": "/etc/hostname"}, "a buffer outside of its folder"),
-        ({"buffers__0__uri": "..\\data.bin"}, "a buffer outside of its folder"),
-        ({"buffers__0__uri": "http://example.org/data.bin"}, "a buffer outside of its folder"),
-        ({"buffers__0__uri": "link.bin"}, "a buffer outside of its folder"),
-        ({"buffers__0__uri": "none.bin"}, "no file 'none.bin' beside it"),
-        ({"buffers__0__uri": "."}, "no file"),
-        ({"buffers__0__uri": "a\0b"}, "damaged"),
-        ({"buffers__0__uri": "x" * 5000}, "could not be read"),
-        ({"buffers__0__uri": "data:application/octet-stream;base64,AAAA"}, "a buffer inside the JSON"),
-        ({"buffers__0__uri": 5}, "a buffer inside the JSON"),
-        ({"accessors__0__count": 10**12}, "count 1000000000000, at most 4"),
-        ({"accessors__0__count": 10**300}, "count of many digits"),
-        ({"accessors__0__count": -1}, "count -1, at most"),
-        ({"accessors__0__count": 1.5}, "count 1.5, which is no whole number"),
-        ({"accessors__0__count": True}, "count True, which is no whole number"),
-        ({"accessors__0__count": 3}, "attributes of different lengths"),
-        ({"accessors__0__sparse": {}}, "without data of its own"),
-        ({"accessors__0__componentType": 5125}, "type 'VEC3', 5125"),
-        ({"bufferViews__0__byteStride": 3}, "byteStride 3"),
-        ({"bufferViews__0__byteLength": 10**9}, "byteLength of a bufferView 1000000000"),
-        ({"buffers__0__byteLength": 10**9}, "byteLength of a buffer 1000000000"),
-        ({"nodes__0__children": [0]}, "node 0 in two places"),
-        ({"nodes": [{"children": [1, 1], "mesh": 0}, {"mesh": 0}]}, "node 1 in two places"),
-        ({"nodes__0__mesh": 7}, "index of meshes 7"),
-        ({"nodes__0__scale": [1, 2, 1]}, "a node that stretches or shears"),
-        ({"nodes__0__scale": [0, 0, 0]}, "a node that stretches or shears"),
-        ({"nodes__0__scale": [1e200, 1e200, 1e200]}, "a node that stretches or shears"),
-        ({"nodes__0__scale": [1e100, 1e100, 1e100]}, "."),
-        ({"nodes__0__rotation": [0, 0, 0, 0]}, "a rotation"),
-        ({"nodes__0__matrix": [1] * 15}, "matrix that are not 16 numbers"),
-        ({"scenes__0__nodes": []}, "0 meshes of them"),
-        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "needs the extension 'KHR_draco"),
-        ({"extensionsRequired": [[]]}, "needs the extension"),
-        ({"meshes__0__primitives__0__extensions": {}}, "0 meshes of them"),
-        ({"meshes__0__primitives__0__extensions__KHR_gaussian_splatting__kernel": "cone"}, "kernel 'cone'"),
-        (
-            {"meshes__0__primitives__0__extensions__KHR_gaussian_splatting__extensions": {"spz": {}}},
-            "in a compressed form",
-        ),
-        ({"meshes__0__primitives__0__attributes": {}}, "0 coefficients of SH"),
-        ({"meshes__0__primitives__0__attributes__POSITION": 99}, "index of accessors 99"),
+        (URI, "../data.bin", "a buffer outside of its folder"),
+        (URI, "%2e%2e/data.bin", "a buffer outside of its folder"),
+        (URI, "/etc/hostname", "a buffer outside of its folder"),
+        (URI, "..\\data.bin", "a buffer outside of its folder"),
+        (URI, "http://example.org/data.bin", "a buffer outside of its folder"),
+        (URI, "link.bin", "a buffer outside of its folder"),
+        (URI, "none.bin", "no file 'none.bin' beside it"),
+        (URI, ".", "no file"),
+        (URI, "a\0b", "damaged"),
+        (URI, "x" * 5000, "could not be read"),
+        (URI, "data:application/octet-stream;base64,AAAA", "a buffer inside the JSON"),
+        (URI, 5, "a buffer inside the JSON"),
+        (COUNT, 10**12, "count 1000000000000, at most 4"),
+        (COUNT, 10**300, "count of many digits"),
+        (COUNT, -1, "count -1, at most"),
+        (COUNT, 1.5, "count 1.5, which is no whole number"),
+        (COUNT, True, "count True, which is no whole number"),
+        (COUNT, 3, "attributes of different lengths"),
+        ("accessors__0__sparse", {}, "without data of its own"),
+        ("accessors__0__componentType", 5125, "type 'VEC3', 5125"),
+        (f"{VIEW}Stride", 3, "byteStride 3"),
+        (f"{VIEW}Length", 10**9, "byteLength of a bufferView 1000000000"),
+        ("buffers__0__byteLength", 10**9, "byteLength of a buffer 1000000000"),
+        ("nodes__0__children", [0], "node 0 in two places"),
+        ("nodes", [{"children": [1, 1], "mesh": 0}, {"mesh": 0}], "node 1 in two places"),
+        ("nodes__0__mesh", 7, "index of meshes 7"),
+        ("nodes__0__scale", [1, 2, 1], "a node that stretches or shears"),
+        ("nodes__0__scale", [0, 0, 0], "a node that stretches or shears"),
+        ("nodes__0__scale", [1e200, 1e200, 1e200], "a node that stretches or shears"),
+        ("nodes__0__rotation", [0, 0, 0, 0], "a rotation"),
+        ("nodes__0__matrix", [1] * 15, "matrix that are not 16 numbers"),
+        ("scenes__0__nodes", [], "0 meshes of them"),
+        ("extensionsRequired", ["KHR_draco_mesh_compression"], "needs the extension 'KHR_draco"),
+        ("extensionsRequired", [[]], "needs the extension"),
+        (f"{PRIMITIVE}extensions", {}, "0 meshes of them"),
+        (f"{EXTENSION}kernel", "cone", "kernel 'cone'"),
+        (f"{EXTENSION}extensions", {"spz": {}}, "in a compressed form"),
+        (f"{PRIMITIVE}attributes", {}, "0 coefficients of SH"),
+        (f"{PRIMITIVE}attributes__POSITION", 99, "index of accessors 99"),
+        ("nodes__0__scale", [1e100, 1e100, 1e100], None),  # positions beyond float32: every Gaussian is left out
     ],
 )
-def test_gltf_that_asks_for_too_much(tmp_path, valid, changes, sentence):
-    folder = tmp_path / "inside"
-    folder.mkdir()
-    (tmp_path / "data.bin").write_bytes(valid["data.bin"])
-    (folder / "link.bin").symlink_to(tmp_path / "data.bin")
-    path = edited(valid, folder, **changes)
-    if sentence == ".":  # positions beyond float32: every Gaussian is left out
+def test_gltf_that_asks_for_too_much(tmp_path, valid, way, value, sentence):
+    """Values replaced; ``way`` leads to one."""
+    path = tmp_path / "inside" / "a.gltf"
+    path.parent.mkdir()
+    for folder in (tmp_path, path.parent):
+        (folder / "data.bin").write_bytes(valid["data.bin"])
+    (path.parent / "link.bin").symlink_to(tmp_path / "data.bin")
+    holder = document = json.loads(valid["gltf"])
+    *keys, last = (int(key) if key.isdecimal() else key for key in way.split("__"))
+    for key in keys:
+        holder = holder[key]
+    holder[last] = value
+    path.write_text(json.dumps(document))
+    if sentence is None:
         assert len(load_gaussians(path, report=lambda line: None).splats.means) == 0
         return
     with pytest.raises(InputError, match=sentence) as error:
         load_gaussians(path)
-    assert str(path) in str(error.value) and len(str(error.value)) < 400 + len(str(path))
+    one_sentence(error, path, 400 - len(str(path)))
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,10 @@ COLMAP models, transforms.json, images and masks are changed as tests/test_hosti
 
 import json
 import resource
-import shutil
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hostile import changed, changed_json, one_sentence, tried
 from hypothesis import strategies as st
 from scene_files import (
     load,
@@ -21,7 +20,6 @@ from scene_files import (
     write_model,
     write_transforms,
 )
-from test_hostile_files import changed, changed_json
 from test_inputs import light
 
 from warp_splat.errors import InputError
@@ -83,8 +81,7 @@ def survive(root):
     try:
         scene, lines = load(root)
     except InputError as error:
-        message = str(error)
-        assert "\n" not in message and len(message) < 1000 + 3 * len(str(root)), message
+        one_sentence(error, "", 1000 + 3 * len(str(root)))
         return False
     assert all("\n" not in line for line in lines)
     assert np.isfinite(scene.points).all() and len(scene.points) == len(scene.colors) > 0
@@ -107,42 +104,29 @@ def hostile(draw, files):
     return path, changed(draw, data)
 
 
-def attack(kind, root, examples, seeded=False):
-    shutil.rmtree(root, ignore_errors=True)
-    files = {path: path.read_bytes() for path in KINDS[kind](root)}
-    assert survive(root)
-    before, found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, [0, 0]
+def resident():
+    """Bytes of this process, at most so far."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    @settings(
-        max_examples=examples,
-        deadline=None,
-        database=None,
-        derandomize=not seeded,
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(change=hostile(files))
+
+@pytest.mark.parametrize("examples", [QUICK, pytest.param(LONG, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_hostile_scenes(tmp_path, kind, examples, pytestconfig):
+    files = {path: path.read_bytes() for path in KINDS[kind](tmp_path)}
+    assert survive(tmp_path)
+    before = resident()
+
     def run(change):
         path, data = change
         path.write_bytes(data)
         try:
-            found[survive(root)] += 1
+            survive(tmp_path)
         finally:
             path.write_bytes(files[path])
 
-    run()
-    assert 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) < MEMORY
-    print(f"{kind}: {found[0]} inputs refused, {found[1]} read")
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_hostile_scenes(tmp_path, kind):
-    attack(kind, tmp_path / "scene", QUICK)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", KINDS)
-def test_hostile_scenes_for_long(tmp_path, kind, pytestconfig):
-    attack(kind, tmp_path / "scene", LONG, pytestconfig.getoption("--hypothesis-seed") is not None)
+    seeded = examples == LONG and pytestconfig.getoption("--hypothesis-seed") is not None
+    tried(examples, hostile(files), run, seeded)
+    assert resident() - before < MEMORY
 
 
 @pytest.mark.parametrize("name", MODEL)
@@ -165,13 +149,19 @@ def test_lies_about_counts_are_refused_at_once(tmp_path, name, count):
         load(tmp_path)
 
 
-def test_bytes_in_a_file_that_are_no_text(tmp_path):
-    """OpenImageIO names the attribute that it refuses."""
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (b"channels\0chlist", b"chann\x80ls\0chlist", "expected a complete image file"),  # a name that is no text
+        (b"screenWindowCenter\0", b"screenWindowCenter\0" * 2, r".* \.\.\.\); replace it\.$"),  # a long list follows
+    ],
+)
+def test_what_a_library_complains_of_is_cut_to_a_sentence(tmp_path, old, new, sentence):
     (path,) = with_image(tmp_path, "a.exr")
     data = path.read_bytes()
-    assert b"channels\0chlist" in data
-    path.write_bytes(data.replace(b"channels\0chlist", b"chann\x80ls\0chlist"))
-    with pytest.raises(InputError, match=r"a\.exr: expected a complete image file"):
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(InputError, match=rf"a\.exr: {sentence}"):
         load(tmp_path)
 
 
@@ -183,22 +173,13 @@ def test_a_model_whose_frames_name_images_that_it_lacks(tmp_path):
         load(tmp_path)
 
 
-def test_all_that_a_library_complains_of_is_cut_to_a_sentence(tmp_path):
-    """OpenEXR lists what follows from a name that stands there twice."""
-    (path,) = with_image(tmp_path, "a.exr")
-    data = path.read_bytes()
-    path.write_bytes(data.replace(b"screenWindowCenter\0", b"screenWindowCenter\0screenWindowCenter\0"))
-    with pytest.raises(InputError, match=r"a\.exr: .* \.\.\.\); replace it\.$"):
-        load(tmp_path)
-
-
 def test_a_png_that_lies_about_its_size_allocates_nothing(tmp_path):
     """A header of 14,000 x 14,000 pixels on a file of some kilobytes."""
     (path,) = with_image(tmp_path, "a.png")
     data = bytearray(path.read_bytes())
     data[16:24] = (14_000).to_bytes(4, "big") * 2
     path.write_bytes(data)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = resident()
     with pytest.raises(InputError, match=r"a\.png"):
         load(tmp_path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000
+    assert resident() - before < 100_000 * 1024

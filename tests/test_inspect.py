@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from commands import SCENE
 from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, write_image, write_transforms
 from test_scene_input import BAD
 
@@ -15,13 +16,11 @@ from warp_splat.inspect import geometry
 from warp_splat.inspect.cost import forecast
 from warp_splat.inspect.subject import read_subject
 
-EMBEDDED = Path(__file__).parents[1] / "assets" / "still_life"
-
 
 @pytest.fixture
 def life(tmp_path):
     """A copy of the embedded scene that may be damaged."""
-    shutil.copytree(EMBEDDED, tmp_path / "life")
+    shutil.copytree(SCENE, tmp_path / "life")
     return tmp_path / "life"
 
 
@@ -46,7 +45,7 @@ def change_model(scene, change):
 
 
 def test_a_good_scene_has_no_finding(tmp_path, capsys):
-    findings, page = examine(EMBEDDED, tmp_path, capsys, 0)
+    findings, page = examine(SCENE, tmp_path, capsys, 0)
     assert not worst(findings)
     html = page.read_text()
     assert html.count('src="data:image/jpeg;base64,') == html.count("<img") == 5
@@ -59,7 +58,7 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
 
 
 def test_the_reprojection_error_is_that_of_pycolmap(capsys):
-    subject, _ = read_subject(EMBEDDED, "images")
+    subject, _ = read_subject(SCENE, "images")
     measured = geometry.Measured()
     list(geometry.check_reprojection(subject, measured))
     errors = np.concatenate(list(measured.errors.values()))
@@ -69,113 +68,87 @@ def test_the_reprojection_error_is_that_of_pycolmap(capsys):
     assert np.isclose(errors.mean(), expected, rtol=1e-6)
 
 
-def push(image, by):
-    pose = image.cam_from_world()
-    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + by)
-
-
-def move(model, count, place):
-    for point in list(model.points3D.values())[:count]:
-        point.xyz = place
-
-
-def turn_all(model, turn):
-    for number in model.reg_image_ids():
-        image = model.image(number)
-        pose = turn(image.cam_from_world())
-        image.frame.rig_from_world = pose
-
-
+ASIDE = np.array((0.3, 0.0, 0.0))
 FLIP = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag((1.0, -1.0, -1.0))), np.zeros(3))
-DAMAGE = {
-    "missing": (lambda s: (s / "images" / "view_003.png").unlink(), ("error", "files"), "view_003.png"),
-    "two of one stem": (
-        lambda s: (
-            [shutil.copy(s / "images" / "view_003.png", s / "images" / f"view_003.{e}") for e in ("tif", "jpg")]
-            and (s / "images" / "view_003.png").unlink()
-        ),
-        ("error", "files"),
-        "several of this stem (view_003.jpg, view_003.tif)",
-    ),
-    "no points": (
-        lambda s: change_model(s, lambda model: [model.delete_point3D(n) for n in list(model.points3D)]),
-        ("warning", "points"),
-        "random ones",
-    ),
-    "size": (
-        lambda s: write_image(s / "images" / "view_003.png", texture(200, 264)),
-        ("error", "sizes"),
-        "264 x 248",
-    ),
-    "cut": (
-        lambda s: (s / "images" / "view_003.png").write_bytes((s / "images" / "view_003.png").read_bytes()[:9000]),
-        ("error", "files"),
-        "view_003.png",
-    ),
-    "sub-models": (
-        lambda s: shutil.copytree(s / "sparse" / "0", s / "sparse" / "1"),
-        ("warning", "sub-models"),
-        "sparse/1",
-    ),
-    "one pose": (
-        lambda s: change_model(s, lambda model: push(model.image(sorted(model.reg_image_ids())[3]), (0.3, 0, 0))),
-        ("warning", "reprojection"),
-        "1 images are much worse",
-    ),
-    "OpenGL axes": (
-        lambda s: change_model(s, lambda model: turn_all(model, lambda pose: FLIP * pose)),
-        ("error", "axes"),
-        "with OpenGL axes",
-    ),
-    "camera to world": (
-        lambda s: change_model(s, lambda model: turn_all(model, lambda pose: pose.inverse())),
-        ("error", "axes"),
-        "with camera-to-world the",
-    ),
-    "focal length": (
-        lambda s: change_model(s, lambda model: setattr(model.cameras[1], "params", (30.0, 30.0, 130, 125))),
-        ("error", "reprojection"),
-        "do not belong together",
-    ),
-    "same bytes": (
-        lambda s: shutil.copy(s / "images" / "view_003.png", s / "images" / "view_004.png"),
-        ("warning", "duplicates"),
-        "view_003.png = view_004.png",
-    ),
-    "some alpha": (
-        lambda s: write_image(s / "images" / "view_003.png", texture(264, 248, 4)),
-        ("warning", "alpha"),
-        "1 of 50",
-    ),
-    "some masks": (
-        lambda s: write_image(s / "masks" / "view_003.png.png", texture(264, 248, 1)),
-        ("warning", "masks"),
-        "masks for 1 of 50",
-    ),
-    "far points": (
-        lambda s: change_model(
-            s, lambda model: [setattr(p, "xyz", (1e6, 0, 0)) for p in list(model.points3D.values())[:9]]
-        ),
-        ("warning", "points"),
-        "9 of 4500",
-    ),
-    "unseen points": (
-        lambda s: change_model(
-            s, lambda model: [setattr(p, "xyz", (0, 0, 40)) for p in list(model.points3D.values())[:900]]
-        ),
-        ("warning", "unseen points"),
-        "20.0 %",
-    ),
-}
 
 
-@pytest.mark.parametrize("case", DAMAGE)
-def test_damage_is_found(life, tmp_path, capsys, monkeypatch, case):
+def in_model(change):
+    """Damage to the COLMAP model."""
+    return lambda scene: change_model(scene, change)
+
+
+def in_poses(turn, *places):
+    """Damage to the poses of all images, or of those at some places."""
+
+    def change(model):
+        numbers = sorted(model.reg_image_ids())
+        for image in map(model.image, [numbers[place] for place in places] or numbers):
+            image.frame.rig_from_world = turn(image.cam_from_world())
+
+    return in_model(change)
+
+
+def in_points(count, place):
+    """Damage to the first points."""
+    return in_model(lambda model: [setattr(p, "xyz", place) for p in list(model.points3D.values())[:count]])
+
+
+def in_photo(change):
+    return lambda scene: change(scene / "images" / "view_003.png")
+
+
+def two_of_one_stem(path):
+    for ending in (".tif", ".jpg"):
+        shutil.copy(path, path.with_suffix(ending))
+    path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "finding", "text"),
+    [
+        (in_photo(Path.unlink), ("error", "files"), "view_003.png"),
+        (in_photo(two_of_one_stem), ("error", "files"), "several of this stem (view_003.jpg, view_003.tif)"),
+        (in_photo(lambda path: write_image(path, texture(200, 264))), ("error", "sizes"), "264 x 248"),
+        (in_photo(lambda path: path.write_bytes(path.read_bytes()[:9000])), ("error", "files"), "view_003.png"),
+        (
+            in_photo(lambda path: shutil.copy(path, path.with_name("view_004.png"))),
+            ("warning", "duplicates"),
+            "view_003.png = view_004.png",
+        ),
+        (in_photo(lambda path: write_image(path, texture(264, 248, 4))), ("warning", "alpha"), "1 of 50"),
+        (
+            lambda s: write_image(s / "masks" / "view_003.png.png", texture(264, 248, 1)),
+            ("warning", "masks"),
+            "masks for 1 of 50",
+        ),
+        (lambda s: shutil.copytree(s / "sparse/0", s / "sparse/1"), ("warning", "sub-models"), "sparse/1"),
+        (
+            in_model(lambda model: [model.delete_point3D(n) for n in list(model.points3D)]),
+            ("warning", "points"),
+            "random ones",
+        ),
+        (
+            in_model(lambda model: setattr(model.cameras[1], "params", (30.0, 30.0, 130, 125))),
+            ("error", "reprojection"),
+            "do not belong together",
+        ),
+        (
+            in_poses(lambda pose: pycolmap.Rigid3d(pose.rotation, pose.translation + ASIDE), 3),
+            ("warning", "reprojection"),
+            "1 images are much worse",
+        ),
+        (in_poses(lambda pose: FLIP * pose), ("error", "axes"), "with OpenGL axes"),
+        (in_poses(lambda pose: pose.inverse()), ("error", "axes"), "with camera-to-world the"),
+        (in_points(9, (1e6, 0, 0)), ("warning", "points"), "9 of 4500"),
+        (in_points(900, (0, 0, 40)), ("warning", "unseen points"), "20.0 %"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_damage_is_found(life, tmp_path, capsys, monkeypatch, damage, finding, text):
     monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject, measured: ())  # takes long
-    damage, (level, check), text = DAMAGE[case]
     damage(life)
-    findings, _ = examine(life, tmp_path, capsys, 1 if level == "error" else 0)
-    assert any(text in what for found, name, what in findings if (found, name) == (level, check)), findings
+    findings, _ = examine(life, tmp_path, capsys, 1 if finding[0] == "error" else 0)
+    assert any(text in what for *found, what in findings if tuple(found) == finding), findings
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -184,8 +157,8 @@ def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case
     source, options = BAD[case][0](tmp_path)
     if options.keys() - {"images"}:
         return  # of the resolution or the split, which this command does not have
-    folder = options.get("images", "images")
-    assert main(["inspect", str(source), "-o", str(tmp_path / "page.html"), "-i", folder]) == 1
+    folder, page = options.get("images", "images"), tmp_path / "page.html"
+    assert main(["inspect", str(source), "-o", str(page), "-i", folder]) == 1
     assert "Traceback" not in "".join(capsys.readouterr())
 
 
@@ -233,11 +206,10 @@ def test_a_model_without_its_points(life, tmp_path, capsys):
     assert ("warning", "points") in worst(examine(life, tmp_path, capsys, 0)[0])
 
 
-def test_no_file_but_a_page_is_written_over(tmp_path, capsys):
+def test_no_file_but_a_page_is_written_over(tmp_path, fails):
     photo = tmp_path / "photo.jpg"
     photo.write_text("a photograph")
-    assert main(["inspect", str(EMBEDDED), "-o", str(photo)]) == 1
-    assert "ends in .html" in capsys.readouterr().err and photo.read_text() == "a photograph"
+    assert "ends in .html" in fails("inspect", SCENE, "-o", photo) and photo.read_text() == "a photograph"
 
 
 def test_text_of_the_scene_is_not_html(tmp_path, capsys):
@@ -253,10 +225,9 @@ def test_nerf_synthetic_scenes_are_examined(tmp_path, capsys):
     assert worst(findings) == {("warning", "cameras"), ("warning", "duplicates")}  # three images, all the same
 
 
-def test_a_folder_that_is_no_scene_gets_one_sentence(tmp_path, capsys):
+def test_a_folder_that_is_no_scene_gets_one_sentence(tmp_path, fails):
     write_image(tmp_path / "photos" / "a.png", texture())
-    assert main(["inspect", str(tmp_path / "photos")]) == 1
-    assert "warp-splat sfm" in capsys.readouterr().err
+    assert "warp-splat sfm" in fails("inspect", tmp_path / "photos")
     assert not (tmp_path / "output").exists()
 
 

@@ -1,9 +1,15 @@
-"""How kernels are written: what they write is named so and stands last, arrays say their shape, none is too long."""
+"""How kernels are written: names, order, shapes, size; and those assembled from functions: the same as if called."""
 
 import ast
 from pathlib import Path
 
+import numpy as np
 import pytest
+import warp as wp
+from commands import python
+
+from warp_splat.errors import InputError
+from warp_splat.kernels.inline import kernel_of_parts
 
 KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
 MOST_PARAMETERS, MOST_LINES = 12, 100
@@ -97,3 +103,71 @@ def test_arrays_of_structs_say_their_shape():
 def test_size(lines, kernel):
     assert len(kernel.args.args) <= MOST_PARAMETERS, "put what belongs together into a struct (kernels/structs.py)"
     assert kernel.end_lineno - kernel.lineno < MOST_LINES
+
+
+size = 2.0  # also the name of a variable of the kernel
+
+
+@wp.func
+def turned(x: float, y: float):
+    half = 0.5 * size
+    return x + y, half * (x - y)
+
+
+def test_arguments_may_be_targets_and_names_may_meet():
+    @kernel_of_parts({}, turned=turned)
+    def kernel(values: wp.array[float], out: wp.array[float]):
+        size = values[0]
+        half = values[1]
+        size, half = turned(size, half)
+        out[0] = size
+        out[1] = half
+
+    out = wp.zeros(2, dtype=float, device="cpu")
+    wp.launch(kernel, 1, [wp.array([5.0, 3.0], dtype=float, device="cpu")], [out], device="cpu")
+    np.testing.assert_allclose(out.numpy(), [8.0, 2.0])
+
+
+@wp.func
+def hasty(x: float):
+    if x > 1.0:
+        return x
+    return 2.0 * x
+
+
+@wp.func
+def careless(x: float):
+    x = 2.0 * x
+    return x
+
+
+@wp.func
+def generous(x: float):
+    return x, x
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [(hasty, "returns once"), (careless, "returns once"), (generous, "returns 1 values, .* found 2")],
+)
+def test_functions_that_cannot_be_put_in_place_are_refused(part, message):
+    with pytest.raises(InputError, match=message):
+
+        @kernel_of_parts({}, part=part)
+        def kernel(out: wp.array[float]):
+            y = out[0]
+            y = part(y)
+            out[0] = y
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("project", "    rotation_w = times(qw, rotation_scale)\n"),
+        ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n"),
+    ],
+)
+def test_what_is_compiled_can_be_read(word, line):
+    """What was assembled: names of a part stand in the kernel; what was written from a formula."""
+    shown = python("benchmarks/show_kernel.py", word, check=False).stdout
+    assert f"def {word}(" in shown and line in shown

@@ -5,8 +5,8 @@ import tomllib
 
 import numpy as np
 import pytest
-from test_checkpoints import begin, state_of, steps
-from test_train import SCENE, fails
+from commands import SCENE
+from trainings import begin, state_of, steps
 
 from warp_splat.cli import main, parse
 from warp_splat.errors import InputError
@@ -229,26 +229,11 @@ def test_a_densification_has_to_fit(scene):
         plan_training(scene, config, ALONE, str)
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ("--minutes 0", "--minutes: expected more than 0, got 0; leave it out to train by --iterations."),
-        ("--minutes -2", "--minutes: expected more than 0, got -2"),
-        ("--minutes nan", "--minutes: expected more than 0, got nan"),
-        ("--minutes inf", "--minutes: expected a finite number"),
-        ("--minutes 3 --iterations 100", "--minutes: expected no --iterations beside it, since it plans the steps"),
-        ("--minutes 3 --densify_until_iter 100", "--minutes: expected no --densify_until_iter beside it"),
-    ],
-)
-def test_what_cannot_be(flags, message, capsys):
-    assert message in fails(capsys, "train", *flags.split())
-
-
-def test_files_and_checkpoints(scene, tmp_path, capsys):
+def test_files_and_checkpoints(scene, tmp_path, fails):
     """A file's steps are a shape; its minutes want none beside them. A training that goes on keeps its minutes."""
     file = tmp_path / "a.toml"
     file.write_text("minutes = 3\niterations = 5\n")
-    assert "expected no --iterations beside it" in fails(capsys, "train", "--config", str(file))
+    assert "expected no --iterations beside it" in fails("train", "--config", str(file))
     file.write_text("settle_from_iter = 3\niterations = 500\n")
     config = parse(["train", "-s", "x", "--config", str(file), "--minutes", "2"])
     assert config.learn.end == 1003 and config.data.preset == "fast" and config.learn.iterations == 500
@@ -262,7 +247,7 @@ def test_files_and_checkpoints(scene, tmp_path, capsys):
     trainer.settle(20, 5)
     keep(trainer, run)
     assert parse(resume).learn.end == 25
-    assert "expected a training that began with it" in fails(capsys, *resume, "--minutes", "4")
+    assert "expected a training that began with it" in fails(*resume, "--minutes", "4")
 
 
 def test_schedules_are_marked():

@@ -3,11 +3,11 @@
 import argparse
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import started
 from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
 from splat_files import some_splats
@@ -32,15 +32,11 @@ ARGUMENTS = {
 }
 
 
-def test_cfg_args_round_trip(tmp_path):
+def test_cfg_args_are_what_argparse_prints_and_come_back(tmp_path):
     model_folder.write_cfg_args(tmp_path, ARGUMENTS)
-    assert model_folder.read_cfg_args(tmp_path) == {**ARGUMENTS, "model_path": str(Path("output") / "x")}
-
-
-def test_cfg_args_is_what_argparse_prints(tmp_path):
-    arguments = {name: value for name, value in ARGUMENTS.items() if not isinstance(value, Path)}
-    model_folder.write_cfg_args(tmp_path, arguments)
-    assert (tmp_path / "cfg_args").read_text() == str(argparse.Namespace(**arguments))
+    plain = ARGUMENTS | {"model_path": str(ARGUMENTS["model_path"])}
+    assert (tmp_path / "cfg_args").read_text() == str(argparse.Namespace(**plain))
+    assert model_folder.read_cfg_args(tmp_path) == plain
 
 
 @pytest.mark.parametrize(
@@ -71,11 +67,11 @@ def test_cfg_args_refuses_all_but_literals_and_runs_nothing(tmp_path, text):
 
 
 def test_cfg_args_missing_or_not_text(tmp_path):
-    with pytest.raises(InputError, match=r"is .* a model folder"):
-        model_folder.read_cfg_args(tmp_path)
-    (tmp_path / "cfg_args").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="could not be read"):
-        model_folder.read_cfg_args(tmp_path)
+    for content, sentence in ((None, r"is .* a model folder"), (b"\xff\xfe\x00", "could not be read")):
+        if content:
+            (tmp_path / "cfg_args").write_bytes(content)
+        with pytest.raises(InputError, match=sentence):
+            model_folder.read_cfg_args(tmp_path)
 
 
 @pytest.mark.parametrize("value", [object(), float("nan"), float("inf"), np.float32(1)])
@@ -108,6 +104,7 @@ def test_cameras_test_first_at_original_size(tmp_path):
 
 
 def test_cameras_come_back(tmp_path):
+    """Those without a principal point, as the reference writes them, have it in the middle."""
     assert model_folder.read_cameras(tmp_path) == []
     views = [view("a/1.jpg", 1), view("2.jpg", 2)]
     model_folder.write_cameras(tmp_path, [], views)
@@ -117,46 +114,26 @@ def test_cameras_come_back(tmp_path):
             assert getattr(camera, field) == getattr(expected.original, field)
         np.testing.assert_allclose(camera.rotation, expected.original.rotation, atol=1e-12)
         np.testing.assert_allclose(camera.translation, expected.original.translation, atol=1e-12)
-
-
-def test_cameras_without_a_principal_point_have_it_in_the_middle(tmp_path):
-    model_folder.write_cameras(tmp_path, [], [view("1.jpg", 1)])
     entries = json.loads((tmp_path / "cameras.json").read_text())
-    del entries[0]["cx"], entries[0]["cy"]  # as the reference writes it
+    del entries[0]["cx"], entries[0]["cy"]
     (tmp_path / "cameras.json").write_text(json.dumps(entries))
-    [(_, camera)] = model_folder.read_cameras(tmp_path)
+    (_, camera), _ = model_folder.read_cameras(tmp_path)
     assert (camera.cx, camera.cy) == (400, 300)
 
 
-ENTRY = {
-    "img_name": "1",
-    "width": 4,
-    "height": 3,
-    "fx": 2,
-    "fy": 2,
-    "position": [0, 0, 0],
-    "rotation": np.eye(3).tolist(),
-}
-
-
 @pytest.mark.parametrize(
-    "text",
+    "damage",
     [
-        "{",
-        "{}",
-        "[1]",
-        "[{}]",
-        "[" * 100_000,
-        json.dumps([{**ENTRY, "width": "wide"}]),
-        json.dumps([{**ENTRY, "width": None}]),
-        json.dumps([{**ENTRY, "rotation": [[1]]}]),
-        json.dumps([{**ENTRY, "rotation": [[[]]]}]),
-        json.dumps([{**ENTRY, "position": [0, 0, 1e400]}]),
-        json.dumps([{**ENTRY, "position": {"x": 0}}]),
-        json.dumps([{**ENTRY, "fx": 0}]),
+        *("{", "{}", "[1]", "[{}]", "[" * 100_000),
+        *({"width": "wide"}, {"width": None}, {"rotation": [[1]]}, {"rotation": [[[]]]}, {"fx": 0}),
+        *({"position": [0, 0, 1e400]}, {"position": {"x": 0}}),
     ],
+    ids=lambda damage: str(damage)[:20],
 )
-def test_damaged_cameras_are_refused_by_a_sentence(tmp_path, text):
+def test_damaged_cameras_are_refused_by_a_sentence(tmp_path, damage):
+    entry = {"img_name": "1", "width": 4, "height": 3, "fx": 2, "fy": 2}
+    entry |= {"position": [0, 0, 0], "rotation": np.eye(3).tolist()}
+    text = damage if isinstance(damage, str) else json.dumps([entry | damage])
     (tmp_path / "cameras.json").write_text(text)
     with pytest.raises(InputError, match=r"cameras\.json"):
         model_folder.read_cameras(tmp_path)
@@ -183,14 +160,19 @@ def test_prepare_creates_and_leaves_nothing_behind(tmp_path):
     model_folder.prepare_folder(folder)
 
 
+CLAIMING = """
+import sys
+from pathlib import Path
+from warp_splat.formats.model_folder import claimed
+with claimed(Path(sys.argv[1])):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+
+
 def test_a_folder_is_claimed_by_one_training(tmp_path):
     """Another process is refused while the block runs, and not any more once it has ended or was killed."""
-    program = (
-        "import sys; from pathlib import Path; from warp_splat.formats.model_folder import claimed\n"
-        f"with claimed(Path({str(tmp_path)!r})):\n    print('in', flush=True); sys.stdin.read()"
-    )
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", program], **pipes) as other:
+    with started("-c", CLAIMING, tmp_path, stdin=subprocess.PIPE) as other:
         assert other.stdout.readline() == "in\n"
         with pytest.raises(InputError, match="another training"), model_folder.claimed(tmp_path):
             pass
@@ -198,9 +180,6 @@ def test_a_folder_is_claimed_by_one_training(tmp_path):
     with model_folder.claimed(tmp_path):
         assert list(tmp_path.iterdir())
     assert not list(tmp_path.iterdir())
-
-
-def test_a_lock_that_is_no_file_is_refused(tmp_path):
     (tmp_path / ".lock").mkdir()
     with pytest.raises(InputError, match=r"\.lock: expected a file.*remove it"), model_folder.claimed(tmp_path):
         pass
@@ -227,7 +206,7 @@ def test_default_model_path_is_new_each_time():
 
 
 @pytest.mark.parametrize("mark", [False, True])
-def test_open_model(tmp_path, mark, monkeypatch, capsys):
+def test_open_model(tmp_path, mark, monkeypatch, fails):
     """cfg_args goes before the file's own mark of antialiasing, which goes before nothing; convert does likewise."""
     folder, target = tmp_path / "model", tmp_path / "a.spz"
     for iteration in (3, 20):
@@ -237,8 +216,7 @@ def test_open_model(tmp_path, mark, monkeypatch, capsys):
     assert model_folder.open_model(model_folder.ply_path(folder, 3))[::2] == (0, options)
     assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased == mark
     monkeypatch.chdir(write_colmap(tmp_path / "scene"))  # which it was not trained on
-    assert main(["render", "-m", str(folder)]) == 1
-    assert "name the scene with -s" in capsys.readouterr().err
+    assert "name the scene with -s" in fails("render", "-m", folder)
     model_folder.write_cfg_args(folder, {"antialiasing": not mark, "eval": False})
     assert model_folder.open_model(folder, 3)[::2] == (3, {"antialiasing": not mark, "eval": False})
     assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased != mark

@@ -4,27 +4,34 @@ import gc
 import itertools
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 import weakref
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from commands import python
 
 import warp_splat
 from warp_splat.runtime import launch, pool
 
-ROOT = Path(__file__).parents[1]
 NAMES = warp_splat.__all__
 
 
-def python(code):
-    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
+def test_version_on_the_command_line():
+    assert warp_splat.__version__ in python("-m", "warp_splat", "--version").stdout
+
+
+def test_ctrl_c_while_libraries_load():
+    code = (
+        "import signal, sys; from warp_splat import cli\n"
+        "cli.importlib.import_module = lambda name: signal.raise_signal(signal.SIGINT)\n"
+        "sys.exit(cli.main(['render']))"
+    )
+    run = python("-c", code, check=False)
+    assert run.returncode == 130 and run.stderr == "warp-splat: interrupted before it began.\n"
 
 
 def test_every_public_name_exists_after_any_other_import():
@@ -33,7 +40,7 @@ def test_every_public_name_exists_after_any_other_import():
     lines += [f"from warp_splat import {a}, {b}" for a, b in itertools.permutations(NAMES, 2)]
     lines += ["import types", f"names = {NAMES!r}"]
     lines += ["assert not any(isinstance(getattr(warp_splat, name), types.ModuleType) for name in names)"]
-    python("\n".join(lines))
+    python("-c", "\n".join(lines))
 
 
 def test_unknown_name():
@@ -42,22 +49,8 @@ def test_unknown_name():
 
 
 def test_import_is_light():
-    assert python("import sys, warp_splat; print({'torch', 'warp', 'numpy'} & set(sys.modules))").strip() == "set()"
-
-
-def test_version_on_the_command_line():
-    out = subprocess.run([sys.executable, "-m", "warp_splat", "--version"], check=True, capture_output=True, text=True)
-    assert warp_splat.__version__ in out.stdout
-
-
-def test_ctrl_c_while_libraries_load():
-    code = (
-        "import signal; from warp_splat import cli\n"
-        "cli.importlib.import_module = lambda name: signal.raise_signal(signal.SIGINT)\n"
-        "cli.main(['render'])"
-    )
-    run = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, cwd=ROOT)
-    assert run.returncode == 130 and run.stderr == "warp-splat: interrupted before it began.\n"
+    code = "import sys, warp_splat; print({'torch', 'warp', 'numpy'} & set(sys.modules))"
+    assert python("-c", code).stdout.strip() == "set()"
 
 
 def image(count=3000):
@@ -80,13 +73,12 @@ def test_a_forked_child_renders_too():
         "if child == 0: os._exit(0 if (image() == expected).all() else 1)\n"
         "sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT, timeout=120)
+    python("-c", code)
 
 
-def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
+def test_a_failing_launch_waits_for_its_helpers(monkeypatch, threads):
     """An error in one slice reaches the caller after the other slices have ended; what the caller held is free then."""
-    threads = pool.get_threads()
-    warp_splat.set_threads(2)
+    threads(2)
     image()
     running, held = [], []
 
@@ -107,14 +99,12 @@ def test_a_failing_launch_waits_for_its_helpers(monkeypatch):
         assert held[0]() is None, "it waits for the garbage collector"
     finally:
         gc.enable()
-        warp_splat.set_threads(threads)
     assert running
 
 
-def test_an_interrupted_launch_waits_for_its_helpers():
+def test_an_interrupted_launch_waits_for_its_helpers(threads):
     """Who is interrupted frees the tensors that helpers still write into."""
-    threads = pool.get_threads()
-    warp_splat.set_threads(2)
+    threads(2)
     image()  # a helper is there
     begun, ended = threading.Event(), []
 
@@ -133,7 +123,6 @@ def test_an_interrupted_launch_waits_for_its_helpers():
             pool._Job([partial(run, 0, 1), partial(run, 1, 2)]).share(helpers=1)
     finally:
         signal.signal(signal.SIGINT, before)
-        warp_splat.set_threads(threads)
     assert len(ended) == 1
 
 
@@ -143,10 +132,6 @@ def test_threads_must_be_a_positive_number(count):
         warp_splat.set_threads(count)
 
 
-def test_threads_may_be_a_whole_number_of_any_kind():
-    threads = warp_splat.get_threads()
-    try:
-        warp_splat.set_threads(np.int64(2))
-        assert warp_splat.get_threads() == 2 and type(warp_splat.get_threads()) is int
-    finally:
-        warp_splat.set_threads(threads)
+def test_threads_may_be_a_whole_number_of_any_kind(threads):
+    threads(np.int64(2))
+    assert warp_splat.get_threads() == 2 and type(warp_splat.get_threads()) is int

@@ -1,14 +1,24 @@
-"""Other systems and processors: what pip would install there, and, emulated, what the package computes there."""
+"""Other systems and processors: what pip installs there, the same bytes for each, and what trains without pycolmap."""
 
 import os
+import platform
 import shutil
 import subprocess
-import sys
-from pathlib import Path
 
+import numpy as np
 import pytest
+from commands import ROOT, python
+from numpy._core._multiarray_umath import __cpu_dispatch__ as dispatched
+from scene_files import write_colmap, write_transforms
+from test_scene_input import plain_photos
 
-ROOT = Path(__file__).parents[1]
+from warp_splat.config import SfmConfig
+from warp_splat.errors import InputError
+from warp_splat.inspect.subject import read_subject
+from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
+from warp_splat.sfm.command import sfm
+
 UV = os.environ.get("UV") or shutil.which("uv")  # `uv run` names itself
 PLATFORMS = {  # uv's name: whether there is a wheel of pycolmap
     "x86_64-manylinux_2_28": True,
@@ -37,8 +47,6 @@ prepare("cpu", 1)
 assert CORES == os.cpu_count() and peak_memory() is None and f"{CORES} cores" in machine()
 """
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
 
 @pytest.mark.slow
 @pytest.mark.skipif(UV is None, reason="uv resolves for other platforms")
@@ -55,7 +63,7 @@ def test_every_dependency_has_a_wheel(platform):
 
 
 def test_nothing_needs_glibc_or_proc():
-    subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=ROOT, check=True)
+    python("-c", ELSEWHERE)
 
 
 @pytest.mark.long
@@ -73,3 +81,113 @@ def test_emulated_arm_computes_the_same_bytes_in_vectors():
         assert {row[0] for row in hot} == set(vectors.HOT)
         for kernel, packed, scalar, *_ in hot:
             assert packed > scalar, (processor, kernel)
+
+
+#: What torch, NumPy, BLAS and the C library do on an old processor.
+OLD = {
+    "ATEN_CPU_CAPABILITY": "default",
+    "NPY_DISABLE_CPU_FEATURES": " ".join(dispatched),
+    "OPENBLAS_CORETYPE": "Nehalem",
+    "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F",
+}
+AVX2 = {"WARP_SPLAT_TARGET": "-target-cpu x86-64-v3", **OLD}
+PORTABLE = {"WARP_SPLAT_PORTABLE": "1"}
+SSE2 = {"WARP_SPLAT_TARGET": "-target-cpu x86-64", **PORTABLE, **OLD}
+
+
+def hashes(changes: dict[str, str], *arguments: str) -> list[str]:
+    """A line for each array, with its hash, in a process of this environment."""
+    said = python("benchmarks/processor_hashes.py", *arguments, **changes).stdout
+    return [line for line in said.splitlines() if line.endswith(")")]
+
+
+def test_a_misspelled_switch_is_refused():
+    done = python("-m", "warp_splat", "export-html", "a.ply", "a.html", check=False, WARP_SPLAT_PORTABLE="yes")
+    assert done.returncode == 1
+    assert done.stderr == (
+        "warp-splat: error: WARP_SPLAT_PORTABLE: expected 1, 0 or nothing in this environment variable, got 'yes'; "
+        "set it to one of them.\n"
+    )
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names processors of the x86-64 family")
+@pytest.mark.parametrize(
+    ("here", "there", "arguments"),
+    [
+        pytest.param({}, AVX2, "--adjoints manual --steps 50", marks=pytest.mark.slow, id="AVX2"),
+        pytest.param({}, AVX2, "--steps 300", marks=pytest.mark.long, id="AVX2, all of it"),
+        pytest.param(PORTABLE, SSE2, "--steps 300", marks=pytest.mark.long, id="SSE2"),
+        *(
+            pytest.param({}, AVX2, f"--steps 60 --options exposure={kind} vignetting", marks=pytest.mark.long, id=kind)
+            for kind in ("gain", "affine", "bilateral")
+        ),
+    ],
+)
+def test_same_bytes(here, there, arguments):
+    expected = hashes(here, *arguments.split())
+    assert len(expected) > 15
+    assert hashes(there, *arguments.split()) == expected
+
+
+HIDE = "import sys; sys.modules['pycolmap'] = None\n"  # then importing it raises ImportError
+TRAIN = "import sys; from warp_splat.cli import main; sys.exit(main(['train', '-m', *sys.argv[1:]]))"
+
+
+@pytest.fixture
+def missing(monkeypatch):
+    monkeypatch.setattr("warp_splat.scene.colmap_library.pycolmap", None)
+
+
+def test_the_embedded_scene_is_the_same_from_both_of_its_files(monkeypatch):
+    expected = load_scene(embedded_scene(), resolution=8, eval=True, report=str)
+    monkeypatch.setattr("warp_splat.scene.colmap_library.pycolmap", None)
+    found = load_scene(embedded_scene(), resolution=8, eval=True, report=str)
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.colors, expected.colors)
+    for ours, theirs in zip(found.train + found.test, expected.train + expected.test, strict=True):
+        assert ours.name == f"images/{theirs.name}"
+        np.testing.assert_array_equal(ours.image, theirs.image)
+        a, b = ours.camera, theirs.camera
+        assert (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy)
+        for name in ("rotation", "translation", "center"):  # of what kernels see, not a bit differs
+            np.testing.assert_array_equal(getattr(a, name).astype(np.float32), getattr(b, name).astype(np.float32))
+
+
+@pytest.mark.slow
+def test_the_embedded_scene_trains_to_the_same_bytes(tmp_path):
+    models = []
+    for name, code in (("with", TRAIN), ("without", HIDE + TRAIN)):
+        python("-c", code, tmp_path / name, *"--iterations 3 -r 8 --seed 1 --quiet".split())
+        models.append((tmp_path / name / "point_cloud" / "iteration_3" / "point_cloud.ply").read_bytes())
+    assert models[0] == models[1]
+
+
+def test_every_room_can_be_imported():
+    python("-c", f"{HIDE}import warp_splat.sfm.command, warp_splat.inspect.command, warp_splat.training.command")
+
+
+@pytest.mark.parametrize(
+    ("make", "run", "words"),
+    [
+        (write_colmap, lambda root: load_scene(root, report=str), ("COLMAP model", "sparse")),
+        (lambda root: write_transforms(root, k1=0.1), lambda root: load_scene(root, report=str), ("OPENCV", "frame 0")),
+        (plain_photos, lambda root: sfm(SfmConfig(str(root), str(root / "scene"))), ("warp-splat sfm",)),
+    ],
+    ids=["COLMAP", "distortion", "sfm"],
+)
+def test_what_needs_it_is_refused_by_name(make, run, words, tmp_path, missing):
+    make(tmp_path)
+    with pytest.raises(InputError) as caught:
+        run(tmp_path)
+    sentence = str(caught.value)
+    assert all(word in sentence for word in ("pycolmap", "Linux on ARM", *words))
+    assert sentence.endswith(".") and "\n" not in sentence and not (tmp_path / "scene").exists()
+
+
+def test_inspect_tells_it(tmp_path, missing):
+    _, findings = read_subject(write_colmap(tmp_path), "images")
+    assert ["pycolmap" in finding.text for finding in findings if finding.level == "error"] == [True]
+
+
+def test_transforms_with_pinholes_are_read(tmp_path, missing):
+    assert len(load_scene(write_transforms(tmp_path), report=str).train) == 2

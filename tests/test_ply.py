@@ -1,24 +1,19 @@
 """PLY files: bytes against the documented layout, other writers' files, damaged files, and full disks."""
 
 import struct
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import full_disk
+from splat_files import some_splats
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.ply import load_ply, save_ply, save_points
-from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.splats import SplatFile
 
 REST = {1: 0, 4: 9, 9: 24, 16: 45}
-
-
-def random_splats(count=7, coefficients=16, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = ((count, 3), (count, coefficients, 3), (count,), (count, 3), (count, 4))
-    return SplatArrays(*(rng.normal(size=shape).astype(np.float32) for shape in shapes))
 
 
 def reference_names(coefficients):
@@ -43,22 +38,10 @@ def packed(means, sh, opacities, scales, quats, comments=()):
     return data
 
 
-@contextmanager
-def full_disk(limit=100):
-    """Writes beyond ``limit`` bytes of a file fail, as the operating system reports it."""
-    resource = pytest.importorskip("resource")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 @pytest.mark.parametrize("coefficients", REST)
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_bytes_are_the_documented_layout(tmp_path, count, coefficients):
-    splats = random_splats(count, coefficients)
+    splats = some_splats(count, coefficients)
     save_ply(tmp_path / "a.ply", SplatFile(splats, antialiased=True))
     assert (tmp_path / "a.ply").read_bytes() == packed(*splats, comments=("SplatRenderMode: mip",))
     for before, after in zip(splats, load_ply(tmp_path / "a.ply").splats, strict=True):
@@ -67,15 +50,15 @@ def test_bytes_are_the_documented_layout(tmp_path, count, coefficients):
 
 
 def test_a_reader_that_knows_only_the_62_floats(tmp_path):
-    means, sh, opacities, scales, quats = random_splats()
-    save_ply(tmp_path / "a.ply", SplatFile(SplatArrays(means, sh, opacities, scales, quats)))
+    splats = some_splats(7)
+    save_ply(tmp_path / "a.ply", SplatFile(splats))
     body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)[1]
-    assert len(body) == 248 * len(means)
+    assert len(body) == 248 * 7
     rows = np.frombuffer(body, [(name, "<f4") for name in reference_names(16)])
     rest = np.stack([rows[f"f_rest_{index}"] for index in range(45)], axis=1)
-    np.testing.assert_array_equal(rest.reshape(-1, 3, 15), sh[:, 1:].transpose(0, 2, 1))
-    np.testing.assert_array_equal(rows["rot_0"], quats[:, 0])
-    np.testing.assert_array_equal(rows["opacity"], opacities)
+    np.testing.assert_array_equal(rest.reshape(-1, 3, 15), splats.sh[:, 1:].transpose(0, 2, 1))
+    np.testing.assert_array_equal(rows["rot_0"], splats.quats[:, 0])
+    np.testing.assert_array_equal(rows["opacity"], splats.opacities)
     assert not rows["nx"].any()
 
 
@@ -113,7 +96,7 @@ def foreign(kind, splats, first="", end="\n"):
 @pytest.mark.parametrize("first", ["", "camera"])
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_reads_by_name_in_any_order_without_normals(tmp_path, kind, first, end):
-    splats = random_splats(5, 4)
+    splats = some_splats(5, 4)
     (tmp_path / "b.ply").write_bytes(foreign(kind, splats, first, end))
     for before, after in zip(splats, load_ply(tmp_path / "b.ply").splats, strict=True):
         assert after.dtype == np.float32 and after.dtype.isnative
@@ -155,12 +138,11 @@ def test_bad_rows_of_a_text(tmp_path, rows):
 
 
 def test_rows_that_are_not_finite_are_left_out_and_counted(tmp_path):
-    means, sh, opacities, scales, quats = random_splats(6, 4)
-    sh[1, 3, 2], scales[4, 0] = np.nan, np.inf
-    save_ply(tmp_path / "a.ply", SplatFile(SplatArrays(means, sh, opacities, scales, quats)))
-    lines = []
+    splats, lines = some_splats(6, 4), []
+    splats.sh[1, 3, 2], splats.scales[4, 0] = np.nan, np.inf
+    save_ply(tmp_path / "a.ply", SplatFile(splats))
     loaded = load_ply(tmp_path / "a.ply", report=lines.append)
-    np.testing.assert_array_equal(loaded.splats.means, means[[0, 2, 3, 5]])
+    np.testing.assert_array_equal(loaded.splats.means, splats.means[[0, 2, 3, 5]])
     assert len(lines) == 1 and "2 of 6" in lines[0]
 
 
@@ -168,24 +150,14 @@ def test_points_are_as_the_reference_writes_them(tmp_path):
     points = np.array([[1.5, -2, 3], [4, 5, 6]])
     colors = np.array([[0, 128, 255], [1, 2, 3]], np.uint8)
     save_points(tmp_path / "input.ply", points, colors)
-    names = [
-        "float x",
-        "float y",
-        "float z",
-        "float nx",
-        "float ny",
-        "float nz",
-        "uchar red",
-        "uchar green",
-        "uchar blue",
-    ]
+    names = [f"float {name}" for name in "x y z nx ny nz".split()] + ["uchar red", "uchar green", "uchar blue"]
     header = ["ply", "format binary_little_endian 1.0", "element vertex 2", *(f"property {name}" for name in names)]
     rows = b"".join(struct.pack("<6f3B", *point, 0, 0, 0, *color) for point, color in zip(points, colors, strict=True))
     assert (tmp_path / "input.ply").read_bytes() == "\n".join([*header, "end_header", ""]).encode() + rows
 
 
 def test_every_cut_gives_one_sentence(tmp_path):
-    save_ply(tmp_path / "a.ply", SplatFile(random_splats(2, 1)))
+    save_ply(tmp_path / "a.ply", SplatFile(some_splats(2, 1)))
     data = (tmp_path / "a.ply").read_bytes()
     for length in range(len(data)):
         (tmp_path / "b.ply").write_bytes(data[:length])
@@ -224,7 +196,7 @@ def test_every_cut_gives_one_sentence(tmp_path):
     ],
 )
 def test_bad_headers(tmp_path, old, new, sentence):
-    save_ply(tmp_path / "a.ply", SplatFile(random_splats(3, 4)))
+    save_ply(tmp_path / "a.ply", SplatFile(some_splats(3, 4)))
     data = (tmp_path / "a.ply").read_bytes()
     assert old in data
     (tmp_path / "a.ply").write_bytes(data.replace(old, new, 1))
@@ -240,29 +212,32 @@ def test_a_count_that_lies_fails_at_once_in_a_text(tmp_path, count):
 
 
 def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        load_ply(tmp_path / "none.ply")
-    with pytest.raises(InputError, match="could not be read"):
-        load_ply(tmp_path)
+    for name, sentence in (("none.ply", "no such file"), ("", "could not be read")):
+        with pytest.raises(InputError, match=sentence):
+            load_ply(tmp_path / name)
 
 
-def test_shapes_are_checked(tmp_path):
-    means, sh, opacities, scales, quats = random_splats()
-    with pytest.raises(InputError, match="opacities: expected shape"):
-        save_ply(tmp_path / "a.ply", SplatFile(SplatArrays(means, sh, opacities[:, None], scales, quats)))
-    with pytest.raises(InputError, match="sh: expected shape"):
-        save_ply(tmp_path / "a.ply", SplatFile(SplatArrays(means, sh[:, :5], opacities, scales, quats)))
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda s: s._replace(opacities=s.opacities[:, None]), "opacities: expected shape"),
+        (lambda s: s._replace(sh=s.sh[:, :5]), "sh: expected shape"),
+    ],
+)
+def test_shapes_are_checked(tmp_path, change, sentence):
+    with pytest.raises(InputError, match=sentence):
+        save_ply(tmp_path / "a.ply", SplatFile(change(some_splats())))
     with pytest.raises(InputError, match="points, colors"):
-        save_points(tmp_path / "a.ply", means, means[:2])
+        save_points(tmp_path / "a.ply", some_splats().means, some_splats().means[:2])
     assert not list(tmp_path.iterdir())
 
 
 def test_full_disk_keeps_the_older_file(tmp_path):
     path = tmp_path / "a.ply"
-    save_ply(path, SplatFile(random_splats(seed=1)))
+    save_ply(path, SplatFile(some_splats(seed=1)))
     before = path.read_bytes()
     with full_disk(limit=1500), pytest.raises(InputError, match=r"a\.ply.*untouched"):
-        save_ply(path, SplatFile(random_splats(seed=2)))
+        save_ply(path, SplatFile(some_splats(seed=2)))
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
 
@@ -278,16 +253,14 @@ def test_atomic_write_removes_what_an_error_left(tmp_path, error):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_atomic_write_reports_a_full_device(tmp_path):
-    with pytest.raises(InputError, match="No space left"), atomic_write(tmp_path / "a.txt"):
-        with open("/dev/full", "w") as file:
-            file.write("text")
+    full = pytest.raises(InputError, match="No space left")
+    with full, atomic_write(tmp_path / "a.txt"), open("/dev/full", "w") as file:
+        file.write("text")
 
 
 def test_atomic_write_reports_a_file_in_the_way(tmp_path):
     (tmp_path / "file").write_text("a file, not a folder")
-    with (
-        pytest.raises(InputError, match="could not be written"),
-        atomic_write(tmp_path / "file" / "a.txt") as temporary,
-    ):
+    refused = pytest.raises(InputError, match="could not be written")
+    with refused, atomic_write(tmp_path / "file" / "a.txt") as temporary:
         temporary.write_text("text")
     assert (tmp_path / "file").read_text() == "a file, not a folder"

@@ -52,7 +52,7 @@ def leaves_of(scene):
 @functools.cache
 def truth(name, options):
     """Computed once per scene and options, in float64."""
-    scene = SCENES[name]()
+    scene = scenes.scene_of(name)
     leaves = leaves_of(scene.to("cpu", torch.float64))
     out = oracle.exact_render(
         *[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **for_oracle(options)
@@ -129,17 +129,6 @@ def check_gradients(gradients, expected):
     assert all(error < GRADIENT for error in errors.values()), errors
 
 
-@pytest.mark.parametrize("adjoint", ADJOINTS)
-@pytest.mark.parametrize("name", SCENES)
-def test_scene(name, adjoint, device, record_property):
-    out, gradients = run(name, device, adjoint=adjoint)
-    expected = truth(name, PLAIN)
-    record_property("fragile_pixels", int(expected.out.fragile.sum()))
-    check_image(out, expected.out)
-    check_culling(out, expected.out)
-    check_gradients(gradients, expected.gradients)
-
-
 VARIANTS = [
     ("degree2", RasterOptions(depth=True)),
     ("inside", RasterOptions(depth=True)),
@@ -150,9 +139,7 @@ VARIANTS = [
     ("subpixel", RasterOptions(antialiasing=True)),
     ("near_and_behind", RasterOptions(antialiasing=True)),
     ("off_center", RasterOptions(antialiasing=True, depth=True)),
-    ("degree3", RasterOptions(sh_degree=0)),
-    ("degree3", RasterOptions(sh_degree=1)),
-    ("degree3", RasterOptions(sh_degree=2)),
+    *(("degree3", RasterOptions(sh_degree=degree)) for degree in (0, 1, 2)),
     ("degree2", RasterOptions(sh_degree=3)),
     ("degree2", RasterOptions(projection="ellipsoid")),
     ("inside", RasterOptions(projection="ellipsoid", depth=True)),
@@ -160,9 +147,6 @@ VARIANTS = [
     ("off_center", RasterOptions(projection="ellipsoid", antialiasing=True)),
     ("near_and_behind", RasterOptions(projection="ellipsoid")),
     ("fisheye", RasterOptions(projection="unscented", antialiasing=True, depth=True)),
-    pytest.param("opencv", RasterOptions(projection="unscented"), marks=pytest.mark.long),
-    pytest.param("panorama", RasterOptions(projection="unscented"), marks=pytest.mark.long),
-    pytest.param("inside", RasterOptions(projection="unscented"), marks=pytest.mark.long),
     ("saturated", RasterOptions(alpha_max=0.999)),
     ("near_and_behind", RasterOptions(near=0.01, blur=0.1, antialiasing=True)),
     ("near_and_behind", RasterOptions(near=1.5, blur=1.0, projection="unscented")),
@@ -171,26 +155,27 @@ VARIANTS = [
     ("saturated", RasterOptions(alpha_min=1e-4, t_min=1e-2)),
     ("layers_4000", RasterOptions(alpha_min=0.0, t_min=0.0)),
     ("degree2", RasterOptions(exp_degree=6)),
-    pytest.param("degree2", RasterOptions(exp_degree=None), marks=pytest.mark.slow),
 ]
+IN_ALL_MODES = [VARIANTS[0], ("layers_4000", RasterOptions(alpha_min=0.0, t_min=0.0))]
+IN_ALL_MODES += [("opaque", RasterOptions(alpha_max=0.999))]
+LONG = [(name, RasterOptions(projection="unscented")) for name in ("opencv", "panorama", "inside")]
 
 
-@pytest.mark.parametrize(("name", "options"), VARIANTS, ids=str)
-def test_options(name, options, device):
-    check_options(name, options, device, "manual")
-
-
-@pytest.mark.parametrize("adjoint", ADJOINTS[1:])
 @pytest.mark.parametrize(
-    ("name", "options"), [VARIANTS[0], VARIANTS[-3], ("opaque", RasterOptions(alpha_max=0.999))], ids=str
+    ("name", "options", "adjoint"),
+    [
+        *((name, PLAIN, adjoint) for name in SCENES for adjoint in ADJOINTS),
+        *((name, options, "manual") for name, options in VARIANTS),
+        *((name, options, adjoint) for name, options in IN_ALL_MODES for adjoint in ADJOINTS[1:]),
+        pytest.param("degree2", RasterOptions(exp_degree=None), "manual", marks=pytest.mark.slow),
+        *(pytest.param(name, options, "manual", marks=pytest.mark.long) for name, options in LONG),
+    ],
+    ids=str,
 )
-def test_options_in_other_modes(name, options, adjoint, device):
-    check_options(name, options, device, adjoint)
-
-
-def check_options(name, options, device, adjoint):
+def test_scene(name, options, adjoint, device, record_property):
     out, gradients = run(name, device, options, adjoint)
     expected = truth(name, options)
+    record_property("fragile_pixels", int(expected.out.fragile.sum()))
     check_image(out, expected.out)
     check_culling(out, expected.out)
     check_gradients(gradients, expected.gradients)
@@ -229,8 +214,7 @@ def test_loop_cap(device):
     """Entries of the tile's list beyond ``max_steps`` are as if they were not there."""
     scene = SCENES["layers_4000"]().to(device)
     depths = torch.tensor(scene.camera.rotation[2], dtype=torch.float32, device=device) @ scene.means.T
-    nearest = depths.argsort()[:100]
-    few = {name: getattr(scene, name)[nearest] for name in PARAMETERS}
+    few = {name: getattr(scene, name)[depths.argsort()[:100]] for name in PARAMETERS}
     leaves = leaves_of(scene)
     capped = rasterize(scene, leaves, RasterOptions(max_steps=100))
     assert (capped.image - rasterize(scene, few).image).abs().max() < 1e-6

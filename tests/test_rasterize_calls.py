@@ -1,16 +1,21 @@
-"""Calls of the renderer: the same bits whatever the threads, several views, inputs of every kind."""
+"""Calls of the renderer: the same bits whatever the threads, several views, inputs of every kind; errors by name."""
 
+import math
+import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 import torch
 from scenes import PARAMETERS, SCENES
 from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, relative_error, run, truth
 
 import warp_splat
-from warp_splat import RasterOptions
+from warp_splat import InputError, RasterOptions
 from warp_splat.config import ADJOINTS
+from warp_splat.raster.drivers import CPU, CUDA, DRIVERS, using
 from warp_splat.training.loss import image_loss
 
 
@@ -20,21 +25,12 @@ def equal(first, second):
     return outputs and all(torch.equal(first[1][name], second[1][name]) for name in first[1])
 
 
-@pytest.mark.parametrize("name", ["dense_tile", "ties", "inside"])
-def test_bit_identical_between_runs(name, device):
-    assert equal(run(name, device), run(name, device))
-
-
-@pytest.mark.parametrize("name", ["dense_tile", "degree3"])
-def test_bit_identical_between_thread_counts(name, device):
-    results, threads = [], warp_splat.get_threads()
-    try:
-        for count in (1, 2):
-            warp_splat.set_threads(count)
-            results.append(run(name, device))
-    finally:
-        warp_splat.set_threads(threads)
-    assert equal(*results)
+@pytest.mark.parametrize("name", ["dense_tile", "ties", "inside", "degree3"])
+def test_bit_identical_between_runs_and_thread_counts(name, device, threads):
+    first = run(name, device)
+    for count in (1, 2):
+        threads(count)
+        assert equal(run(name, device), first)
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
@@ -88,20 +84,16 @@ def test_several_views_equal_separate_calls(device):
     assert warp_splat.rasterize_views(*gaussians, []) == []
 
 
-def test_sh_pair_equals_sh_tensor(device):
-    scene = SCENES["degree3"]().to(device)
+@pytest.mark.parametrize("name", ["degree3", "degree0"])
+def test_sh_pair_equals_sh_tensor(name, device):
+    scene = SCENES[name]().to(device)
     leaves = leaves_of(scene)
     pair = [leaves["sh"].detach()[:, :1].clone(), leaves["sh"].detach()[:, 1:].clone()]
     whole, parts = rasterize(scene, leaves), rasterize(scene, {"sh": [part.requires_grad_() for part in pair]})
     assert torch.equal(whole.image, parts.image)
     whole.image.square().sum().backward()
     parts.image.square().sum().backward()
-    assert torch.equal(leaves["sh"].grad, torch.cat([part.grad for part in pair], 1))
-
-
-def test_sh_pair_of_degree_0(device):
-    scene = SCENES["degree0"]().to(device)
-    assert torch.equal(rasterize(scene, {"sh": (scene.sh, scene.sh[:, :0])}).image, rasterize(scene).image)
+    assert torch.equal(leaves["sh"].grad, torch.cat([part.grad for part in pair if part.grad is not None], 1))
 
 
 def test_zero_gaussians(device):
@@ -143,34 +135,24 @@ def test_gradient_of_one_input_only(name, device):
     assert all(getattr(scene, other).grad is None for other in PARAMETERS)
 
 
-def test_no_gaussians_of_any_strides(device):
-    """Torch calls a tensor of nothing contiguous, whatever its strides."""
-    scene = SCENES["empty"]().to(device)
-    leaves = leaves_of(scene)
-    strided = leaves | {
-        "means": torch.zeros(0, 6, device=device)[:, ::2],
-        "quats": torch.zeros(0, 4, 2, device=device)[..., 0],
-        "sh": torch.zeros(0, 16, 6, device=device)[..., :3],
-    }
-    assert torch.equal(rasterize(scene, strided).image, rasterize(scene, leaves).image)
-
-
-def test_non_contiguous_inputs(device):
-    scene = SCENES["degree1"]().to(device)
+@pytest.mark.parametrize("name", ["degree1", "empty"])  # torch calls a tensor of nothing contiguous
+def test_inputs_of_any_strides(name, device):
+    scene = SCENES[name]().to(device)
     leaves, strided = leaves_of(scene), {}
-    for name in PARAMETERS:
-        padded = torch.stack([getattr(scene, name), torch.zeros_like(getattr(scene, name))], -1)
-        strided[name] = padded[..., 0].requires_grad_()
-        assert not strided[name].is_contiguous()
+    for key in PARAMETERS:
+        padded = torch.stack([getattr(scene, key), torch.zeros_like(getattr(scene, key))], -1)
+        strided[key] = padded[..., 0].requires_grad_()
+        assert strided[key].is_contiguous() == (name == "empty")
     first, second = rasterize(scene, leaves), rasterize(scene, strided)
     assert torch.equal(first.image, second.image)
     first.image.square().sum().backward()
     second.image.square().sum().backward()
-    assert all(torch.equal(leaves[name].grad, strided[name].grad) for name in PARAMETERS)
+    assert all(torch.equal(leaves[key].grad, strided[key].grad) for key in PARAMETERS)
 
 
+@pytest.mark.parametrize("driver", ["lanes", "blocks"])
 @pytest.mark.parametrize(("key", "value"), [("image", float("nan")), ("image", float("inf")), ("alpha", float("nan"))])
-def test_upstream_gradient_that_is_not_finite_drops_its_pixel(key, value, device):
+def test_upstream_gradient_that_is_not_finite_drops_its_pixel(key, value, driver, device):
     expected = truth("degree1", PLAIN)
     results = []
     for bad in (True, False):
@@ -180,8 +162,9 @@ def test_upstream_gradient_that_is_not_finite_drops_its_pixel(key, value, device
         if bad:
             upstream[key][5, 7] = value
         leaves = leaves_of(expected.scene.to(device))
-        out = rasterize(expected.scene, leaves)
-        torch.autograd.backward([out.image, out.alpha], [upstream["image"], upstream["alpha"]])
+        with using(CUDA) if driver == "blocks" else nullcontext():
+            out = rasterize(expected.scene, leaves)
+            torch.autograd.backward([out.image, out.alpha], [upstream["image"], upstream["alpha"]])
         results.append({name: leaf.grad for name, leaf in leaves.items()})
         assert out.dropped.pixels == (1 if bad else 0)
     assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
@@ -202,3 +185,144 @@ def test_quaternion_of_zero_norm_is_culled(device):
     for leaf in leaves.values():
         assert leaf.grad.isfinite().all()
     assert all(not leaves[name].grad[touched].any() for name in PARAMETERS)
+
+
+SCENE = scenes.cloud(0, 6, scenes.make_camera(20, 18), degree=1)
+
+
+def call(device, **changed):
+    """Rasterize a good scene with some arguments changed."""
+    arguments = {name: getattr(SCENE, name).to(device) for name in PARAMETERS} | {"camera": SCENE.camera}
+    for name, change in changed.items():
+        arguments[name] = change(arguments.get(name)) if callable(change) else change
+    return warp_splat.rasterize(**arguments)
+
+
+def test_memory_that_runs_out_is_explained(monkeypatch):
+    def failing(*arguments):
+        raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate much")
+
+    monkeypatch.setitem(DRIVERS, "cpu", replace(CPU, bin=failing))
+    explained = r"Out of memory on cpu in stage 'bin', with 6 Gaussians on 20 x 18 px; render"
+    with pytest.raises(InputError, match=explained):
+        call("cpu")
+
+
+def put(value, *index):
+    """A change: one element of a tensor."""
+
+    def change(tensor):
+        tensor = tensor.clone()
+        tensor[index] = value
+        return tensor
+
+    return change
+
+
+def options(**values):
+    return lambda _: RasterOptions(**values)
+
+
+SHAPES = [
+    ("means", lambda t: t[:, :2], "6, 2"),
+    ("means", lambda t: t[0], r"3,?[)\]]"),
+    ("means", lambda t: t.T, "3, 6"),
+    ("quats", lambda t: t[:, :3], "6, 3"),
+    ("scales", lambda t: t[:, :1], "6, 1"),
+    ("opacities", lambda t: t[:, None], "6, 1"),
+    ("sh", lambda t: t[:, 0], "6, 3"),
+    ("sh", lambda t: torch.zeros(6, 5, 3, device=t.device), "6, 5, 3|5"),
+    ("sh", lambda t: t[:, :0], "6, 0, 3|0"),
+    ("sh", lambda t: t[..., :2], "6, 4, 2"),
+    ("sh", lambda t: (t[:, :2], t[:, 2:]), "6, 2, 3"),
+    ("sh", lambda t: (t[:, :1], t[:, 1:3]), "6, 2, 3|3"),
+    ("sh", lambda t: (t[:, :1], t[:5, 1:]), "5, 3, 3|5"),
+    ("sh", lambda t: (t[:, :1], t[:, 1:2], t[:, 2:]), "3"),
+    ("means", lambda t: t.to_sparse(), "dense"),
+    ("sh", lambda t: t.to_sparse(), "dense"),
+    ("background", lambda _: (0, 0), "2"),
+    ("background", lambda _: torch.zeros(4), "4"),
+    ("background", lambda _: torch.zeros(1, 3), "1, 3"),
+]
+KINDS = [
+    (name, change, found)
+    for name in PARAMETERS
+    for change, found in [
+        *((lambda t, dtype=dtype: t.to(getattr(torch, dtype)), dtype) for dtype in ("float64", "float16", "int64")),
+        (lambda t: t.cpu().numpy(), "ndarray"),
+        (lambda t: t.tolist(), "list"),
+        (None, "None"),
+    ]
+]
+FINITE = "(?i:nan|inf|finite)"
+NUMBERS = [
+    ("scales", put(0.0, 3, 1), "0"),
+    ("scales", put(-0.25, 3, 1), "-0.25"),
+    ("opacities", put(-0.25, 3), "-0.25"),
+    ("opacities", put(1.25, 3), "1.25"),
+    ("opacities", put(1.0001, 3), "to 1.0001"),
+    *(
+        (name, put(value, 2) if name == "opacities" else put(value, 2, 1), FINITE)
+        for name in PARAMETERS
+        for value in (math.nan, math.inf, -math.inf)
+    ),
+    *(("background", lambda _, v=v: torch.tensor([0, v, 0]), FINITE) for v in (math.nan, math.inf, -math.inf)),
+]
+OTHERS = [
+    ("camera", SCENE.camera.resized(10**6, 10**6), "expected at most .* pixels, got 1000000 x 1000000"),
+    *(("camera", camera, type(camera).__name__) for camera in (None, {"width": 20}, np.eye(4))),
+    ("adjoint", "magic", "magic"),
+    ("adjoint", None, "None"),
+    ("options", {"depth": True}, "dict"),
+    *(
+        (
+            "options",
+            options(sh_degree=degree),
+            r"\.sh_degree: expected 0, 1, 2, 3 or None, got " + re.escape(repr(degree)),
+        )
+        for degree in (-1, 4, np.zeros(2), torch.ones(2), [1])
+    ),
+    ("options", options(alpha_max=1.0), r"\.alpha_max: expected a number from 0 to 0\.9999, got 1\.0\."),
+    ("options", options(near=0.0), r"\.near: expected a number from 1e-06 to 1e\+06, got 0\.0\."),
+    ("options", options(blur=math.nan), r"\.blur: expected a number from 1e-06 to 1e\+06, got nan\."),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "found"), [*SHAPES, *KINDS, *NUMBERS, *OTHERS])
+def test_what_is_found_is_said(name, change, found, device):
+    with pytest.raises(InputError, match=rf"(?s){name}.*({found})"):
+        call(device, **{name: change})
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_number_and_device_of_one_that_differs(name, device):
+    with pytest.raises(InputError, match=r"(?s)(means|quats|scales|opacities|sh).*5") as error:
+        call(device, **{name: lambda t: t[:5]})
+    assert "6" in str(error.value) and (name == "means" or name in str(error.value))
+    with pytest.raises(InputError, match=rf"(?s){name}.*meta") as error:
+        call(device, **{name: lambda t: t.to("meta")})
+    assert str(device).split(":", maxsplit=1)[0] in str(error.value)
+
+
+def test_ends_of_the_ranges_are_good(device):
+    out = call(device, opacities=lambda t: t.clone().fill_(1), scales=put(1e-30, 0, 0))
+    assert out.image.isfinite().all()
+    assert not call(device, opacities=lambda t: t.clone().fill_(0)).alpha.any()
+    rounded, exact = (call(device, opacities=lambda t, value=value: t.clone().fill_(value)) for value in (1.0000001, 1))
+    assert torch.allclose(rounded.image, exact.image, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "cameras", [SCENE.camera, None, iter(()), [SCENE.camera, None]], ids=["one", "None", "iterator", "list"]
+)
+def test_cameras(cameras, device):
+    found = "NoneType" if isinstance(cameras, list) else type(cameras).__name__
+    with pytest.raises(InputError, match=f"(?s)camera.*{found}"):
+        warp_splat.rasterize_views(*SCENE.to(device).parameters(), cameras)
+
+
+def test_bad_input_leaves_the_renderer_working(device):
+    before = call(device).image
+    with pytest.raises(InputError):
+        call(device, means=put(float("nan"), 0, 0))
+    assert torch.equal(before, call(device).image)

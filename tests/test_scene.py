@@ -1,24 +1,27 @@
 """Scene loading against files written by hand, analytic patterns and formulas that share nothing with the loader."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
+from commands import FOX, python
 from scene_files import (
     COLORS,
     HEIGHT,
     POINTS,
     WIDTH,
     change_json,
+    check_ideal,
+    distorted_picture,
+    field_of_view,
+    fisheye,
+    full_radial,
     load,
     pose,
     project,
+    radial,
     scale_axes,
     texture,
+    thin_prism,
     write_blender,
     write_colmap,
     write_image,
@@ -29,8 +32,6 @@ from warp_splat import InputError
 from warp_splat.scene.images import read_pixels, target_size
 from warp_splat.scene.types import visible
 
-ROOT = Path(__file__).resolve().parent.parent
-FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
 FOX_TEST = ["0001.jpg", "0012.jpg", "0027.jpg", "0042.jpg", "0073.jpg", "0089.jpg", "0110.jpg"]
 
 
@@ -136,39 +137,6 @@ def test_eval_holds_out_every_eighth(tmp_path, count):
 # undistortion ------------------------------------------------------------------------------------
 
 
-def radial(x, y, k1, k2=0.0, p1=0.0, p2=0.0):
-    """COLMAP's (and OpenCV's) radial and tangential distortion of normalized coordinates."""
-    r2 = x * x + y * y
-    factor = 1 + k1 * r2 + k2 * r2 * r2
-    dx = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    dy = 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    return x * factor + dx, y * factor + dy
-
-
-def fisheye(x, y, k1, k2, k3, k4):
-    """OpenCV's equidistant fisheye model."""
-    r = np.hypot(x, y)
-    t = np.arctan(r)
-    bent = t * (1 + k1 * t**2 + k2 * t**4 + k3 * t**6 + k4 * t**8)
-    return x * bent / r, y * bent / r
-
-
-def pattern(x, y):
-    """A smooth picture on the plane at depth 1, 0..1."""
-    return np.stack([0.5 + 0.4 * np.sin(9 * x), 0.5 + 0.4 * np.cos(8 * y), 0.5 + 0.4 * np.sin(6 * (x + y))], axis=-1)
-
-
-def distorted_picture(distort, params, width, height, fx, fy, cx, cy):
-    v, u = np.mgrid[:height, :width] + 0.5
-    goal = (u - cx) / fx, (v - cy) / fy
-    x, y = goal
-    for _ in range(200):  # the fixed point of x = x + goal - distort(x)
-        bent = distort(x, y, *params)
-        x, y = x + goal[0] - bent[0], y + goal[1] - bent[1]
-    np.testing.assert_allclose(distort(x, y, *params), goal, atol=1e-9)
-    return np.rint(pattern(x, y) * 65535).astype(np.uint16)
-
-
 @pytest.mark.parametrize("scale", [1, 2], ids=["same-size", "half-size"])
 @pytest.mark.parametrize(
     ("model", "distort", "focal", "params"),
@@ -177,24 +145,20 @@ def distorted_picture(distort, params, width, height, fx, fy, cx, cy):
         ("RADIAL", radial, (150, 150), (0.1, -0.03)),
         ("OPENCV", radial, (150, 156), (-0.15, 0.04, 0.002, -0.003)),
         ("OPENCV_FISHEYE", fisheye, (110, 112), (0.02, -0.01, 0.003, 0.0)),
+        ("FULL_OPENCV", full_radial, (150, 156), (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
+        ("SIMPLE_RADIAL_FISHEYE", fisheye, (150, 150), (0.02,)),
+        ("RADIAL_FISHEYE", fisheye, (150, 150), (0.02, -0.01)),
+        ("THIN_PRISM_FISHEYE", thin_prism, (150, 156), (0.02, -0.01, 0.002, 0.001, 0.003, 0.0, 0.004, -0.002)),
+        ("FOV", field_of_view, (150, 156), (0.4,)),
     ],
 )
 def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, focal, params, scale):
     width, height, cx, cy = 160, 120, 83.2, 58.6
-    focals = focal[:1] if "RADIAL" in model else focal
-    numbers = (width, height, *focals, cx, cy, *params)
-    k = np.array((*focal, cx, cy)) / scale
-    pixels = distorted_picture(distort, params, width // scale, height // scale, *k)
+    numbers = (width, height, *(focal[:1] if "RADIAL" in model else focal), cx, cy, *params)
+    pixels = distorted_picture(distort, params, width // scale, height // scale, *np.array((*focal, cx, cy)) / scale)
     root = write_colmap(tmp_path, ["a.png"], pixels, camera=" ".join(map(str, (model, *numbers))))
     scene, lines = load(root)
-    view = scene.train[0]
-    camera = view.camera
-    assert view.image.shape == (camera.height, camera.width, 3)
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    ideal = pattern((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy) * 255
-    error = np.abs(view.image - ideal)
-    assert error[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
-    assert error.max() < 3  # the outermost pixels may lie half a pixel outside of the file
+    check_ideal(scene.train[0])
     assert any(model in line for line in lines)
 
 
@@ -251,7 +215,7 @@ def test_sixteen_bits_survive_until_after_the_resize(tmp_path):
 def test_jpeg(tmp_path):
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     pixels = np.stack([x * 4, y * 6, 60 + x + y], axis=-1).astype(np.uint8)
-    write_model(tmp_path / "sparse" / "0", ["a.jpg"])
+    write_colmap(tmp_path, ["a.jpg"], pixels)
     write_image(tmp_path / "images" / "a.jpg", pixels, [("Compression", "jpeg:98"), ("Orientation", 6)])
     image = load(tmp_path)[0].train[0].image
     assert image.shape == pixels.shape  # as stored: not rotated by the orientation tag
@@ -333,22 +297,18 @@ def test_blender_axes_and_intrinsics(tmp_path):
 
 def test_blender_splits(tmp_path):
     root = write_blender(tmp_path, train=3, test=2)
+    names = [[f"{split}/r_{i}.png" for i in range(count)] for split, count in (("train", 3), ("test", 2))]
     scene, _ = load(root)
-    assert [view.name for view in scene.train] == [f"train/r_{i}.png" for i in range(3)] + [
-        f"test/r_{i}.png" for i in range(2)
-    ]
-    assert not scene.test
+    assert [view.name for view in scene.train] == [*names[0], *names[1]] and not scene.test
     scene, _ = load(root, eval=True)
-    assert [view.name for view in scene.test] == ["test/r_0.png", "test/r_1.png"]
-    assert len(scene.train) == 3
+    assert [[view.name for view in views] for views in (scene.train, scene.test)] == names
 
 
 def test_blender_without_test_file(tmp_path):
     root = write_blender(tmp_path, train=9, test=0)
     assert len(load(root)[0].train) == 9
     scene, lines = load(root, eval=True)
-    assert [view.name for view in scene.test] == ["train/r_0.png", "train/r_8.png"]
-    assert len(lines) == 1
+    assert [view.name for view in scene.test] == ["train/r_0.png", "train/r_8.png"] and len(lines) == 1
 
 
 def test_blender_points_and_background(tmp_path):
@@ -390,5 +350,4 @@ def test_fox():
 
 
 def test_import_stays_light():
-    code = "import sys, warp_splat.scene; sys.exit(any(name in sys.modules for name in ('pycolmap', 'OpenImageIO')))"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+    python("-c", "import sys, warp_splat.scene; sys.exit(not {'pycolmap', 'OpenImageIO'}.isdisjoint(sys.modules))")

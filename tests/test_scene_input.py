@@ -15,7 +15,6 @@ from scene_files import (
     write_blender,
     write_colmap,
     write_image,
-    write_model,
 )
 
 from warp_splat.errors import InputError
@@ -32,24 +31,44 @@ def replace(path, old, new):
     path.write_text(text.replace(old, new))
 
 
-def colmap_case(change, binary=False, **options):
+def colmap_case(change=lambda root: None, options=None, **written):
+    """Makes a COLMAP scene, and changes it; the options that it is loaded with."""
+
     def make(root):
-        write_colmap(root, binary=binary)
+        write_colmap(root, **written)
         change(root)
-        return root, options
+        return root, options or {}
 
     return make
 
 
-def model_case(file, change, binary=False):
-    return colmap_case(lambda root: change(root / "sparse" / "0" / file), binary)
+def model_case(file, change):
+    return colmap_case(lambda root: change(root / "sparse" / "0" / file), binary=file.endswith("bin"))
 
 
-def camera_case(camera):
+def image_case(change, names=("a.png", "b.png", "c.png")):
+    """The last of the photographs is changed."""
+    return colmap_case(lambda root: change(root / "images" / names[-1]), names=names)
+
+
+def file_case(name, text, source=""):
+    """A folder with one file that is text."""
+
     def make(root):
-        return write_colmap(root, camera=camera), {}
+        (root / name).write_text(text)
+        return root / source, {}
 
     return make
+
+
+def folder_case(name):
+    """A folder with one that is empty."""
+    return lambda root: ((root / name).mkdir() or root, {})
+
+
+def plain_photos(root):
+    write_image(root / "images" / "a.png", texture())
+    return root, {}
 
 
 def blender_case(change):
@@ -61,44 +80,18 @@ def blender_case(change):
 
 
 def frame_case(**values):
-    return blender_case(lambda content: content["frames"][1].update(values))
+    """Values of the second frame; None removes one."""
 
+    def change(content):
+        frame = content["frames"][1]
+        content["frames"][1] = {k: v for k, v in (frame | values).items() if v is not None}
 
-def plain_photos(root):
-    write_image(root / "images" / "a.png", texture())
-    return root, {}
-
-
-def cut_jpeg(root):
-    write_model(root / "sparse" / "0", ["a.jpg"])
-    write_image(root / "images" / "a.jpg", texture())
-    cut(root / "images" / "a.jpg", 0.7)
-    return root, {}
-
-
-def source_is_file(root):
-    (root / "scene.txt").write_text("x")
-    return root / "scene.txt", {}
-
-
-def blind_cameras(root):
-    """The axes of OpenGL in a COLMAP model: all points are behind the cameras."""
-    write_colmap(root, points=-2 * np.array([pose(i)[0].T @ pose(i)[1] for i in range(3)]))
-    return root, {}
+    return blender_case(change)
 
 
 def blind_blender(content):
     for frame in content["frames"]:
         frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag((1, -1, -1, 1))).tolist()
-
-
-def no_test_left(root):
-    return write_colmap(root, ["only.png"]), {"eval": True}
-
-
-def trained_model(root):
-    (root / "point_cloud").mkdir()
-    return root, {}
 
 
 def unknown_binary_model(path):
@@ -107,49 +100,50 @@ def unknown_binary_model(path):
     path.write_bytes(data)
 
 
-def image_only(path):
-    path.write_text("# no images\n")
-
-
+#: The axes of OpenGL in a COLMAP model: all points are behind the cameras.
+BEHIND = -2 * np.array([pose(i)[0].T @ pose(i)[1] for i in range(3)])
 BAD = {
     "no-source": (lambda root: (root / "nowhere", {}), ["nowhere", "found nothing"]),
-    "source-is-file": (source_is_file, ["scene.txt", "found a file"]),
+    "source-is-file": (file_case("scene.txt", "x", "scene.txt"), ["scene.txt", "found a file"]),
     "plain-photos": (
         plain_photos,
         ["model (sparse/), transforms_train.json or transforms.json", "1 photographs alone", "warp-splat sfm"],
     ),
-    "model": (trained_model, ["found a trained model", "folder of its scene"]),
-    "resolution-0": (colmap_case(lambda root: None, resolution=0), ["resolution", "got 0"]),
-    "resolution-absurd": (colmap_case(lambda root: None, resolution=1_000_000), [".png", "1000000", "-r"]),
-    "resolution-negative": (colmap_case(lambda root: None, resolution=-2), ["resolution", "got -2"]),
-    "eval-one-image": (no_test_left, ["at least 2 images", "found 1", "--eval"]),
-    "empty-sparse": (lambda root: ((root / "sparse").mkdir() or root, {}), ["sparse", "found none"]),
-    "no-images": (model_case("images.txt", image_only), ["sparse/0", "registered images"]),
-    "missing-file": (model_case("points3D.bin", Path.unlink, binary=True), ["sparse/0", "pycolmap cannot read"]),
+    "model": (folder_case("point_cloud"), ["found a trained model", "folder of its scene"]),
+    "resolution-0": (colmap_case(options={"resolution": 0}), ["resolution", "got 0"]),
+    "resolution-absurd": (colmap_case(options={"resolution": 1_000_000}), [".png", "1000000", "-r"]),
+    "resolution-negative": (colmap_case(options={"resolution": -2}), ["resolution", "got -2"]),
+    "eval-one-image": (
+        colmap_case(options={"eval": True}, names=["only.png"]),
+        ["at least 2 images", "found 1", "--eval"],
+    ),
+    "empty-sparse": (folder_case("sparse"), ["sparse", "found none"]),
+    "no-images": (
+        model_case("images.txt", lambda path: path.write_text("# none\n")),
+        ["sparse/0", "registered images"],
+    ),
+    "missing-file": (model_case("points3D.bin", Path.unlink), ["sparse/0", "pycolmap cannot read"]),
     "missing-images": (
         colmap_case(lambda root: [(root / "images" / name).unlink() for name in ("b.png", "c.png")]),
         ["images", "2 of them cannot be found", "'b.png'"],
     ),
-    "no-image-folder": (
-        colmap_case(lambda root: None, images="images_4"),
-        ["images_4", "3 of them cannot be found", "--images"],
-    ),
-    "cut-image": (colmap_case(lambda root: cut(root / "images" / "b.png", 0.5)), ["b.png", "complete image"]),
-    "cut-jpeg": (cut_jpeg, ["a.jpg", "complete image", "Premature end"]),
-    "empty-image": (colmap_case(lambda root: cut(root / "images" / "b.png", 0)), ["b.png", "complete image"]),
-    "not-an-image": (colmap_case(lambda root: (root / "images" / "b.png").write_text("hello")), ["b.png", "PNG"]),
+    "no-image-folder": (colmap_case(options={"images": "images_4"}), ["images_4", "3 of them cannot", "--images"]),
+    "cut-image": (image_case(lambda path: cut(path, 0.5)), ["c.png", "complete image"]),
+    "cut-jpeg": (image_case(lambda path: cut(path, 0.7), ["a.jpg"]), ["a.jpg", "complete image", "Premature end"]),
+    "empty-image": (image_case(lambda path: cut(path, 0)), ["c.png", "complete image"]),
+    "not-an-image": (image_case(lambda path: path.write_text("hello")), ["c.png", "PNG"]),
     "size": (
-        colmap_case(lambda root: write_image(root / "images" / "b.png", texture(HEIGHT, WIDTH))),
-        ["b.png", f"{WIDTH} x {HEIGHT}", f"{HEIGHT} x {WIDTH}"],
+        image_case(lambda path: write_image(path, texture(HEIGHT, WIDTH))),
+        ["c.png", f"{WIDTH} x {HEIGHT}", f"{HEIGHT} x {WIDTH}"],
     ),
-    "opengl-axes": (blind_cameras, ["none of the 3 training cameras", "axes are probably mixed up"]),
-    "cut-points": (model_case("points3D.bin", lambda path: cut(path, 0.7), binary=True), ["points3D.bin", "cut short"]),
-    "empty-points": (model_case("points3D.bin", lambda path: cut(path, 0), binary=True), ["points3D.bin", "0 bytes"]),
-    "cut-images": (model_case("images.bin", lambda path: cut(path, 0.7), binary=True), ["images.bin", "cut short"]),
-    "cut-cameras": (model_case("cameras.bin", lambda path: cut(path, 0.7), binary=True), ["cameras.bin", "cut short"]),
-    "cut-frames": (model_case("frames.bin", lambda path: cut(path, 0.7), binary=True), ["frames.bin", "cut short"]),
+    "opengl-axes": (colmap_case(points=BEHIND), ["none of the 3 training cameras", "axes are probably mixed up"]),
+    "empty-points": (model_case("points3D.bin", lambda path: cut(path, 0)), ["points3D.bin", "0 bytes"]),
+    **{
+        f"cut-{name}": (model_case(f"{name}.bin", lambda path: cut(path, 0.7)), [f"{name}.bin", "cut short"])
+        for name in ("points3D", "images", "cameras", "frames")
+    },
     "garbage-points": (
-        model_case("points3D.bin", lambda path: path.write_bytes(texture().tobytes()), binary=True),
+        model_case("points3D.bin", lambda path: path.write_bytes(texture().tobytes())),
         ["points3D.bin", "damaged"],
     ),
     "garbage-text": (model_case("points3D.txt", lambda path: path.write_text("hello you\n")), ["sparse/0", "pycolmap"]),
@@ -158,30 +152,24 @@ BAD = {
         ["sparse/0", "Camera model does not exist"],
     ),
     "unknown-model-binary": (
-        model_case("cameras.bin", unknown_binary_model, binary=True),
+        model_case("cameras.bin", unknown_binary_model),
         ["sparse/0", "Camera model does not exist"],
     ),
-    "panorama": (camera_case(f"EQUIRECTANGULAR {WIDTH} {HEIGHT} {WIDTH} {HEIGHT}"), ["a.png", "EQUIRECTANGULAR"]),
-    "focal": (camera_case(f"PINHOLE {WIDTH} {HEIGHT} 40 -44 20 15"), ["a.png", "fy", "-44"]),
-    "json": (
-        lambda root: ((root / "transforms_train.json").write_text('{"frames": ') and root, {}),
-        ["transforms_train.json", "expected JSON"],
+    "panorama": (
+        colmap_case(camera=f"EQUIRECTANGULAR {WIDTH} {HEIGHT} {WIDTH} {HEIGHT}"),
+        ["a.png", "EQUIRECTANGULAR"],
     ),
-    "json-list": (
-        lambda root: ((root / "transforms_train.json").write_text("[1]") and root, {}),
-        ["transforms_train.json", "key frames"],
-    ),
+    "focal": (colmap_case(camera=f"PINHOLE {WIDTH} {HEIGHT} 40 -44 20 15"), ["a.png", "fy", "-44"]),
+    "json": (file_case("transforms_train.json", '{"frames": '), ["transforms_train.json", "expected JSON"]),
+    "json-list": (file_case("transforms_train.json", "[1]"), ["transforms_train.json", "key frames"]),
     "angle-missing": (blender_case(lambda content: content.pop("camera_angle_x")), ["train.json", "camera_angle_x"]),
     "angle": (blender_case(lambda content: content.update(camera_angle_x=0)), ["train.json", "between 0 and pi"]),
     "frames-missing": (blender_case(lambda content: content.pop("frames")), ["train.json", "key frames"]),
     "frames-empty": (blender_case(lambda content: content.update(frames=[])), ["train.json", "at least one frame"]),
-    "path-missing": (blender_case(lambda content: content["frames"][1].pop("file_path")), ["frame 1", "file_path"]),
+    "path-missing": (frame_case(file_path=None), ["frame 1", "file_path"]),
     "path-number": (frame_case(file_path=3), ["frame 1", "string as file_path"]),
     "path-nowhere": (frame_case(file_path="train/r_9"), ["train.json", "1 of them cannot", "'train/r_9'"]),
-    "matrix-missing": (
-        blender_case(lambda content: content["frames"][0].pop("transform_matrix")),
-        ["train.json", "frame 0", "transform_matrix"],
-    ),
+    "matrix-missing": (frame_case(transform_matrix=None), ["train.json", "frame 1", "transform_matrix"]),
     "matrix-3x4": (frame_case(transform_matrix=np.eye(4)[:3].tolist()), ["frame 1", "4 x 4"]),
     "matrix-ragged": (frame_case(transform_matrix=[[1, 2], [3]]), ["frame 1", "4 x 4"]),
     "matrix-nan": (frame_case(transform_matrix=np.full((4, 4), np.nan).tolist()), ["frame 1", "finite"]),

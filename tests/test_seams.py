@@ -6,20 +6,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_checkpoints import begin, state_of, steps
-from test_distributed import Pretended
-from test_train import SCENE, fails, train
+from commands import SCENE, train
+from trainings import Pretended, begin, check_same, resumed, state_of
 
 from warp_splat.cli import main, parse
 from warp_splat.errors import InputError
 from warp_splat.flags import growing, learning
-from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.training.config_file import load_options, read_config, write_config
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import PARTS
-from warp_splat.training.record import keep, restore
+from warp_splat.training.record import keep
 from warp_splat.training.seams import Change, Entry, Verdict
 from warp_splat.training.trainer import Trainer
 
@@ -119,23 +117,14 @@ def _registered(monkeypatch):
     ids=str,
 )
 def test_own_ones_learn_and_resume_to_the_same_bytes(options, scene, tmp_path):
-    trainer, run = begin(scene, tmp_path, **options)
-    steps(trainer, run, 34)
-    expected, _ = state_of(trainer, run)
+    trainer, run = expected = resumed(scene, tmp_path, [34], **options)
+    state, _ = state_of(trainer, run)
     for name in ("parameters", "exp_avg", "exp_avg_sq", "gradients"):
-        assert expected[f"{name}.gain"][1] == (len(scene.train),)
+        assert state[f"{name}.gain"][1] == (len(scene.train),)
     gain = trainer.parts[-1]
     assert int(gain.steps) == 33 and int((gain.gains != 0).sum()) == 33  # one photograph in each step
-    trainer, run = begin(scene, tmp_path, **options)
-    for stop in (0, 11, 20):
-        steps(trainer, run, stop)
-        keep(trainer, run)
-        trainer, run = begin(scene, tmp_path, **options)
-        trainer.warm_up()
-        restore(trainer, run, load_checkpoint(tmp_path))
-    steps(trainer, run, 34)
-    found, _ = state_of(trainer, run)
-    assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
+    trainer, run = found = resumed(scene, tmp_path, [0, 11, 20, 34], **options)
+    check_same(found, expected)
     if options.get("growth"):
         assert int(trainer.growth.seen) == 34 and len(trainer.model) < len(scene.points)
 
@@ -158,7 +147,7 @@ def test_what_a_part_learns_is_adams_step_of_the_mean_gradient(scene, monkeypatc
         assert torch.allclose(gains.detach().double(), copy.detach(), rtol=5e-7, atol=1e-8) and gains.grad is None
 
 
-def test_flags_files_and_output_know_them(tmp_path, capsys):
+def test_flags_files_and_output_know_them(tmp_path, capsys, fails):
     """Of those that the scene does not need, the figure is told."""
     options = "--no-quiet --parts auto --growth faint --gain_lr 0.5 --iterations 12"
     assert train(tmp_path / "a", *options.split()) == 0
@@ -179,9 +168,9 @@ def test_flags_files_and_output_know_them(tmp_path, capsys):
     assert "--gain_lr FLOAT" in capsys.readouterr().out
     begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
     assert "--parts: expected auto, or some of random_background, sky, exposure, pose, depth, floaters, gain" in fails(
-        capsys, *begun, "--parts", "weather"
+        *begun, "--parts", "weather"
     )
-    assert "--growth: expected one of reference, budget, mcmc, faint" in fails(capsys, *begun, "--growth", "weather")
+    assert "--growth: expected one of reference, budget, mcmc, faint" in fails(*begun, "--growth", "weather")
 
 
 def test_neither_trainer_nor_command_line_knows_one_by_name():
@@ -193,7 +182,7 @@ def test_neither_trainer_nor_command_line_knows_one_by_name():
         assert found <= {"background", "depth"}  # a color and a plane, too
 
 
-def test_options_of_one_name_are_refused(monkeypatch, capsys):
+def test_options_of_one_name_are_refused(monkeypatch, fails):
     @dataclass(frozen=True)
     class OtherOptions:
         faint_below: float = growing(0.5, "of another growth")
@@ -202,7 +191,7 @@ def test_options_of_one_name_are_refused(monkeypatch, capsys):
     message = "--faint_below: expected one kind of options with it, found FaintOptions and OtherOptions; rename one."
     with pytest.raises(InputError, match=message):
         TrainConfig()
-    assert message in fails(capsys, "train")
+    assert message in fails("train")
 
 
 def test_growths_may_share_their_options(monkeypatch):

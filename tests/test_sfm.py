@@ -2,7 +2,6 @@
 
 import ctypes
 import json
-import os
 import re
 import shutil
 import signal
@@ -15,6 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 import room
+from commands import python, started
 from scene_files import texture, write_blender, write_image
 from scipy.ndimage import gaussian_filter
 
@@ -53,12 +53,7 @@ def start(photos, scene):
     """What shells start in the background ignores SIGINT, and passes that on; a handler is not passed on."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return subprocess.Popen(
-            [sys.executable, "-u", "-m", "warp_splat", "sfm", str(photos), str(scene)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        return started("-u", "-m", "warp_splat", "sfm", photos, scene, stderr=subprocess.STDOUT)
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -70,9 +65,7 @@ def test_the_cameras_are_found(photos, scene):
     found = np.array([view.camera.center for view in views])
     expected = np.array([truth[view.name] for view in views])
     fitted = pycolmap.estimate_sim3d(found, expected)
-    errors = np.linalg.norm(
-        [fitted * center - center_true for center, center_true in zip(found, expected, strict=True)]
-    )
+    errors = np.linalg.norm([fitted * one - other for one, other in zip(found, expected, strict=True)])
     assert errors.max() < 0.01  # the camera goes along 2 units
     for view in views:
         assert abs(view.camera.fx / room.FOCAL - 1) < 0.01 and abs(view.camera.fy / room.FOCAL - 1) < 0.01
@@ -153,56 +146,44 @@ def cannot(run, *words):
     with pytest.raises(InputError) as caught:
         run()
     sentence = str(caught.value)
-    assert sentence.endswith(".") and "\n" not in sentence
-    for word in words:
-        assert word in sentence
+    assert sentence.endswith(".") and "\n" not in sentence and all(word in sentence for word in words)
     return sentence
 
 
-def flat_photos(folder, count=4):
+def flat_photos(folder, count=4, keep=None):
+    """Photographs of one color each, or of each file its first bytes."""
     for index in range(count):
-        write_image(folder / f"{index}.png", np.full((64, 64, 3), 40 * index, np.uint8))
+        path = folder / f"{index}.png"
+        write_image(path, np.full((64, 64, 3), 40 * index, np.uint8))
+        path.write_bytes(path.read_bytes()[:keep])
 
 
-def nothing(folder):
-    folder.mkdir()
+def holding(*names):
+    """Makes a folder of files that are no photographs."""
+
+    def make(folder):
+        folder.mkdir()
+        for name in names:
+            (folder / name).write_bytes(b"x")
+
+    return make
 
 
-def heic(folder):
-    folder.mkdir()
-    (folder / "IMG_1.HEIC").write_bytes(b"x")
-
-
-def video_inside(folder):
-    folder.mkdir()
-    (folder / "a.mp4").write_bytes(b"x")
-
-
-def two_photos(folder):
-    flat_photos(folder, 2)
-
-
-def broken_photos(folder):
-    flat_photos(folder)
-    for path in folder.iterdir():
-        path.write_bytes(path.read_bytes()[:60])
-
-
-BAD_PHOTOS = {
-    "missing": (lambda folder: None, ["found nothing"]),
-    "a file": (lambda folder: folder.write_text("x"), ["expected a folder of photographs or a video"]),
-    "empty": (nothing, ["found none", "check the path"]),
-    "heic": (heic, ["IMG_1.HEIC", "convert"]),
-    "video inside": (video_inside, ["name the video itself", "a.mp4"]),
-    "two": (two_photos, ["at least 3 readable photographs", "found 2"]),
-    "broken": (broken_photos, ["at least 3 readable photographs", "found 0"]),
-    "without texture": (flat_photos, ["0 of 4 photographs could be registered", "overlap"]),
-}
-
-
-@pytest.mark.parametrize("case", BAD_PHOTOS)
-def test_bad_photographs_get_one_sentence(tmp_path, case):
-    make, words = BAD_PHOTOS[case]
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda folder: None, ["found nothing"]),
+        (lambda folder: folder.write_text("x"), ["expected a folder of photographs or a video"]),
+        (holding(), ["found none", "check the path"]),
+        (holding("IMG_1.HEIC"), ["IMG_1.HEIC", "convert"]),
+        (holding("a.mp4"), ["name the video itself", "a.mp4"]),
+        (lambda folder: flat_photos(folder, 2), ["at least 3 readable photographs", "found 2"]),
+        (lambda folder: flat_photos(folder, keep=60), ["at least 3 readable photographs", "found 0"]),
+        (flat_photos, ["0 of 4 photographs could be registered", "overlap"]),
+    ],
+    ids=["missing", "a file", "empty", "heic", "video inside", "two", "broken", "without texture"],
+)
+def test_bad_photographs_get_one_sentence(tmp_path, make, words):
     make(tmp_path / "photos")
     cannot(lambda: sfm(SfmConfig(str(tmp_path / "photos"), str(tmp_path / "scene"), quiet=True)), "photos", *words)
 
@@ -229,16 +210,13 @@ def test_a_damaged_database_gets_one_sentence(photos, scene, tmp_path):
 
 
 def test_training_on_photographs_alone_names_the_command(tmp_path, monkeypatch):
-    folder = tmp_path / "my photos"
+    folder, clip = tmp_path / "my photos", tmp_path / "clip.mp4"
     flat_photos(folder, 4)
-    sentence = cannot(lambda: load_scene(folder), "4 photographs alone", "--sfm")
-    assert f"`warp-splat sfm '{folder}' '{folder}_scene'`" in sentence
+    cannot(lambda: load_scene(folder), "4 photographs alone", "--sfm", f"`warp-splat sfm '{folder}' '{folder}_scene'`")
     monkeypatch.chdir(folder)
     cannot(lambda: load_scene("."), f"`warp-splat sfm . '{folder}_scene'`")
-    (tmp_path / "clip.mp4").write_bytes(b"x")
-    cannot(
-        lambda: load_scene(tmp_path / "clip.mp4"), "a video", f"sfm {tmp_path / 'clip.mp4'} {tmp_path / 'clip_scene'}"
-    )
+    clip.write_bytes(b"x")
+    cannot(lambda: load_scene(clip), "a video", f"sfm {clip} {tmp_path / 'clip_scene'}")
 
 
 def test_training_with_sfm_makes_the_scene_once(photos, capsys):
@@ -287,5 +265,4 @@ def test_png_files_can_be_written_after_pycolmap_was_loaded(tmp_path):
         "import sys, warp_splat.scene.colmap, numpy as np; from warp_splat.formats.png import save_png; "
         "save_png(sys.argv[1], np.zeros((8, 8, 3), np.uint8))"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], env=os.environ, check=False)
-    assert done.returncode == 0
+    python("-c", code, tmp_path / "a.png")

@@ -1,32 +1,31 @@
-"""The sky: what is saved is what training shows, who cannot carry it says so, and how much of it photographs show."""
+"""The sky: harmonics behind the Gaussians against float64; what is saved is what is shown; who cannot carry it."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from commands import SCENE
+from make_faults import beyond, make_faulty, sky_light
 from scipy.spatial.transform import Rotation
-from test_checkpoints import begin, steps
-from test_train import SCENE
+from trainings import begin, steps
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import to_srgb
+from warp_splat.compare.oracle import sh_basis
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path, read_environment
 from warp_splat.gaussians import GaussianModel
+from warp_splat.lenses import Lens
+from warp_splat.raster.behind import put_behind
+from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.rendering.command import make_picture
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import save_model
 from warp_splat.training.trial import weigh
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
-
-from make_faults import beyond, make_faulty, sky_light
 
 
 @pytest.fixture(scope="module")
@@ -123,3 +122,60 @@ def test_the_sky_that_is_made_up_is_one(tmp_path):
         is_sky = np.abs(after.image - 255 * to_srgb(light, np.where)).max(-1) < 3
         as_before = np.abs(after.image.astype(int) - before.image).max(-1) < 2
         assert np.mean(is_sky | as_before) > 0.97 and 0.02 < is_sky.mean() < 0.5
+
+
+FISHEYE = Lens("OPENCV_FISHEYE", (0.01, 0.0, 0.0, 0.0))
+
+
+def made(width, height, focal, lens=None):
+    """A camera, and image, alpha, harmonics and an upstream gradient."""
+    rotation, random = Rotation.from_rotvec([0.3, 0.9, -0.4]).as_matrix(), torch.Generator().manual_seed(1)
+    camera = Camera(width, height, focal, 1.1 * focal, 0.5 * width + 1, 0.5 * height - 2, rotation, np.ones(3), lens)
+    image, upstream = (torch.rand(height, width, 3, generator=random) for _ in range(2))
+    alpha = torch.rand(height, width, generator=random)
+    harmonics = 0.7 * torch.randn(16, 3, generator=random)
+    return camera, [leaf.requires_grad_() for leaf in (image, alpha, harmonics)], upstream
+
+
+def exact(camera, image, alpha, harmonics):
+    """In float64, by the oracle's harmonics."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = camera.rays(np.stack([x.ravel(), y.ravel()], 1))
+    seen = torch.from_numpy(np.isfinite(rays).all(1)).view(alpha.shape)
+    basis = sh_basis(torch.from_numpy(np.nan_to_num(rays) @ camera.rotation), 3)
+    colors = (0.5 + basis @ harmonics).clamp_min(0.0).view(image.shape)
+    return image + (seen * (1.0 - alpha))[..., None] * colors, seen
+
+
+@pytest.mark.parametrize("driver", [CPU, CUDA], ids=["lanes", "fibers"])
+@pytest.mark.parametrize(("size", "lens"), [((37, 31), None), ((5, 3), None), ((64, 48), FISHEYE)], ids=str)
+def test_image_and_gradients_are_those_of_float64(size, lens, driver):
+    """Some colors are cut to 0; the fisheye leaves corners unseen."""
+    camera, leaves, upstream = made(*size, 8.0, lens)
+    wide = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    expected, seen = exact(camera, *wide)
+    with using(driver):
+        found = put_behind(*leaves, camera)
+        gradients = torch.autograd.grad(found, leaves, upstream)
+    assert bool(seen.all()) == (lens is None)
+    torch.testing.assert_close(found.double(), expected, rtol=0.0, atol=3e-6)
+    for gradient, right in zip(gradients, torch.autograd.grad(expected, wide, upstream.double()), strict=True):
+        assert (gradient - right).norm() < 3e-6 * right.norm()
+
+
+def test_threads_change_nothing(threads):
+    (camera, leaves, upstream), found = made(211, 130, 90.0), []
+    for count in (1, 2, 3):
+        threads(count)
+        image = put_behind(*leaves, camera)
+        found.append([image, *torch.autograd.grad(image, leaves, upstream)])
+    assert all(map(torch.equal, found[0], found[1])) and all(map(torch.equal, found[0], found[2]))
+
+
+def test_a_pixel_that_is_not_finite_spoils_no_coefficient():
+    camera, leaves, upstream = made(37, 31, 8.0)
+    upstream[3, 4] = torch.inf
+    assert all(
+        torch.isfinite(gradient).all()
+        for gradient in torch.autograd.grad(put_behind(*leaves, camera), leaves[2:], upstream)
+    )

@@ -152,11 +152,7 @@ def parts(tmp_path):
         ("means", [], "no object 'means' in its meta.json"),
         ("means.files", ["means_l.webp"], "no name of image 1 of 'means'"),
         ("means.files", ["means_l.webp", "none.webp"], "no file 'none.webp' in it"),
-        (
-            "means.files",
-            ["means_l.webp", "shN_centroids.webp"],
-            "an image 'shN_centroids.webp' of 192x1 pixels|broadcast",
-        ),
+        ("means.files", ["means_l.webp", "shN_centroids.webp"], "'shN_centroids.webp' of 192x1 pixels|broadcast"),
         ("means.mins", [0, 1], "mins that are not 3 numbers"),
         ("means.mins", [0, 1, 10**400], "too large"),
         ("scales.codebook", [0.0] * 255, "codebook that are not 256 numbers"),
@@ -180,20 +176,21 @@ def test_what_meta_json_says_is_checked(tmp_path, way, value, sentence):
         load_gaussians(tmp_path / "b.sog")
 
 
+def scales(*shape, **options):
+    """An image in place of the scales'."""
+    return "scales.webp", webp_bytes(np.zeros(shape, np.uint8), **options)
+
+
 @pytest.mark.parametrize(
     ("name", "data", "sentence"),
     [
         ("scales.webp", None, "no file 'scales.webp' in it"),
         ("scales.webp", b"", "an image 'scales.webp' that is no WebP"),
-        ("scales.webp", webp_bytes(np.zeros((8, 4, 3), np.uint8))[:-9], "image 'scales.webp'"),
-        (
-            "scales.webp",
-            webp_bytes(np.zeros((4, 4, 3), np.uint8)),
-            "an image 'scales.webp' of 4x4 pixels, expected 8x4",
-        ),
-        ("scales.webp", webp_bytes(np.zeros((4, 8, 3), np.uint8), lossless=False), "whose compression changes values"),
-        ("scales.webp", webp_bytes(np.zeros((4, 8, 4), np.uint8), lossless=False), "whose compression changes values"),
-        ("scales.webp", webp_bytes(np.zeros((9000, 9000, 3), np.uint8)), "of 9000x9000 pixels, expected 8x4"),
+        ("scales.webp", scales(8, 4, 3)[1][:-9], "image 'scales.webp'"),
+        (*scales(4, 4, 3), "an image 'scales.webp' of 4x4 pixels, expected 8x4"),
+        (*scales(4, 8, 3, lossless=False), "whose compression changes values"),
+        (*scales(4, 8, 4, lossless=False), "whose compression changes values"),
+        (*scales(9000, 9000, 3), "of 9000x9000 pixels, expected 8x4"),
         ("meta.json", b"[]", "JSON that is no object"),
         ("meta.json", b"{", "damaged"),
         ("meta.json", b" " * 2**21, "'meta.json' expands to more than 1048576 bytes"),
@@ -202,12 +199,8 @@ def test_what_meta_json_says_is_checked(tmp_path, way, value, sentence):
 @pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_what_the_archive_holds_is_checked(tmp_path, name, data, sentence, compression):
     meta, files = parts(tmp_path)
-    if name == "meta.json":
-        meta = data
-    elif data is None:
-        del files[name]
-    else:
-        files[name] = data
+    meta, changed = (data, {}) if name == "meta.json" else (meta, {name: data})
+    files = {name: data for name, data in (files | changed).items() if data is not None}
     (tmp_path / "b.sog").write_bytes(sog_bytes(meta, files, compression))
     with pytest.raises(InputError, match=sentence):
         load_gaussians(tmp_path / "b.sog")

@@ -35,7 +35,7 @@ def small_truth():
 
 
 def broken(monkeypatch, change):
-    """The outcome of the ordinary case when ``change`` is done to the renderer's output."""
+    """The failures of the ordinary case when ``change`` is done to the renderer's output."""
     draw = verdict.draw_case
 
     def drawn(*arguments):
@@ -44,36 +44,17 @@ def broken(monkeypatch, change):
         return out
 
     monkeypatch.setattr(verdict, "draw_case", drawn)
-    return verdict.judge(small_truth(), "manual")
-
-
-def spoil(value):
-    """A change: something added to one pixel that is compared."""
-
-    def change(out):
-        line, column = (~small_truth().out.fragile).nonzero()[0].tolist()
-        image = out.image.clone()
-        image[line, column, 1] += value
-        out.image = image
-
-    return change
+    return verdict.judge(small_truth(), "manual").failures
 
 
 @pytest.mark.parametrize("value", [2e-4, float("nan"), float("inf")])
 def test_a_wrong_pixel_fails(monkeypatch, value):
-    assert broken(monkeypatch, spoil(value)).failures
+    def change(out):
+        line, column = (~small_truth().out.fragile).nonzero()[0].tolist()
+        out.image = out.image.clone()
+        out.image[line, column, 1] += value
 
-
-def test_a_wrong_gradient_fails(monkeypatch):
-    differentiate = verdict.gradients_by_name
-
-    def scaled(*arguments):
-        return {name: value * (1.001 if name == "scales" else 1) for name, value in differentiate(*arguments).items()}
-
-    truth = small_truth()
-    monkeypatch.setattr(verdict, "gradients_by_name", scaled)
-    failures = verdict.judge(truth, "manual").failures
-    assert len(failures) == 1 and "scales" in failures[0]
+    assert broken(monkeypatch, change)
 
 
 @pytest.mark.parametrize("name", ["invalid", "dropped"])
@@ -82,8 +63,19 @@ def test_a_wrong_count_fails(monkeypatch, name):
         out.invalid_count += name == "invalid"
         out.dropped.gaussian_count += name == "dropped"
 
-    failures = broken(monkeypatch, change).failures
+    failures = broken(monkeypatch, change)
     assert len(failures) == 1 and name in failures[0]
+
+
+def test_a_wrong_gradient_fails(monkeypatch):
+    differentiate, truth = verdict.gradients_by_name, small_truth()
+
+    def scaled(*arguments):
+        return {name: value * (1.001 if name == "scales" else 1) for name, value in differentiate(*arguments).items()}
+
+    monkeypatch.setattr(verdict, "gradients_by_name", scaled)
+    failures = verdict.judge(truth, "manual").failures
+    assert len(failures) == 1 and "scales" in failures[0]
 
 
 def test_a_gaussian_that_should_be_left_out_fails():

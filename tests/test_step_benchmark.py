@@ -1,12 +1,19 @@
 """What ``benchmarks/step.py``, ``savings.py`` and ``derivatives.py`` count and compare is right."""
 
-import sys
 from pathlib import Path
 
+import derivatives
+import gpu_steps
+import limits
+import made_up
 import numpy as np
 import pytest
+import savings
+import serial
+import step
 import torch
 import warp as wp
+import work
 
 from warp_splat import RasterOptions
 from warp_splat.config import ADJOINTS, ALPHA_MIN, T_MIN
@@ -15,24 +22,11 @@ from warp_splat.raster.project import project
 from warp_splat.runtime import launch, pool
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import derivatives  # noqa: E402
-import gpu_steps  # noqa: E402
-import limits  # noqa: E402
-import made_up  # noqa: E402
-import savings  # noqa: E402
-import serial  # noqa: E402
-import step  # noqa: E402
-import work  # noqa: E402
 
 
 @pytest.fixture
-def two_threads():
-    before = pool.get_threads()
-    pool.set_threads(2)
-    yield
-    pool.set_threads(before)
+def two_threads(threads):
+    threads(2)
 
 
 def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():

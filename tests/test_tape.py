@@ -11,7 +11,7 @@ import warp as wp
 from scenes import SCENES, cloud, make_camera
 
 import warp_splat
-from warp_splat import CameraParameters, InputError, RasterOptions, get_threads, set_threads, tape
+from warp_splat import CameraParameters, InputError, RasterOptions, tape
 from warp_splat.config import ADJOINTS
 from warp_splat.raster.drivers import CUDA, using
 
@@ -39,6 +39,16 @@ def scene_of(device, name="degree1"):
     camera = scene.camera
     weights = torch.randn(camera.height, camera.width, 4, generator=torch.Generator().manual_seed(0)).to(device)
     return scene, [camera.fx, camera.fy, camera.cx, camera.cy], weights
+
+
+def arrays_of(scene, **wanted):
+    """Warp arrays of a scene's Gaussians, by name; those ``wanted`` have a gradient."""
+    return {name: wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=name in wanted) for name in KINDS}
+
+
+def ones(image):
+    """The gradient of the sum of an image."""
+    return {image: wp.full_like(image, wp.vec3(1.0))}
 
 
 def by_torch(device, mode="manual", options=None):
@@ -93,29 +103,19 @@ def test_cuda_kernels_give_the_bits_of_torch_as_well():
     assert all(torch.equal(wp.to_torch(array.grad), grad) for array, grad in zip(arrays, gradients, strict=True))
 
 
-def test_two_ways_back_add_up_unless_the_tape_is_zeroed(device):
-    recorded, loss, arrays, out = on_tape(device)
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_two_ways_back_add_up_unless_the_tape_is_zeroed_and_inputs_may_change(mode, device):
+    recorded, loss, arrays, out = on_tape(device, mode)
     recorded.backward(loss)
     once = [array.grad.numpy().copy() for array in arrays]
     assert not out.image.grad.numpy().any(), "read and zeroed, as Warp's kernels do"
     recorded.zero()
     assert not any(array.grad.numpy().any() for array in arrays)
-    recorded.backward(loss)
-    assert all(np.array_equal(array.grad.numpy(), grad) for array, grad in zip(arrays, once, strict=True))
-    recorded.backward(loss)
-    assert all(np.array_equal(array.grad.numpy(), 2 * grad) for array, grad in zip(arrays, once, strict=True))
-
-
-@pytest.mark.parametrize("mode", ADJOINTS)
-def test_inputs_may_change_before_the_way_back(mode, device):
-    recorded, loss, arrays, _ = on_tape(device, mode)
-    recorded.backward(loss)
-    expected = [array.grad.numpy().copy() for array in arrays]
-    recorded.zero()
     for array in arrays:
         wp.to_torch(array, requires_grad=False).mul_(0.8)
-    recorded.backward(loss)
-    assert all(np.array_equal(array.grad.numpy(), grad) for array, grad in zip(arrays, expected, strict=True))
+    for times in (1, 2):
+        recorded.backward(loss)
+        assert all(np.array_equal(array.grad.numpy(), times * grad) for array, grad in zip(arrays, once, strict=True))
 
 
 def test_gradients_of_the_pixels_are_kept_where_that_is_asked_for(device):
@@ -125,37 +125,32 @@ def test_gradients_of_the_pixels_are_kept_where_that_is_asked_for(device):
     assert out.image.grad.numpy().any() and not out.alpha.grad.numpy().any()
 
 
-@pytest.mark.parametrize("wanted", range(5))
+@pytest.mark.parametrize("wanted", KINDS)
 def test_arrays_that_want_no_gradient(wanted, device):
     scene, _, _ = scene_of(device)
-    arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]
-    arrays[wanted].requires_grad = True
+    arrays = arrays_of(scene, **{wanted: True})
     with wp.Tape() as recorded:
-        out = tape.rasterize(*arrays, scene.camera)
-    recorded.backward(grads={out.image: wp.full_like(out.image, wp.vec3(1.0))})
-    assert [array.grad is not None and bool(array.grad.numpy().any()) for array in arrays] == [
-        index == wanted for index in range(5)
-    ]
+        out = tape.rasterize(**arrays, camera=scene.camera)
+    recorded.backward(grads=ones(out.image))
+    learned = {name for name, array in arrays.items() if array.grad is not None and array.grad.numpy().any()}
+    assert learned == {wanted}
 
 
 def test_features_alone_may_want_a_gradient(device):
     """What no gradient reaches, the image, is left alone; that of a sum of features is the weight of each Gaussian."""
     scene, _, _ = scene_of(device)
-    arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]
     features = wp.from_torch(torch.ones(len(scene.means), 1).to(device), requires_grad=True)
     with wp.Tape() as recorded:
-        out = tape.rasterize(*arrays, scene.camera, features=features)
+        out = tape.rasterize(**arrays_of(scene), camera=scene.camera, features=features)
     recorded.backward(grads={out.features: wp.full_like(out.features, 1.0)})
     assert features.grad.numpy().sum() == pytest.approx(out.alpha.numpy().sum(), rel=1e-4)
 
 
 def test_without_gradients_or_a_tape_nothing_is_recorded(device):
     scene, _, _ = scene_of(device)
-    arrays = [wp.from_torch(getattr(scene, name), KINDS[name], requires_grad=False) for name in KINDS]
     with wp.Tape() as recorded:
-        still = tape.rasterize(*arrays, scene.camera)
-    arrays[0].requires_grad = True
-    out = tape.rasterize(*arrays, scene.camera)
+        still = tape.rasterize(**arrays_of(scene), camera=scene.camera)
+    out = tape.rasterize(**arrays_of(scene, means=True), camera=scene.camera)
     assert not recorded.launches and out.image.grad is None
     assert np.array_equal(out.image.numpy(), still.image.numpy())
 
@@ -165,27 +160,22 @@ def test_warps_quaternions_have_w_last(device):
     gradients = []
     for turn, kind in ((0, wp.vec4), (-1, wp.quat)):
         quats = wp.from_torch(scene.quats.roll(turn, 1), kind, requires_grad=True)
-        others = [wp.from_torch(getattr(scene, name), KINDS[name]) for name in ("means", "scales", "opacities", "sh")]
         with wp.Tape() as recorded:
-            out = tape.rasterize(others[0], quats, *others[1:], scene.camera)
-        recorded.backward(grads={out.image: wp.full_like(out.image, wp.vec3(1.0))})
+            out = tape.rasterize(**arrays_of(scene) | {"quats": quats}, camera=scene.camera)
+        recorded.backward(grads=ones(out.image))
         gradients.append(wp.to_torch(quats.grad).roll(-turn, 1))
     assert gradients[0].any() and torch.equal(*gradients)
 
 
 @pytest.mark.parametrize("mode", ADJOINTS)
-def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mode, device, capfd):
+def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mode, device, threads, capfd):
     """Whatever threads take part: 6,000 Gaussians are enough to share every launch."""
     scene = cloud(3, 6000, make_camera(200, 150), degree=1).to(device)
     leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
-    before = get_threads()
-    set_threads(3)
-    try:
-        with wp.Tape() as recorded:
-            out = warp_splat.rasterize(*leaves, scene.camera, adjoint=mode)
-            out.image.sum().backward()
-    finally:
-        set_threads(before)
+    threads(3)
+    with wp.Tape() as recorded:
+        out = warp_splat.rasterize(*leaves, scene.camera, adjoint=mode)
+        out.image.sum().backward()
     assert not recorded.launches and leaves[0].grad.any()
     recorded.backward()
     assert "Warp" not in "".join(capfd.readouterr()).replace("Warp CUDA warning", "")
@@ -208,18 +198,20 @@ def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mod
 def test_bad_input(name, change, found):
     wp.init()  # where no other test has run before
     scene, _, _ = scene_of("cpu")
-    arrays = {key: wp.from_torch(getattr(scene, key), kind) for key, kind in KINDS.items()}
+    arrays = arrays_of(scene)
     with pytest.raises(InputError, match=found):
         tape.rasterize(**arrays | {name: change(arrays.get(name))}, camera=scene.camera)
 
 
 def test_no_gaussian_at_all(device):
+    wp.init()
     scene = SCENES["empty"]().to(device)
-    arrays = [wp.zeros(getattr(scene, name).shape[:2], dtype=KINDS[name], device=device) for name in ("sh",)]
-    arrays = [wp.zeros(0, dtype=KINDS[name], device=device, requires_grad=True) for name in list(KINDS)[:4]] + arrays
+    shapes = {name: getattr(scene, name).shape[: 2 if name == "sh" else 1] for name in KINDS}
+    kept = {"device": device, "requires_grad": True}
+    arrays = {name: wp.zeros(shape, dtype=KINDS[name], **kept) for name, shape in shapes.items()}
     with wp.Tape() as recorded:
-        out = tape.rasterize(*arrays, scene.camera)
-    recorded.backward(grads={out.image: wp.full_like(out.image, wp.vec3(1.0))})
+        out = tape.rasterize(**arrays, camera=scene.camera)
+    recorded.backward(grads=ones(out.image))
     assert not out.image.numpy().any()
 
 

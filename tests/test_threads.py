@@ -1,13 +1,12 @@
 """What the threads of the CPU share of torch's work is what one of them computes alone, bit for bit."""
 
 import hashlib
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from made_up import make_trainer
 
 from warp_splat import Camera, rasterize
 from warp_splat.gaussians import GaussianModel
@@ -20,22 +19,17 @@ from warp_splat.training.optimizer import EPS, Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.seams import Setting, Step
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-from made_up import make_trainer
-
 COUNT = 5003  # no multiple of what any processor computes at once
 
 
 @pytest.fixture(params=[1, 2, 3])
-def threads(request, monkeypatch):
+def threads(request, monkeypatch, threads):
     """So many of ours, and one of torch's: with more it shares its work by itself."""
-    before, of_torch = pool.get_threads(), torch.get_num_threads()
+    of_torch = torch.get_num_threads()
     monkeypatch.setattr(pool, "SMALLEST_OF_TORCH", 1024)
-    pool.set_threads(request.param)
+    threads(request.param)
     torch.set_num_threads(1)
     yield request.param
-    pool.set_threads(before)
     torch.set_num_threads(of_torch)
 
 

@@ -2,46 +2,26 @@
 
 import importlib
 import json
-import os
+import re
 import signal
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from commands import FOX, SCENE, SHORT, python, started, train
 from splat_files import some_file
 
 from warp_splat.cli import main
 from warp_splat.config import CORES
+from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.png import load_png
 from warp_splat.raster.drivers import CPU
-
-ROOT = Path(__file__).parents[1]
-SCENE = ROOT / "assets" / "still_life"
-FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
-#: Densifies, prunes, resets opacities and raises the SH degree within 60 steps.
-SHORT = (
-    "--eval -r 4 --iterations 60 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 55 "
-    "--opacity_reset_interval 30 --sh_interval 15 --densify_grad_threshold 0.00005 --quiet"
-).split()
-
-
-def train(folder, *options):
-    return main(["train", "-s", str(SCENE), "-m", str(folder), *SHORT, *options])
-
-
-def fails(capsys, *arguments):
-    """The one sentence of a failing command."""
-    assert main(list(arguments)) == 1
-    message = capsys.readouterr().err.strip()
-    assert message.startswith("warp-splat: error: ") and "Traceback" not in message
-    return message
+from warp_splat.training.loss import image_loss
 
 
 def learns(folder):
@@ -123,9 +103,8 @@ def test_orbit(trained, tmp_path, capsys):
 def test_one_seed_one_result_for_any_number_of_threads(trained, tmp_path):
     """Byte-identical PLY files: a second run, in a fresh process, with another number of threads."""
     digest = json.loads((trained / "results.json").read_text())["ours_60"]["sha256"]
-    options = ("--threads", str(1 + CORES % 2), "--verify", digest[:16])
-    command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *SHORT, *options]
-    subprocess.run(command, check=True, capture_output=True)
+    options = ("--threads", 1 + CORES % 2, "--verify", digest[:16])
+    python("train.py", "-s", SCENE, "-m", tmp_path, *SHORT, *options)
     assert ply_path(tmp_path, 60).read_bytes() == ply_path(trained, 60).read_bytes()
 
 
@@ -158,10 +137,8 @@ def test_options(options, tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_saves_the_model(tmp_path):
-    command = [sys.executable, ROOT / "train.py", "-s", SCENE, "-r", "8", "--eval", "-m", tmp_path]
-    command += ["--iterations", "100000"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def test_ctrl_c_saves_the_model_and_says_how_to_continue(tmp_path):
+    process = started("train.py", "-s", SCENE, "-r", "8", "--eval", "-m", tmp_path, "--iterations", "100000")
     for line in process.stderr:
         if "it/s" in line:
             break
@@ -171,7 +148,10 @@ def test_ctrl_c_saves_the_model(tmp_path):
     assert "Interrupted after" in out and "Traceback" not in err
     (saved,) = (tmp_path / "point_cloud").glob("*/point_cloud.ply")
     assert str(saved) in out and len(load_ply(saved).splats.means) >= 4500
-    assert f"{sys.executable} {ROOT / 'train.py'} --resume {tmp_path}\n" in out
+    reached, continued = re.search(r"^To continue after iteration (\d+): (.*)$", out, re.MULTILINE).groups()
+    assert continued == f"{sys.executable} train.py --resume {tmp_path}"
+    done = python(*continued.split()[1:], "--iterations", int(reached) + 5)
+    assert f"Done after {int(reached) + 5} iterations" in done.stdout
 
 
 def test_help_answers_without_torch_or_warp():
@@ -181,8 +161,7 @@ def test_help_answers_without_torch_or_warp():
         "except SystemExit as end: assert end.code == 0\n"
         "assert not {'torch', 'warp', 'numpy'} & set(sys.modules)"
     )
-    out = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
-    assert "--densify_grad_threshold" in out
+    assert "--densify_grad_threshold" in python("-c", code).stdout
 
 
 @pytest.mark.parametrize(
@@ -208,54 +187,52 @@ def test_help_answers_without_torch_or_warp():
     ],
     ids=" ".join,
 )
-def test_bad_options(options, words, tmp_path, capsys):
-    message = fails(capsys, "train", "-s", str(SCENE), "-m", str(tmp_path / "model"), *options)
+def test_bad_options(options, words, tmp_path, fails):
+    message = fails("train", "-s", str(SCENE), "-m", str(tmp_path / "model"), *options)
     assert all(word in message for word in words)
     assert not (tmp_path / "model").exists()
 
 
-def test_output_folder_that_cannot_be_written(tmp_path, capsys):
+def test_output_folder_that_cannot_be_written(tmp_path, fails):
     (tmp_path / "file").write_text("in the way")
     for scene in (SCENE, tmp_path / "no scene"):  # said before the scene is loaded
-        message = fails(capsys, "train", "-s", str(scene), "-m", str(tmp_path / "file" / "model"))
+        message = fails("train", "-s", str(scene), "-m", str(tmp_path / "file" / "model"))
         assert f"{tmp_path / 'file'} is a file" in message
 
 
-def test_a_folder_that_holds_a_model_is_left_alone(trained, capsys):
+def test_a_folder_that_holds_a_model_is_left_alone(trained, fails):
     before = (trained / "cfg_args").read_bytes()
-    message = fails(capsys, "train", "-s", str(SCENE), "-m", str(trained), "--iterations", "5")
+    message = fails("train", "-s", str(SCENE), "-m", str(trained), "--iterations", "5")
     assert "already holds" in message and (trained / "cfg_args").read_bytes() == before
 
 
-def test_render_without_a_model(tmp_path, capsys):
-    assert "-m" in fails(capsys, "render")
-    assert str(tmp_path) in fails(capsys, "render", "-m", str(tmp_path))
-    assert "nope: expected the folder of a trained model" in fails(capsys, "render", "-m", str(tmp_path / "nope"))
+def test_render_without_a_model(tmp_path, fails):
+    assert "-m" in fails("render")
+    assert str(tmp_path) in fails("render", "-m", str(tmp_path))
+    assert "nope: expected the folder of a trained model" in fails("render", "-m", str(tmp_path / "nope"))
 
 
-def test_films_that_cannot_be(tmp_path, capsys):
+def test_films_that_cannot_be(tmp_path, fails):
     for name, count in (("empty.ply", 0), ("full.ply", 5)):
         save_gaussians(tmp_path / name, some_file(count))
     film = ("-s", str(SCENE), "--video", "path", "--frames", "2")
-    assert "at least one Gaussian to film" in fails(capsys, "render", "-m", str(tmp_path / "empty.ply"), *film)
+    assert "at least one Gaussian to film" in fails("render", "-m", str(tmp_path / "empty.ply"), *film)
     output = ("--video_output", str(tmp_path / "full.ply" / "a.mp4"))
-    sentence = fails(capsys, "render", "-m", str(tmp_path / "full.ply"), *film, *output)
+    sentence = fails("render", "-m", str(tmp_path / "full.ply"), *film, *output)
     assert "full.ply: expected a folder that can be written" in sentence
+
+
+def no_space(path, *_):
+    raise InputError(f"{path}: could not be written (no space left on device).")
 
 
 def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, capsys):
     """The save fails; the model goes to the folder for temporary files instead."""
-    from warp_splat import gaussians  # noqa: PLC0415
-    from warp_splat.errors import InputError  # noqa: PLC0415
-
-    save = gaussians.save_gaussians
 
     def full(path, *arrays, **options):
-        if "point_cloud" in str(path):
-            raise InputError(f"{path}: could not be written (no space left on device).")
-        save(path, *arrays, **options)
+        (no_space if "point_cloud" in str(path) else save_gaussians)(path, *arrays, **options)
 
-    monkeypatch.setattr(gaussians, "save_gaussians", full)
+    monkeypatch.setattr("warp_splat.gaussians.save_gaussians", full)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert train(tmp_path / "model", "--iterations", "5", "--antialiasing") == 1
     (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
@@ -264,14 +241,9 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
 
 
 def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, capsys):
-    from warp_splat.errors import InputError  # noqa: PLC0415
-    from warp_splat.training import loop as module  # noqa: PLC0415
-
-    def full(path, image):
-        raise InputError(f"{path}: could not be written (no space left on device).")
-
-    monkeypatch.setattr(module, "save_png", full)
-    monkeypatch.setattr(module.Trainer, "warm_up", lambda self: (tmp_path / "point_cloud").write_text("in the way"))
+    monkeypatch.setattr("warp_splat.training.loop.save_png", no_space)
+    warm_up = lambda self: (tmp_path / "point_cloud").write_text("in the way")  # noqa: E731
+    monkeypatch.setattr("warp_splat.training.loop.Trainer.warm_up", warm_up)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "spare"))
     (tmp_path / "spare").mkdir()
     assert train(tmp_path, "--save_iterations", "20", "--iterations", "25") == 1
@@ -298,10 +270,11 @@ def fail_at(monkeypatch, target, call, error):
         monkeypatch.setattr(target, failing)
 
 
+LOSS = "warp_splat.training.trainer.image_loss"
+
+
 def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
-    fail_at(
-        monkeypatch, "warp_splat.training.trainer.image_loss", 11, RuntimeError("planted")
-    )  # the first call warms up
+    fail_at(monkeypatch, LOSS, 11, RuntimeError("planted"))  # the first call warms up
     with pytest.raises(RuntimeError, match="planted"):
         train(tmp_path)
     assert len(load_ply(ply_path(tmp_path, 9)).splats.means) == 4500
@@ -313,16 +286,10 @@ def test_an_error_while_training_saves_the_model_first(tmp_path, monkeypatch):
         ("driver.bin", MemoryError(), "in stage 'bin'"),
         ("driver.bin", RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), "'bin'"),
         ("driver.adjoint", torch.OutOfMemoryError("CUDA out of memory."), "'adjoint of blend'"),
-        (
-            "warp_splat.training.trainer.image_loss",
-            RuntimeError("[enforce fail] . not enough memory: you"),
-            "between two stages",
-        ),
+        (LOSS, RuntimeError("[enforce fail] . not enough memory: you"), "between two stages"),
     ],
 )
-def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
-    target, error, where, tmp_path, monkeypatch, capsys
-):
+def test_memory_that_runs_out_is_explained_once_the_model_is_saved(target, error, where, tmp_path, monkeypatch, capsys):
     fail_at(monkeypatch, target, 6, error)  # of steps one to three there is an evaluation of seven views
     assert train(tmp_path) == 1
     text = capsys.readouterr()
@@ -339,9 +306,9 @@ def test_memory_that_runs_out_is_explained_after_the_model_was_saved(
         (("--orbit",), RuntimeError("Failed to allocate 8 bytes on device 'cuda:0'"), ("'bin'", " on 980 x 545 px;")),
     ],
 )
-def test_memory_that_runs_out_while_rendering_is_explained(options, error, words, trained, monkeypatch, capsys):
+def test_memory_that_runs_out_while_rendering_is_explained(options, error, words, trained, monkeypatch, fails):
     fail_at(monkeypatch, "driver.bin", 3, error)
-    message = fails(capsys, "render", "-m", str(trained), *options)
+    message = fails("render", "-m", str(trained), *options)
     count = len(load_ply(ply_path(trained, 60)).splats.means)
     assert all(word in message for word in (*words, f"Out of memory on cpu in stage 'bin', with {count} Gaussians"))
     assert "--max_gaussians" in message and "\n" not in message
@@ -349,17 +316,15 @@ def test_memory_that_runs_out_while_rendering_is_explained(options, error, words
 
 def test_gradients_that_are_not_finite_are_dropped_and_reported(tmp_path, monkeypatch, capsys):
     """NaN from the loss in one pixel of one step: the run goes on and says so at its end."""
-    from warp_splat.training import trainer  # noqa: PLC0415
-
-    loss, steps = trainer.image_loss, []
+    steps = []
 
     def poisoned(image, *arguments, **options):
         steps.append(0)
         if len(steps) == 20 and image.requires_grad:
             image.register_hook(lambda grad: grad.index_fill(0, torch.tensor([3]), float("nan")))
-        return loss(image, *arguments, **options)
+        return image_loss(image, *arguments, **options)
 
-    monkeypatch.setattr(trainer, "image_loss", poisoned)
+    monkeypatch.setattr(LOSS, poisoned)
     assert train(tmp_path, "--iterations", "25") == 0
     assert "66 pixels" in capsys.readouterr().out
     assert json.loads((tmp_path / "results.json").read_text())["ours_25"]["dropped"]["pixels"] == 66

@@ -1,7 +1,5 @@
 """Cameras in JSON, and lenses: against formulas that share nothing with the loader."""
 
-import json
-
 import numpy as np
 import pytest
 from scene_files import (
@@ -10,13 +8,17 @@ from scene_files import (
     LENS,
     POINTS,
     WIDTH,
+    change_json,
+    check_ideal,
+    distorted_picture,
+    fisheye,
+    full_radial,
     load,
     project,
+    radial,
     texture,
-    write_colmap,
     write_transforms,
 )
-from test_scene import distorted_picture, fisheye, pattern, radial
 
 from warp_splat import InputError, Lens
 from warp_splat.inspect.subject import read_subject
@@ -61,66 +63,34 @@ def test_transforms_with_lists_of_names(tmp_path):
     assert [view.name for view in scene.test] == names[2:4]
 
 
-def full_radial(x, y, k1, k2, p1, p2, k3, k4=0.0, k5=0.0, k6=0.0):
-    """OpenCV's rational model."""
-    r2 = x * x + y * y
-    factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    return (
-        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-    )
-
-
-def thin_prism(x, y, k1, k2, p1, p2, k3, k4, s1, s2):
-    """Weng et al. 1992 on the angles of a fisheye, in COLMAP's order of the parameters."""
-    x, y = fisheye(x, y, 0.0, 0.0, 0.0, 0.0)
-    dx, dy = full_radial(x, y, k1, k2, p1, p2, k3)
-    r2 = x * x + y * y
-    return dx + x * k4 * r2**4 + s1 * r2, dy + y * k4 * r2**4 + s2 * r2
-
-
-def field_of_view(x, y, omega):
-    """Devernay and Faugeras 2001."""
-    r = np.hypot(x, y)
-    factor = np.arctan(2 * r * np.tan(omega / 2)) / (r * omega)
-    return x * factor, y * factor
-
-
-def check_ideal(view):
-    camera = view.camera
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    ideal = pattern((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy) * 255
-    assert view.image.shape == ideal.shape
-    assert np.abs(view.image - ideal)[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
+K = ("k1", "k2", "p1", "p2", "k3")
 
 
 @pytest.mark.parametrize(
-    ("model", "distort", "params", "values"),
+    ("model", "distort", "params", "keys"),
     [
-        ("OPENCV", radial, (-0.15, 0.04, 0.002, -0.003), {"k1": -0.15, "k2": 0.04, "p1": 0.002, "p2": -0.003}),
-        ("OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01), {}),
-        ("OPENCV_FISHEYE", fisheye, (0.02, -0.01, 0.003, 0.0), {}),
+        ("OPENCV", radial, (-0.15, 0.04, 0.002, -0.003), K[:4]),
+        ("OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01), K),
+        ("OPENCV_FISHEYE", fisheye, (0.02, -0.01, 0.003, 0.0), ("k1", "k2", "k3", "k4")),
     ],
 )
-def test_transforms_with_distortion(tmp_path, model, distort, params, values):
-    width, height, lens = 160, 120, (150, 156, 83.2, 58.6)
-    keys = ("k1", "k2", "p1", "p2", "k3") if distort is full_radial else ("k1", "k2", "k3", "k4")
-    values = {**(values or dict(zip(keys, params, strict=True))), "camera_model": model}
-    values |= dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), (width, height, *lens), strict=True))
-    pixels = distorted_picture(distort, params, width, height, *lens)
+def test_transforms_with_distortion(tmp_path, model, distort, params, keys):
+    lens = (160, 120, 150, 156, 83.2, 58.6)
+    values = dict(zip((*LENS, *keys), (*lens, *params), strict=True)) | {"camera_model": model}
+    pixels = distorted_picture(distort, params, *lens)
     scene, lines = load(write_transforms(tmp_path, ["a.png"], pixels, **values))
     check_ideal(scene.train[0])
     assert len(lines) == 1 and "Undistorting 1 of 1" in lines[0]
+
+
+FEW = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003}
 
 
 @pytest.mark.parametrize(
     ("values", "lens"),
     [
         ({"k1": -0.15, "k2": 0.04, "p1": 0.002, "p2": -0.003}, Lens("OPENCV", (-0.15, 0.04, 0.002, -0.003))),
-        (
-            {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003},
-            Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, 0)),
-        ),
+        (FEW, Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, 0))),
         ({"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32}, Lens("EQUIRECTANGULAR")),
     ],
 )
@@ -134,33 +104,11 @@ def test_native_lenses_keep_the_pixels(tmp_path, values, lens):
     assert lines[0].startswith(f"Keeping 1 of 1 images as their lenses show them (models: {lens.model})")
 
 
-@pytest.mark.parametrize(
-    ("model", "distort", "params"),
-    [
-        ("FULL_OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
-        ("SIMPLE_RADIAL_FISHEYE", fisheye, (0.02,)),
-        ("RADIAL_FISHEYE", fisheye, (0.02, -0.01)),
-        ("THIN_PRISM_FISHEYE", thin_prism, (0.02, -0.01, 0.002, 0.001, 0.003, 0.0, 0.004, -0.002)),
-        ("FOV", field_of_view, (0.4,)),
-    ],
-)
-def test_other_models_of_colmap(tmp_path, model, distort, params):
-    fx, fy, cx, cy = (150, 150 if "RADIAL" in model else 156, 83.2, 58.6)
-    focal = (fx,) if "RADIAL" in model else (fx, fy)
-    bent = (*params, *[0.0] * (4 - len(params))) if distort is fisheye else params
-    pixels = distorted_picture(distort, bent, 160, 120, fx, fy, cx, cy)
-    numbers = " ".join(map(str, (model, 160, 120, *focal, cx, cy, *params)))
-    scene, lines = load(write_colmap(tmp_path, ["a.png"], pixels, camera=numbers))
-    check_ideal(scene.train[0])
-    assert model in lines[0]
-
-
 def test_a_photograph_with_two_frames_counts_once(tmp_path):
     names = [f"images/{letter}.png" for letter in "abcdefghi"]
     root = write_transforms(tmp_path / "a", names)
-    content = json.loads((root / "transforms.json").read_text())
-    content["frames"] += [{**content["frames"][1], "file_path": "./images/a"}, content["frames"][8]]
-    (root / "transforms.json").write_text(json.dumps(content))
+    again = lambda frames: frames.extend([{**frames[1], "file_path": "./images/a"}, frames[8]])  # noqa: E731
+    change_json(root, lambda content: again(content["frames"]), "transforms.json")
     scene, lines = load(root, eval=True)
     assert [view.name for view in scene.test] == [names[0], names[8]]
     assert [view.name for view in scene.train] == names[1:8]
@@ -169,23 +117,24 @@ def test_a_photograph_with_two_frames_counts_once(tmp_path):
     assert found == ["training would accept this scene.", lines[0]]
 
 
-def broken(change=None, **values):
+def broken(change=lambda content: None, **values):
+    """Makes a scene, and changes its JSON."""
+
     def make(root):
         write_transforms(root, **values)
-        if change:
-            content = json.loads((root / "transforms.json").read_text())
-            change(content)
-            (root / "transforms.json").write_text(json.dumps(content))
+        change_json(root, change, "transforms.json")
 
     return make
 
 
-def deep(root):
-    (root / "transforms.json").write_text("[" * 100_000)
+def frame(index, **values):
+    """A change: of one frame."""
+    return broken(lambda content: content["frames"][index].update(values))
 
 
-def huge(root):
-    (root / "transforms.json").write_text("[" + "[]," * 6_000_000 + "[]]")
+def text(content):
+    """In place of a scene."""
+    return lambda root: (root / "transforms.json").write_text(content)
 
 
 BAD = {
@@ -201,10 +150,10 @@ BAD = {
     "size": (broken(w=32, h=48), ["a.png", "32 x 48", f"{WIDTH} x {HEIGHT}"]),
     "size-half": (broken(w=1.5), ["frame 0", "w and h"]),
     "frame": (broken(lambda c: c["frames"].append(5)), ["frame 2", "file_path"]),
-    "outside": (broken(lambda c: c["frames"][0].update(file_path="../a.png")), ["in this folder", "'../a.png'"]),
-    "absolute": (broken(lambda c: c["frames"][0].update(file_path="/etc/hostname")), ["'/etc/hostname'"]),
-    "long": (broken(lambda c: c["frames"][0].update(file_path="x" * 5000)), ["1 of them cannot be found"]),
-    "nul": (broken(lambda c: c["frames"][0].update(file_path="a\0b/c")), ["1 of them cannot be found"]),
+    "outside": (frame(0, file_path="../a.png"), ["in this folder", "'../a.png'"]),
+    "absolute": (frame(0, file_path="/etc/hostname"), ["'/etc/hostname'"]),
+    "long": (frame(0, file_path="x" * 5000), ["1 of them cannot be found"]),
+    "nul": (frame(0, file_path="a\0b/c"), ["1 of them cannot be found"]),
     "list": (broken(test_filenames=["images/c.png"]), ["'images/c.png' has no frame or is in two"]),
     "list-twice": (broken(train_filenames=["images/a.png"], val_filenames=["images/a.png"]), ["'images/a.png'"]),
     "list-all": (broken(val_filenames=["images/a.png", "images/b.png"]), ["none is left to train on"]),
@@ -212,13 +161,10 @@ BAD = {
     "points": (broken(lambda c: c.update(ply_file_path="b.ply")), ["'b.ply'", "no such file"]),
     "points-outside": (broken(lambda c: c.update(ply_file_path="../b.ply")), ["in this folder"]),
     "points-number": (broken(lambda c: c.update(ply_file_path=3)), ["string as ply_file_path"]),
-    "mask": (broken(lambda c: c["frames"][1].update(mask_path="m.png")), ["frame 1", "the mask 'm.png'"]),
-    "matrix-large": (
-        broken(lambda c: c["frames"][1].update(transform_matrix=[[10**400] * 4] * 4)),
-        ["frame 1", "4 x 4 finite"],
-    ),
-    "deep": (deep, ["transforms.json", "cannot be parsed"]),
-    "huge": (huge, ["transforms.json", "at most 16777216 bytes"]),
+    "mask": (frame(1, mask_path="m.png"), ["frame 1", "the mask 'm.png'"]),
+    "matrix-large": (frame(1, transform_matrix=[[10**400] * 4] * 4), ["frame 1", "4 x 4 finite"]),
+    "deep": (text("[" * 100_000), ["transforms.json", "cannot be parsed"]),
+    "huge": (text("[" + "[]," * 6_000_000 + "[]]"), ["transforms.json", "at most 16777216 bytes"]),
 }
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_train import train
+from commands import train
 
 from warp_splat.camera import Camera
 from warp_splat.formats.model_folder import ply_path

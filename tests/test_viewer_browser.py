@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from browser import browser_page
-from serving import PATIENCE, end, served
+from commands import PATIENCE, end, served
 from torch.nn import functional
 
 from warp_splat.camera import Camera

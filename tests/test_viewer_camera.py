@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from fake_viser import PHOTO, ROTATION, wxyz
+from scene_files import project
 from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
@@ -18,12 +19,6 @@ from warp_splat.viewer import server
 from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
 from warp_splat.viewer.picture import depth_colors, depth_range, overlay
 from warp_splat.viewer.watcher import FEWEST, MOST, Pace
-
-
-def project(camera, points):
-    """Pixels [P, 2], from the definition of a pinhole camera."""
-    x, y, z = camera.rotation @ points.T + camera.translation[:, None]
-    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
 
 
 def test_camera_of_a_browser():

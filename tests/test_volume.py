@@ -87,22 +87,24 @@ def test_needle_keeps_its_digits():
     assert profile.center[0, 0] == pytest.approx(5, rel=1e-12)
 
 
-@pytest.mark.parametrize("integrate", INTEGRATORS)
-def test_constant_medium(integrate):
+@pytest.mark.parametrize(
+    ("integrate", "steps", "tolerance"), zip(INTEGRATORS, (3, 20000, 200), (1e-14, 1e-4, 1e-10), strict=True)
+)
+def test_constant_medium(integrate, steps, tolerance):
+    """And an empty one, which shows the background."""
     expected = COLOR * (1 - np.exp(-0.7 * 3)) + BACKGROUND * np.exp(-0.7 * 3)
-    steps, tolerance = {"integrate_exponential": (3, 1e-14), "integrate_euler": (20000, 1e-4)}.get(
-        integrate.__name__, (200, 1e-10)
-    )
     assert integrate(slab(0.7), 1.0, 4.0, steps, BACKGROUND)[0] == pytest.approx(expected, abs=tolerance)
+    assert np.array_equal(integrate(slab(0.0), 0.0, 1.0, 4, BACKGROUND)[0], BACKGROUND)
 
 
-def test_empty_medium_shows_the_background():
-    for integrate in INTEGRATORS:
-        assert np.array_equal(integrate(slab(0.0), 0.0, 1.0, 4, BACKGROUND)[0], BACKGROUND)
+def alone(**more):
+    """One Gaussian."""
+    good = {"means": [[0.1, 0, 4]], "quats": [[1, 0, 0, 0]], "scales": [[0.5, 0.3, 0.4]], "densities": [3.0]}
+    return Volume(**good | {"colors": [COLOR], "background": BACKGROUND} | more)
 
 
 def test_single_gaussian_is_its_color_at_its_depth():
-    volume = Volume([[0.1, 0, 4]], [[1, 0, 0, 0]], [[0.5, 0.3, 0.4]], [3.0], [COLOR], BACKGROUND)
+    volume = alone()
     profile = physics.ray_profile(volume, np.zeros(3), directions(4))
     seen = np.exp(-profile.depths().sum(-1))[:, None]
     expected = COLOR * (1 - seen) + BACKGROUND * seen
@@ -210,10 +212,8 @@ def test_renderer_rung_is_linear_and_clamped():
     ("name", "value"), [("scales", [[1, 0, 1]]), ("densities", [-1]), ("quats", [[0] * 4]), ("colors", [[np.nan] * 3])]
 )
 def test_bad_volumes_are_refused(name, value):
-    good = {"means": [[0, 0, 1]], "quats": [[1, 0, 0, 0]], "scales": [[1, 1, 1]], "densities": [1]}
-    good |= {"colors": [[0, 0, 0]], "background": [0, 0, 0]}
     with pytest.raises(InputError, match="Volume"):
-        Volume(**{**good, name: value})
+        Volume(**vars(alone()) | {name: value})
 
 
 def test_run_writes_its_files(tmp_path, monkeypatch):

@@ -1,22 +1,24 @@
-"""Known depths: the term against float64, maps in the reference's layout, the verdict, what is refused."""
+"""Parts that add to the loss: known depths, in maps and points, and a price on opacity; verdicts; what is refused."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
-from scene_files import write_floats, write_image
-from test_checkpoints import begin, steps
-from test_train import SCENE, fails
+from scene_files import change_json, write_floats, write_image
+from trainings import begin, state_of, steps
 
 from warp_splat.errors import InputError
+from warp_splat.runtime.distributed import ALONE
 from warp_splat.scene.depth_maps import PARAMETERS, read_inverse_depths
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.seams import Step
-from warp_splat.training.trial import weigh
+from warp_splat.training.trial import settle_parts, weigh
 
 DEPTH = {"parts": "depth", "depth_l1_weight_init": 0.5}
 
@@ -131,48 +133,50 @@ def test_maps_are_compared_like_points(mapped, tmp_path):
     assert np.allclose(small, np.float32(scene.extent) * part.maps[view][:, 1::3])
 
 
-def test_verdict(scene):
-    assert not weigh(TrainConfig(), scene)["depth"].needed
-    few = replace(scene, train=scene.train[::8])
-    assert weigh(TrainConfig(), few)["depth"] == (True, "half of its points lie in 6 photographs or fewer")
-    assert not weigh(TrainConfig(), replace(few, find_tracks=dict))["depth"].needed
+@pytest.mark.parametrize(("part", "every", "photographs"), [("depth", 8, 6), ("floaters", 2, 22)])
+def test_verdict(part, every, photographs, scene):
+    assert not weigh(TrainConfig(), scene)[part].needed
+    few = replace(scene, train=scene.train[::every])
+    assert weigh(TrainConfig(), few)[part] == (True, f"half of its points lie in {photographs} photographs or fewer")
+    assert not weigh(TrainConfig(), replace(few, find_tracks=dict))[part].needed
 
 
-def spoil(folder, name):
-    if name == "a missing map":
-        (folder / "depths" / "view_009.png").unlink()
-    elif name == "another size":
-        write_image(folder / "depths" / "view_009.png", np.zeros((100, 264, 1), np.uint16))
-    elif name == "eight bits":
-        write_image(folder / "depths" / "view_009.png", np.zeros((248, 264, 1), np.uint8))
-    elif name == "no parameters":
-        (folder / PARAMETERS).unlink()
-    else:
-        fits = json.loads((folder / PARAMETERS).read_text())
-        fits.pop("view_009") if name == "none for one" else fits.update(view_009={"scale": None, "offset": 0})
-        (folder / PARAMETERS).write_text(json.dumps(fits))
+def in_map(change):
+    """Damage to the map of one photograph."""
+    return lambda folder: change(folder / "depths" / "view_009.png")
+
+
+def in_fits(change):
+    """Damage to the parameters of the maps."""
+    return lambda folder: change_json(folder, change, PARAMETERS)
 
 
 @pytest.mark.parametrize(
-    ("name", "sentence"),
+    ("damage", "sentence"),
     [
-        ("a missing map", "view_009.png: expected a map of inverse depth for view_009.png, found none; add it."),
+        (in_map(Path.unlink), "view_009.png: expected a map of inverse depth for view_009.png, found none; add it."),
         (
-            "another size",
+            in_map(lambda path: write_image(path, np.zeros((100, 264, 1), np.uint16))),
             "expected a map of 264 x 248 pixels as its photograph has, or scaled by one factor, got 264 x 100",
         ),
-        ("eight bits", "view_009.png: expected numbers of 16 bits or floats, found uint8"),
         (
-            "no parameters",
+            in_map(lambda path: write_image(path, np.zeros((248, 264, 1), np.uint8))),
+            "view_009.png: expected numbers of 16 bits or floats, found uint8",
+        ),
+        (
+            lambda folder: (folder / PARAMETERS).unlink(),
             "depth_params.json: expected scale and offset of each map of inverse depth, found no such file",
         ),
-        ("none for one", "depth_params.json: expected JSON of the kind"),
-        ("no number", "found {'scale': None, 'offset': 0} for view_009"),
+        (in_fits(lambda fits: fits.pop("view_009")), "depth_params.json: expected JSON of the kind"),
+        (
+            in_fits(lambda fits: fits.update(view_009={"scale": None, "offset": 0})),
+            "found {'scale': None, 'offset': 0} for view_009",
+        ),
     ],
 )
-def test_what_does_not_fit_is_one_sentence(name, sentence, mapped):
+def test_what_does_not_fit_is_one_sentence(damage, sentence, mapped):
     scene, folder = mapped
-    spoil(folder, name)
+    damage(folder)
     with pytest.raises(InputError) as refused:
         read_inverse_depths(scene, "depths")
     assert sentence in str(refused.value)
@@ -184,8 +188,58 @@ def test_photographs_that_were_undistorted_have_no_maps(mapped):
         read_inverse_depths(replace(scene, train=[replace(scene.train[0], undistorted=True)]), "depths")
 
 
-def test_a_scene_without_depths_is_refused(scene, tmp_path, capsys):
-    command = ["train", "-s", str(SCENE), "-m", str(tmp_path / "m"), "--parts", "depth", "--depth_l1_weight_final=0"]
-    assert "--depth_l1_weight_final: expected a positive number" in fails(capsys, *command)
+def test_a_scene_without_depths_is_refused(scene, tmp_path):
     with pytest.raises(InputError, match="--parts depth: expected a scene that says which points"):
         begin(replace(scene, find_tracks=dict), tmp_path, **DEPTH)
+
+
+def differentiated(scene, folder, **options):
+    """A trainer after the loss of its first view, and that loss."""
+    trainer, _ = begin(scene, folder, **options)
+    return trainer, float(trainer.differentiate(1))
+
+
+def test_it_adds_the_mean_opacity_and_its_gradient(scene, tmp_path):
+    """To every Gaussian's logit, in view or not, and to nothing else."""
+    (plain, loss), (priced, with_price) = (differentiated(scene, tmp_path, parts=parts) for parts in ("", "floaters"))
+    opacities = torch.sigmoid(plain.model.parameters["opacities"].detach().double())
+    assert with_price == pytest.approx(loss + 0.05 * float(opacities.mean()), abs=1e-7)
+    for name, leaf in plain.model.parameters.items():
+        if name != "opacities" and leaf.grad is not None:
+            assert torch.equal(priced.model.parameters[name].grad, leaf.grad), name
+    before, after = (trainer.model.parameters["opacities"].grad.double() for trainer in (plain, priced))
+    expected = 0.05 / len(opacities) * opacities * (1.0 - opacities)
+    unseen = before == 0
+    assert unseen.any() and not unseen.all()
+    torch.testing.assert_close(after[unseen], expected[unseen], rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(after, before + expected, rtol=1e-6, atol=1e-12)
+
+
+def test_the_sum_is_the_same_in_any_order_and_leaves_out_what_is_not_finite(scene, tmp_path):
+    trainer, _ = begin(scene, tmp_path, parts="floaters")
+    out = trainer.look(scene.train[0].camera)
+    opacities = torch.rand(100_001, generator=torch.Generator().manual_seed(0)).square().requires_grad_()
+    losses = []
+    for order in (slice(None), torch.arange(100_000, -1, -1), torch.randperm(100_001)):
+        out.gaussians = out.gaussians._replace(opacities=opacities[order])
+        losses.append(trainer.parts[0].loss(torch.zeros(()), out, None))
+    assert losses[0] == losses[1] == losses[2]
+    exact = 0.05 * math.fsum(opacities.tolist()) / 100_001
+    assert losses[0].item() == pytest.approx(exact, abs=0.05 * 2**-24, rel=1e-7)
+    (gradient,) = torch.autograd.grad(losses[2], opacities)
+    assert torch.equal(gradient, torch.full_like(gradient, 0.05 / 100_001))  # rounded once
+    out.gaussians = out.gaussians._replace(opacities=torch.tensor([0.5, float("nan")]))
+    assert float(trainer.parts[0].loss(torch.zeros(()), out, None)) == pytest.approx(0.0125)
+
+
+def test_without_it_nothing_changes(scene, tmp_path):
+    assert settle_parts(TrainConfig(), scene, ALONE, str) == (TrainConfig(), [])
+    config, told = settle_parts(TrainConfig(opacity_reg=9.0), scene, ALONE, str)
+    assert not config.used_parts
+    assert told == ["Warning: the part floaters is not used, without which --opacity_reg will change nothing."]
+    states = []
+    for options in ({}, {"opacity_reg": 9.0}):
+        trainer, run = begin(scene, tmp_path, **options)
+        steps(trainer, run, 12)
+        states.append(state_of(trainer, run)[0])
+    assert states[0] == states[1]

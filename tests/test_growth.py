@@ -1,40 +1,36 @@
-"""Growth to a budget: exact numbers, what a split leaves as it was, and the error that a Gaussian carries."""
+"""Growth to a budget and as a Markov chain: exact numbers, what a split or a crowd leaves as it was, what is priced."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from commands import SCENE
 from scenes import SCENES
+from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
-from test_checkpoints import SCHEDULE
-from test_distributed import Pretended
-from test_train import SCENE, fails
+from trainings import Pretended, begin, steps
 
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
-from warp_splat.runtime import pool
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.growth.budget import SMALLER, Budget, halves
+from warp_splat.training.growth.mcmc import Mcmc, crowds
 from warp_splat.training.growth.reference import Reference
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.seams import Setting
-from warp_splat.training.trainer import Trainer
 
 POINTS = 4500  # of the scene
 
 
 def count_steps(scene, budget, **options):
     """A training of 50 steps, and the Gaussians after each."""
-    config = TrainConfig(**{**SCHEDULE, "growth": "budget", "max_gaussians": budget, **options})
-    trainer, found = Trainer(scene, config), []
-    for iteration in range(1, 51):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
-        found.append(len(trainer.model))
+    trainer, run = begin(scene, None, **{"growth": "budget", "max_gaussians": budget, **options})
+    found = []
+    steps(trainer, run, 50, lambda: found.append(len(trainer.model)))
     return trainer, found
 
 
@@ -48,21 +44,20 @@ def test_it_ends_with_exactly_as_many_as_asked_for(budget, until, scene):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("growth", ["budget", "mcmc"])
-def test_any_number_of_threads_makes_the_same_bytes(growth, scene):
-    before, found = pool.get_threads(), []
-    for threads in (1, 3):
-        pool.set_threads(threads)
+def test_any_number_of_threads_makes_the_same_bytes(growth, scene, threads):
+    found = []
+    for count in (1, 3):
+        threads(count)
         trainer, counts = count_steps(scene, 5500, growth=growth, opacity_lr=0.3)
         found.append([counts, *(tensor.detach().numpy().tobytes() for tensor in trainer.model.parameters.values())])
-    pool.set_threads(before)
     assert found[0] == found[1] and found[0][0][-1] > POINTS
 
 
-@pytest.mark.parametrize("flags", ["--growth budget", "--preset fast --max_gaussians 0"])
-def test_a_budget_has_to_be_named(flags, capsys, tmp_path):
-    command = ["train", "-s", str(SCENE), "-r", "8", "-m", str(tmp_path / "a"), *flags.split()]
-    sentence = "--max_gaussians 0: expected the number of Gaussians that --growth budget ends with, at least 1"
-    assert sentence in fails(capsys, *command)
+@pytest.mark.parametrize("flags", ["--growth budget", "--preset fast --max_gaussians 0", "--growth mcmc"])
+def test_a_budget_has_to_be_named(flags, fails, tmp_path):
+    sentence = fails("train", "-s", SCENE, "-r", "8", "-m", tmp_path / "a", *flags.split())
+    growth = "mcmc" if "mcmc" in flags else "budget"
+    assert f"--max_gaussians 0: expected the number of Gaussians that --growth {growth} ends with" in sentence
 
 
 @pytest.mark.parametrize(
@@ -71,11 +66,7 @@ def test_a_budget_has_to_be_named(flags, capsys, tmp_path):
         (POINTS, 45, ""),
         (2 * POINTS, 21, ""),
         (4000, 45, f"The faintest of {POINTS} Gaussians go, until there are --max_gaussians 4000."),
-        (
-            9001,
-            21,
-            f"--max_gaussians 9001 will not be reached, since 1 densifications double {POINTS} to 9000 at most.",
-        ),
+        (9001, 21, f"9001 will not be reached, since 1 densifications double {POINTS} to 9000 at most."),
         (9001, 11, f"Warning: no densification before step 11: there will be {POINTS} Gaussians as now."),
     ],
 )
@@ -174,3 +165,97 @@ def test_processes_add_what_they_saw(scene, monkeypatch):
     assert alone._grow(70) == first._grow(70)
     for name, tensor in alone.model.parameters.items():
         assert torch.equal(tensor, first.model.parameters[name])
+
+
+def mcmc_on(count, budget, iterations=1000, **raw):
+    """A growth of equal Gaussians; of ``raw``, parameters before activation."""
+    rows = {"means": [0.0] * 3, "scales": [0.0] * 3, "quats": [1.0, 0, 0, 0], "opacities": 0.0}
+    rows = {name: torch.tensor(value).repeat(count, *[1] * np.ndim(value)) for name, value in rows.items()}
+    rows |= {"sh_dc": torch.arange(3.0 * count).view(count, 1, 3), "sh_rest": torch.zeros(count, 0, 3)}
+    rows |= {name: torch.as_tensor(value, dtype=torch.float32).expand_as(rows[name]) for name, value in raw.items()}
+    model, config = GaussianModel(rows), TrainConfig(growth="mcmc")
+    setting = Setting(SimpleNamespace(extent=1.0), model, torch.zeros(3), ALONE, 0, budget, iterations)
+    return model, Mcmc(config.plugins["mcmc"], setting, Optimizer(model, config.learn, 1.0))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 60])
+@pytest.mark.parametrize("opacity", [0.006, 0.3, 0.9, 0.999])
+def test_a_crowd_is_as_opaque_as_the_one(count, opacity):
+    """In the middle, and summed up along a line (SciPy's quadrature); for few by the paper's sum, too."""
+    logit = math.log(opacity / (1 - opacity))
+    model, _ = mcmc_on(3, 3, opacities=logit, scales=[0.5, -1.0, 2.0])
+    raw = {name: tensor.detach() for name, tensor in model.parameters.items()}
+    crowd = crowds(raw, torch.tensor([0, 2]), torch.tensor([count, 1]))
+    assert len(crowd["means"]) == count + 1 and set(crowd["sh_dc"][:, 0, 0].tolist()) == {0.0, 6.0}
+    b = torch.sigmoid(crowd["opacities"].double()).numpy()
+    assert (1 - b[0]) ** count == pytest.approx(1 - opacity, abs=2e-7)  # float32 near 1
+    assert b[count] == pytest.approx(opacity, abs=2e-7)
+    shrink = np.exp((crowd["scales"] - torch.tensor([0.5, -1.0, 2.0])).double().numpy())
+    assert np.allclose(shrink[count], 1, atol=1e-6) and np.ptp(shrink[0]) < 1e-6
+    covered = quad(lambda x: 1 - (1 - b[0] * math.exp(-((x / shrink[0, 0]) ** 2) / 2)) ** count, -40, 40, limit=200)[0]
+    assert covered == pytest.approx(opacity * math.sqrt(2 * math.pi), rel=2e-5)
+    if count <= 7:
+        series = sum(
+            math.comb(i - 1, k) * (-1) ** k * b[0] ** (k + 1) / math.sqrt(k + 1)
+            for i in range(1, count + 1)
+            for k in range(i)
+        )
+        assert shrink[0, 0] == pytest.approx(opacity / series, rel=2e-5)
+
+
+def test_faint_ones_move_by_their_covariance_and_others_stay():
+    """Against the covariance of the paper's displacement, from 40,000 of them."""
+    quat, scales = [0.3, -0.5, 0.7, 0.2], np.array([-3.0, -2.0, -1.0])
+    count, opacity = 40_000, 0.012
+    logit = math.log(opacity / (1 - opacity))
+    model, growth = mcmc_on(count + 1, count + 1, quats=quat, scales=scales, opacities=logit)
+    with torch.no_grad():
+        model.parameters["opacities"][-1] = 0.0
+    before = model.parameters["means"].detach().clone()
+    growth.optimizer.set_iteration(0)
+    growth.after_step(1)
+    moved = (model.parameters["means"].detach() - before).double().numpy()
+    turned = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+    covariance = turned @ np.diag(np.exp(2 * scales)) @ turned.T
+    size = 5e5 * 0.00016 / (1 + math.exp(100 * (opacity - 0.005)))
+    expected = size**2 * covariance @ covariance
+    assert not moved[-1].any()
+    assert np.abs(np.cov(moved[:-1].T) - expected).max() < 0.03 * np.abs(expected).max()
+    assert np.abs(moved[:-1].mean(0)).max() < 0.03 * np.sqrt(np.abs(expected).max())
+
+
+def test_prices_on_opacity_and_size():
+    model, growth = mcmc_on(5, 5, scales=[-1.0, 0.0, 1.0])
+    gaussians = model.activated()
+    for leaf in (gaussians.opacities, gaussians.scales):
+        leaf.retain_grad()
+    loss = growth.loss(torch.zeros((), requires_grad=True) + 2.0, SimpleNamespace(gaussians=gaussians), None)
+    loss.backward()
+    assert loss.item() == pytest.approx(2 + 0.01 * 0.5 + 0.01 * (math.exp(-1) + 1 + math.e) / 3)
+    assert torch.allclose(gaussians.opacities.grad, torch.tensor(0.01 / 5))
+    assert torch.allclose(gaussians.scales.grad, torch.tensor(0.01 / 15))
+
+
+def test_the_dead_go_to_the_living_as_often_as_these_are_opaque():
+    """1,000 of 1,003 are dead; two of the rest are equally opaque, one is half as much."""
+    model, growth = mcmc_on(1003, 1003)
+    with torch.no_grad():
+        model.parameters["opacities"][:] = -9.0
+        model.parameters["opacities"][[5, 500, 1000]] = torch.tensor([0.0, 0.0, math.log(0.25 / 0.75)])
+        model.parameters["scales"][7, 1] = math.nan
+    change = growth.update(600)
+    assert (change.cloned, change.split, change.pruned) == (1000, 0, 1000) and len(model) == 1003
+    colors = model.parameters["sh_dc"].detach()[:, 0, 0]
+    shares = [int((colors == 3.0 * row).sum()) for row in (5, 500, 1000)]
+    assert sum(shares) == 1003 and np.abs(np.array(shares) - [400, 400, 200]).max() < 60  # four standard deviations
+    assert all(torch.isfinite(tensor).all() for tensor in model.parameters.values())
+
+
+def test_all_dead_is_refused():
+    model, growth = mcmc_on(5, 9, opacities=-9.0)
+    assert growth.update(600).refused and len(model) == 5
+
+
+def test_a_twentieth_more_until_the_limit(scene):
+    _, found = count_steps(scene, 4800, growth="mcmc", densification_interval=5)
+    assert found[14:16] == [4500, 4725] and found[20] == found[-1] == 4800

@@ -1,0 +1,100 @@
+"""Commands of ours, in this process and in others, and how they end."""
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from warp_splat.cli import main
+from warp_splat.scene.embedded import embedded_scene
+
+ROOT = Path(__file__).parents[1]
+SCENE = embedded_scene()
+FOX = Path(os.environ.get("WARP_SPLAT_FOX", ROOT.parent / "shared" / "data" / "fox"))
+PATIENCE = 300.0  # seconds; a machine may be busy
+#: Densifies, prunes, resets opacities and raises the SH degree within 60 steps.
+SHORT = (
+    "--eval -r 4 --iterations 60 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 55 "
+    "--opacity_reset_interval 30 --sh_interval 15 --densify_grad_threshold 0.00005 --quiet"
+).split()
+
+
+def train(folder, *options):
+    """Train the embedded scene for :data:`SHORT`; the exit code."""
+    return main(["train", "-s", str(SCENE), "-m", str(folder), *SHORT, *options])
+
+
+def python(*words, check=True, **environment):
+    """A process of Python that has ended: what it said, and its exit code."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    options = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True, "timeout": 600}
+    done = subprocess.run([sys.executable, *map(str, words)], check=False, **options)
+    assert not (check and done.returncode), done.stderr
+    return done
+
+
+def started(*words, **pipes):
+    """A process of Python that runs, with pipes for what it says."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT, **pipes}
+    return subprocess.Popen([sys.executable, *map(str, words)], env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes)
+
+
+@contextmanager
+def full_disk(limit):
+    """Writes beyond ``limit`` bytes of a file fail, as the operating system reports it."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+class CtrlC(io.StringIO):
+    """The standard output of a command in this process, which presses Ctrl-C where a text begins with ``line``."""
+
+    def __init__(self, line):
+        super().__init__()
+        self.line, self.heeded = line, []
+
+    def write(self, text):
+        if text.startswith(self.line):
+            self.heeded.append(signal.getsignal(signal.SIGINT) is not signal.SIG_IGN)
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().write(text)
+
+
+@contextmanager
+def served(*arguments):
+    """A command with a viewer, once that is up: the process, its address, what it printed so far."""
+    # as a shell's "&" starts it, ignoring SIGINT: Ctrl-C only works once the command has a handler for it
+    ignoring = ["sh", "-c", 'trap "" INT; exec "$@"', "sh"]
+    command = [*ignoring, sys.executable, "-m", "warp_splat", *map(str, arguments)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, cwd=ROOT, **pipes)
+    try:
+        said = ""
+        for line in process.stdout:
+            said += line
+            if found := re.search(r"Viewer at (http://127.0.0.1:\d+)", line):
+                yield process, found[1], said
+                return
+        raise AssertionError(said)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def end(process):
+    """Ctrl-C; the exit code, and what else was said."""
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=PATIENCE)[0]
+    assert "Traceback" not in said
+    return process.returncode, said
