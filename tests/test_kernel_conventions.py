@@ -160,13 +160,13 @@ def test_functions_that_cannot_be_put_in_place_are_refused(part, message):
             out[0] = y
 
 
-@pytest.mark.parametrize(
-    ("word", "line"),
-    [
-        ("project", "    rotation_w = times(qw, rotation_scale)\n"),
-        ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n"),
-    ],
-)
+LINES = [
+    ("project", "    rotation_w = times(qw, rotation_scale)\n"),
+    ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n"),
+]
+
+
+@pytest.mark.parametrize(("word", "line"), LINES)
 def test_what_is_compiled_can_be_read(word, line):
     """What was assembled: names of a part stand in the kernel; what was written from a formula."""
     shown = python("benchmarks/show_kernel.py", word, check=False).stdout
