@@ -2,8 +2,9 @@
 
     python assets/make_capture.py walk 464 --out output/walk [--size 320 240]
 
-walk: through rooms and back, a room for every 50 photographs. loop: once around in one hall. video: the walk, blurred
-by movement, under an exposure that swings by two stops. `positions.csv` says where each photograph was taken.
+walk: through rooms and back, a room for every 50 photographs. loop: once around in one room. video: the walk at a third
+of the pace, blurred by movement, under an exposure that swings by two stops. `positions.csv` says where each photograph
+was taken.
 """
 
 import argparse
@@ -22,7 +23,7 @@ SIDE, HEIGHT, DOOR, LINTEL = 6.0, 3.0, 1.2, 2.2  # of a room and its doors [m]
 FOCAL = 0.8  # of the width
 LIGHT = 4.0
 STOPS = 2.0  # from the darkest to the brightest exposure of a video
-SHUTTER = 0.25  # of the time from one frame to the next
+SHUTTER = 0.2  # of the time from one frame to the next
 
 
 @wp.kernel
@@ -110,7 +111,7 @@ def camera(center: np.ndarray, rotation: np.ndarray, size: tuple[int, int]) -> C
 
 def make_capture(folder: pathlib.Path, kind: str, count: int, size: tuple[int, int] = (320, 240)) -> None:
     """Write ``count`` photographs to ``folder``/images, and their places to ``folder``/positions.csv."""
-    rooms = 1 if kind == "loop" else max(2, round(count / PER_ROOM))
+    rooms = 1 if kind == "loop" else max(2, round(count / PER_ROOM / (3 if kind == "video" else 1)))
     tracer = Tracer(join([part for number in range(rooms) for part in room(number)]))
     (folder / "images").mkdir(parents=True, exist_ok=True)
     lines = ["name,x,y,z"]

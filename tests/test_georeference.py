@@ -1,6 +1,7 @@
 """Scale, up and origin of a model, against positions that are known."""
 
 import json
+import shutil
 
 import numpy as np
 import pycolmap
@@ -10,7 +11,13 @@ from PIL import Image
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import MODEL_FROM_WORLD, read_coordinates, write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.model_folder import write_cameras
 from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.inspect.subject import Subject
+from warp_splat.inspect.verdicts import check_coordinates
+from warp_splat.rendering.camera_paths import focus_point
+from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
 from warp_splat.sfm import stages
 from warp_splat.sfm.georeference import _gps, georeference
 
@@ -125,6 +132,26 @@ def test_files_of_gaussians_keep_the_origin(tmp_path, ending):
     assert load_gaussians(tmp_path / f"a{ending}").coordinates == where
     save_gaussians(tmp_path / f"b{ending}", splats)
     assert load_gaussians(tmp_path / f"b{ending}").coordinates is None
+
+
+def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):
+    shutil.copytree(embedded_scene(), tmp_path / "scene")
+    assert abs(load_scene(tmp_path / "scene", resolution=8, report=str).up[2]) > 0.9  # z is up in it, as cameras tell
+    where = {
+        "origin": UTM.tolist(),
+        "reference": "UTM",
+        "residuals": {"a": 0.5, "b": 0.25, "c": 9.0},
+        "left_out": ["c"],
+    }
+    write_coordinates(tmp_path / "scene", where)
+    scene = load_scene(tmp_path / "scene", resolution=8, report=str)
+    np.testing.assert_array_equal(focus_point(scene)[1], (0, -1, 0))
+    write_cameras(tmp_path, scene.test, scene.train, scene.coordinates)
+    assert json.loads((tmp_path / "cameras.json").read_text())[3]["origin"] == UTM.tolist()
+    (finding,) = check_coordinates(Subject(tmp_path / "scene", tmp_path))
+    for words in ("UTM, origin at 691000.25, 5335000.5, 520", "the worst, a, within 0.5 m", "left out: c"):
+        assert words in finding.text
+    assert finding.level == "warning"
 
 
 def test_damaged_coordinates_get_one_sentence(tmp_path):

@@ -22,6 +22,7 @@ from warp_splat.errors import InputError, reason_of
 from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_json
 from warp_splat.formats.coordinates import write_coordinates
+from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.photos import (
@@ -189,9 +190,13 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
     lenses = f"{len(groups)} lens{'es' * (len(groups) > 1)}"
     say(f"{len(names)} photographs, {lenses}, {config.threads} threads; work in {work}")
     database = work / "database.db"
-    stages.extract(database, root, groups, config)
-    pairs = match(database, config, say)
-    models = mapping.reconstruct(database, root, work / "models", config, say)
+    taken: dict[str, dict[str, float]] = {}
+    with _taking("features", taken):
+        stages.extract(database, root, groups, config)
+    with _taking("matches", taken):
+        pairs = match(database, config, say)
+    with _taking("cameras", taken):
+        models = mapping.reconstruct(database, root, work / "models", config, say)
     sizes = {index: model.num_reg_images() for index, model in models.items()}
     if sizes.get(0, 0) < LEAST:
         shutil.rmtree(work / "models")  # the next run may have another seed of luck, and more photographs
@@ -207,7 +212,8 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         path.mkdir(exist_ok=True)
         model.write(path)
     write_coordinates(scene, where)
-    stages.write_scene(path, root, scene, work / "scene.part", sizes[0], config)
+    with _taking("images", taken):
+        stages.write_scene(path, root, scene, work / "scene.part", sizes[0], config)
     return {
         "photographs": len(names) + len(broken),
         "unreadable": broken,
@@ -219,7 +225,16 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         "track_length": model.compute_mean_track_length(),
         "threads": config.threads,
         "keep_lens": config.keep_lens,
+        "stages_of_last_run": taken,
     }
+
+
+@contextmanager
+def _taking(stage: str, taken: dict[str, dict[str, float]]) -> Iterator[None]:
+    """Note the seconds of a stage, and the most memory that the process had at its end."""
+    began = time.perf_counter()
+    yield
+    taken[stage] = {"seconds": round(time.perf_counter() - began, 2), "peak_mib": peak_memory() or 0}
 
 
 def _groups(root: Path, names: list[str], threads: int, say) -> tuple[list[list[str]], list[str]]:

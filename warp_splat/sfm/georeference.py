@@ -70,10 +70,10 @@ def georeference(
     extent = _extent(world[right])
     error = float(np.median(residuals[right])) if right.any() else np.inf
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
-        text = f"the positions of {reference} err by {error:.2g} m (median), and reach over {extent:.3g} m"
+        text = f"{right.sum()} of {len(names)} positions of {reference} do, within {error:.2g} m of {extent:.3g} m"
         if source != "auto":
             raise InputError(f"{source}: expected positions that fit to the cameras, but {text}; check their order.")
-        say(f"no coordinates: {text}")
+        say(f"no coordinates: of positions that fit to the cameras, {text}")
         return None
     _move(model, fitted)
     left_out = [name for name, good in zip(names, right, strict=True) if not good]

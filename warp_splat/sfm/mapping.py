@@ -90,7 +90,9 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
         pycolmap.global_mapping(calibrated, root, part, options)
 
     began = time.monotonic()
-    run_watched("cameras", round(seconds) + 1, work, lambda: int(time.monotonic() - began), config.quiet, stops=False)
+    run_watched(
+        "cameras (s)", round(seconds) + 1, work, lambda: int(time.monotonic() - began), config.quiet, stops=False
+    )
     (part / database.name).unlink(missing_ok=True)
 
 

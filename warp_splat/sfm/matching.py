@@ -22,6 +22,8 @@ FAISS_THRESHOLD = "_ZN5faiss31distance_compute_blas_thresholdE"  # queries from 
 # Pairs are matched in blocks of BLOCK x BLOCK, and Ctrl-C is heard in between. Tried:
 # - 36 instead of 42 s for 1,225 pairs of 540 x 960 px: pycolmap's 50
 BLOCK = 10
+TYPICAL = 33  # pairs for each photograph that looks find
+PER_FEATURE, PER_SQUARE = 7.5e-6, 3.4e-9  # seconds of one thread for a pair (AMD EPYC): of a feature, of its square
 MANY = 100  # photographs from which on "auto" compares those that look alike, and not all
 
 
@@ -46,9 +48,15 @@ def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> in
     """Match photographs as ``config.matching`` says; returns how many pairs fit together."""
     with opened(database) as connection:
         images = connection.num_images()
+        features = connection.num_keypoints() / max(images, 1)
     matching = config.matching
     if matching == "auto":
         matching = "exhaustive" if images < MANY else "looks"
+    every = images * (images - 1) // 2
+    pairs = {"looks": min(every, TYPICAL * images), "exhaustive": every}.get(matching, 0)
+    if pairs >= TYPICAL * MANY:
+        seconds = pairs * (PER_FEATURE * features + PER_SQUARE * features**2) / config.threads
+        say(f"matching will take about {seconds / 60:.1f} min: {pairs} pairs of {features:.0f} features each")
     if matching == "looks":
         _match_by_looks(database, config, say)
     elif matching == "sequential":
@@ -57,7 +65,7 @@ def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> in
         _run(database, pycolmap.match_sequential, pairing, _sequential_pairs(images, pairing.overlap), config)
     else:
         pairing = pycolmap.ExhaustivePairingOptions(block_size=BLOCK)
-        _run(database, pycolmap.match_exhaustive, pairing, images * (images - 1) // 2, config)
+        _run(database, pycolmap.match_exhaustive, pairing, every, config)
     return len(_matched(database))
 
 

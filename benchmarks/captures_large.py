@@ -1,0 +1,89 @@
+"""Photographs against seconds and memory of each stage, on walks through rooms that a ray tracer makes.
+
+    python benchmarks/captures_large.py --counts 100 300 --work output/large [--out docs/benchmarks] [--all_pairs 150]
+
+Up to `--all_pairs` photographs, all pairs are compared as well: what share of those that fit was found by looks?
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from common import option, parse, write_table
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
+
+from make_capture import make_capture
+
+STAGES = ("features", "matches", "cameras", "images")
+HEADERS = (
+    *("photographs", "pairs compared", "of all", "of those that fit"),
+    *(f"{stage} s" for stage in STAGES),
+    *("all pairs s", "peak MiB", "registered", "error of places mm"),
+)
+
+
+def run(capture: Path, scene: Path, matching: str) -> dict:
+    """`warp-splat sfm` on a capture, placed by its true positions; what it says of itself."""
+    options = ["--matching", matching, "--coordinates", str(capture / "positions.csv"), "--quiet"]
+    subprocess.run(
+        [sys.executable, "-m", "warp_splat", "sfm", str(capture / "images"), str(scene), *options], check=True
+    )
+    residuals = json.loads((scene / "coordinates.json").read_text())["residuals"]
+    summary = json.loads((scene / "sfm" / "summary.json").read_text())
+    return {**summary, "residual": float(np.median(list(residuals.values())))}
+
+
+def fitting(scene: Path) -> tuple[set[int], int]:
+    """Pairs of photographs that fit together, and how many were compared."""
+    with pycolmap.Database.open(scene / "sfm" / "database.db") as database:
+        pairs, counts = database.read_two_view_geometry_num_inliers()
+        return {
+            pair for pair, count in zip(pairs, counts, strict=True) if count > 0
+        }, database.num_matched_image_pairs()
+
+
+def measured(count: int, work: Path, all_pairs: bool) -> dict:
+    """One row; what was made and computed before is not made again."""
+    capture = work / f"walk{count}"
+    if not (capture / "positions.csv").is_file():
+        make_capture(capture, "walk", count)
+    row = {"photographs": count, **run(capture, work / f"looks{count}", "looks")}
+    found, row["compared"] = fitting(work / f"looks{count}")
+    row["share"] = row["compared"] / (count * (count - 1) / 2)
+    if all_pairs:
+        row["exhaustive"] = run(capture, work / f"exhaustive{count}", "exhaustive")
+        every, _ = fitting(work / f"exhaustive{count}")
+        row["recall"] = len(every & found) / len(every)
+    return row
+
+
+def main() -> None:
+    options = parse(
+        __doc__,
+        option("--counts", type=int, nargs="+", default=[100, 300]),
+        option("--work", type=Path, required=True, help="folder for captures and scenes"),
+        option("--all_pairs", type=int, default=150),
+    )
+    data = [measured(count, options.work, count <= options.all_pairs) for count in options.counts]
+    rows = []
+    for row in data:
+        stages, whole = row["stages_of_last_run"], row.get("exhaustive")
+        rows.append(
+            (
+                *(row["photographs"], row["compared"], f"{100 * row['share']:.0f} %"),
+                f"{100 * row['recall']:.1f} %" if whole else "",
+                *(f"{stages[stage]['seconds']:.0f}" for stage in STAGES),
+                f"{whole['stages_of_last_run']['matches']['seconds']:.0f}" if whole else "",
+                *(stages["images"]["peak_mib"], row["registered"], f"{1000 * row['residual']:.1f}"),
+            )
+        )
+    note = "Walks of 320 x 240 px, a room for every 50 photographs; `all pairs s`: of matching all pairs instead."
+    write_table("captures_large", options.out, HEADERS, rows, note, {"rows": data})
+
+
+if __name__ == "__main__":
+    main()
