@@ -68,9 +68,8 @@ def room(number: int) -> list[Patch]:
     for k, y in enumerate((-half, half)):
         parts += [painted((2 * i, y, 0), (2, 0, 0), HEIGHT, seed + 3 * k + i) for i in range(3)]
     for k, x in enumerate((0.04, SIDE - 0.04)):
-        parts += [painted((x, y, 0), (0, jamb, 0), HEIGHT, seed + 7 + 4 * k + y) for y in (-half, DOOR / 2)]
-        lintel = painted((x, -DOOR / 2, LINTEL), (0, DOOR, 0), HEIGHT - LINTEL, seed + 13 + k)
-        parts.append(lintel)
+        parts += [painted((x, y, 0), (0, jamb, 0), HEIGHT, seed + 6 + 2 * k + (y > 0)) for y in (-half, DOOR / 2)]
+        parts.append(painted((x, -DOOR / 2, LINTEL), (0, DOOR, 0), HEIGHT - LINTEL, seed + 10 + k))
     random = np.random.default_rng(number)
     for k, (x, y) in enumerate(((1.3, -2.1), (3.0, 2.3), (4.7, -2.1))):
         sides = ((-0.4, -0.4), (0.8, 0)), ((0.4, -0.4), (0, 0.8)), ((0.4, 0.4), (-0.8, 0)), ((-0.4, 0.4), (0, -0.8))

@@ -48,7 +48,8 @@ def write_positions(path, world):
 
 
 def placed(model, found):
-    """Positions of the model's cameras in the world, by its coordinates."""
+    """Positions of the model's cameras in the world, by its coordinates as a file has them."""
+    found = json.loads(json.dumps(found, allow_nan=False))
     local = np.array([model.image(i + 1).projection_center() for i in range(COUNT)])
     assert np.abs(local).max() < 100  # so float32 holds them
     return local.astype(np.float32) @ MODEL_FROM_WORLD + np.array(found["origin"])

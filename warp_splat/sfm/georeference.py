@@ -134,7 +134,7 @@ def _move(model: pycolmap.Reconstruction, world_from_old: pycolmap.Sim3d) -> Non
 
 
 def _described(origin: np.ndarray, reference: str, scale: float, residuals: dict, left_out: list[str]) -> dict:
-    found = {"origin": origin.tolist(), "axes": AXES, "reference": reference, "scale": scale}
+    found = {"origin": origin.tolist(), "axes": AXES, "reference": reference, "scale": float(scale)}
     return {**found, "residuals": residuals, "left_out": left_out}
 
 

@@ -22,7 +22,7 @@ from warp_splat.sfm.stages import opened, run_watched
 ENOUGH, MANY = 0.98, 100
 SHARED = 3  # photographs that two models need to have in common to become one
 RELAXED = {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.1, "abs_pose_max_error": 16.0}  # 30, 0.25, 12
-SECONDS_PER_MATCH = 1e-4  # of global mapping on two cores, for the time that the bar says is left
+SECONDS_PER_MATCH = 1e-4  # of global mapping (AMD EPYC), for the time that the bar says is left
 
 
 def reconstruct(
@@ -80,7 +80,8 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
     """Global mapping (GLOMAP, Pan et al. 2024), with focal lengths from the view graph where no file says them."""
     with opened(database) as connection:
         known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
-    options = pycolmap.GlobalPipelineOptions(num_threads=config.threads, random_seed=config.seed)
+    # One thread: with two, each run ends in other bytes.
+    options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=config.seed)
 
     def work() -> None:
         calibrated = database
@@ -90,9 +91,8 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
         pycolmap.global_mapping(calibrated, root, part, options)
 
     began = time.monotonic()
-    run_watched(
-        "cameras (s)", round(seconds) + 1, work, lambda: int(time.monotonic() - began), config.quiet, stops=False
-    )
+    passed = lambda: int(time.monotonic() - began)  # noqa: E731
+    run_watched("cameras (s)", round(seconds) + 1, work, passed, config.quiet, stops=False)
     (part / database.name).unlink(missing_ok=True)
 
 
