@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from warp_splat.flags import argument, film, flag, machinery, reporting
 
 if TYPE_CHECKING:
+    import torch
+
     from warp_splat.kernels.falloff import Falloff
     from warp_splat.kernels.project import Projection
 
@@ -38,6 +40,7 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (o
 ADJOINTS = ("manual", "stepwise", "reversible", "stored")  # of the pixel loop; see warp_splat.rasterize
 PROJECTIONS = ("affine", "ellipsoid", "unscented")  # files of kernels/project; see RasterOptions, as all that follow
 EXTENTS = ("ellipse", "square")
+BOUNDS_OF = ("ideal", "trained")
 EXP_DEGREES = (3, 4, 5, 6, None)
 LENSES = ("undistort", "native")  # what becomes of photographs with distortion; see load_scene
 VIDEOS = ("orbit", "spiral", "path")  # see warp_splat.rendering.camera_paths
@@ -72,6 +75,12 @@ class RasterOptions:
         near: Gaussians whose center is nearer along the optical axis (of a wide lens: nearer) are left out, at least
             1e-6 [world units].
         blur: added to both variances of the projected Gaussian (low-pass), at least 1e-6 [px^2].
+        bound: also return how far a pixel can be from the ideal: the same Gaussians in the same order without any cut,
+            in real arithmetic (docs/tolerance.md). The background must not be negative.
+        of: what the bound is of: "ideal", or "trained": what is below 1/255 at a pixel is not part of the model, since
+            the reference's rules left it out in training.
+        tolerance: cut as much as the bound allows, which is then found, too: a number, or one for each pixel [H, W],
+            above 0. Takes the place of ``alpha_min`` and ``t_min``, and lowers ``exp_degree``. Rounding comes on top.
     """
 
     depth: bool = False
@@ -90,6 +99,9 @@ class RasterOptions:
     strongest: int = 0
     near: float = NEAR
     blur: float = BLUR
+    bound: bool = False
+    of: str = "ideal"
+    tolerance: float | torch.Tensor | None = None
 
 
 @dataclass
@@ -108,6 +120,9 @@ class RenderConfig:
         choices=("", *VIDEOS),
     )
     quiet: bool = flag(False, "print only the summary")
+    tolerance: float = flag(0.0, "leave out what changes no pixel by more, of 1; 0: the usual cuts", most=1)
+    of: str = flag("ideal", "what a tolerance and a bound compare with: see docs/tolerance.md", choices=BOUNDS_OF)
+    bound: bool = flag(False, "also write how wrong each pixel may be: pictures with a scale, and EXR files")
 
     frames: int = film(250, "frames of the video, 25 a second", least=1)
     video_output: str = film("", "an .mp4 file, or a folder for PNG; default: <model>/<video>.mp4", "--orbit_output")

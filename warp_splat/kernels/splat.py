@@ -39,6 +39,7 @@ class BlendVariant(NamedTuple):
     channels: int = 3  # that are blended: the color's, and depth
     falloff: Falloff | int | None = 5  # the user's, or the degree of the Gaussian's polynomial (see make_falloff)
     keep: bool = False  # every transmittance is stored
+    bound: bool = False  # how wrong a pixel can be is found
 
     @property
     def columns(self) -> int:

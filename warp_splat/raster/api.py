@@ -18,12 +18,14 @@ from warp_splat.raster.behind import put_behind
 from warp_splat.raster.beside import blend_beside
 from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.certificate import certify, far_reaching, looking
 from warp_splat.raster.checks import (
     check_background,
     check_camera,
     check_features,
     check_gaussians,
     check_options,
+    check_tolerance,
     explain_invalid,
     own_explained,
 )
@@ -31,6 +33,7 @@ from warp_splat.raster.data import Dropped, Gaussians, Room
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing
+from warp_splat.raster.tolerance import Painted, only, paint_within
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.timers import stage
 
@@ -58,6 +61,8 @@ class RenderOutput:
     )
     strongest: torch.Tensor | None = None  # [H, W, k] int64, Gaussians of the largest weights; -1 where there is none
     strongest_weights: torch.Tensor | None = None  # [H, W, k] share of them in the pixel
+    bound: torch.Tensor | None = None  # [H, W] how far the image may be from the ideal in any channel; no gradient
+    rounding: torch.Tensor | None = None  # [H, W] the part of the bound that is rounding
 
     @property
     def invalid(self) -> int:
@@ -160,6 +165,7 @@ def _checked(
     options = check_options(adjoint, options)
     gaussians = check_gaussians(means, quats, scales, opacities, sh)
     background = check_background(background, means.device)
+    check_tolerance(options, features)
     if features is not None:
         check_features(features, means)
     outputs, bases = [], (camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras)
@@ -189,17 +195,29 @@ def render(
     """
     driver, dropped = driver_of(gaussians.means.device), Dropped()
     with stage("project"):
-        splats = project(gaussians, camera, options, driver, dropped)
+        splats = project(gaussians, camera, far_reaching(options), driver, dropped)
     seen = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
-    with stage("bin"):
-        crossing = find_crossing(splats, seen)
-        drawn = around(splats, seen, crossing)
-        # 'stored' keeps 1 KiB of each instance: too much for some that there are not
-        bins = driver.bin(drawn, seen, options, None if adjoint == "stored" else room)
-    with stage("blend"):
-        color = background if background.dim() == 1 else background.new_zeros(3)
-        blending = Blending(bins, seen, options, driver, adjoint, dropped)
-        image, alpha, depth = blend(drawn, color, blending)
+    crossing = find_crossing(splats, seen)
+    copied = around(splats, seen, crossing)
+    color = background if background.dim() == 1 else background.new_zeros(3)
+
+    def paint(chosen: RasterOptions, tiles: torch.Tensor | None = None) -> Painted:
+        with stage("bin"):
+            drawn, certificate = copied, None
+            if chosen.bound:
+                drawn, certificate = certify(copied, gaussians, crossing, seen, background, chosen, driver)
+            # 'stored' keeps 1 KiB of each instance: too much for some that there are not
+            bins = driver.bin(drawn, seen, looking(chosen), None if adjoint == "stored" else room)
+            bins = bins if tiles is None else only(bins, tiles)
+            if certificate:
+                bins.bound = certificate.view(bins)
+        with stage("blend"):
+            blending = Blending(bins, seen, chosen, driver, adjoint, dropped)
+            return Painted(blend(drawn, color, blending), drawn, blending, certificate)
+
+    (image, alpha, depth), drawn, blending, certificate = (
+        paint(options) if options.tolerance is None else paint_within(paint, options, seen)
+    )
     if background.dim() == 2:
         image = put_behind(image, alpha, background, camera)
     more = {}
@@ -208,7 +226,12 @@ def render(
             more = blend_beside(features, gaussians, drawn, camera, blending, crossing)
     if room and room.overflowed():
         return render(gaussians, camera, background, options, adjoint, features, room)
-    all_valid = isinstance(bins.invalid, int) and not bins.invalid  # a GPU would have to stop for the answer
+    if certificate:
+        more |= {"bound": certificate.bound, "rounding": certificate.rounding}
+        splats = splats._replace(radii=drawn.radii[: len(splats.radii)])
+    all_valid = (
+        isinstance(blending.bins.invalid, int) and not blending.bins.invalid
+    )  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,
         alpha=alpha,
@@ -219,7 +242,7 @@ def render(
         colors=splats.colors,
         depths=splats.depths,
         opacities2d=splats.opacities,
-        invalid_count=bins.invalid,
+        invalid_count=invalid,
         gaussians=gaussians,
         dropped=dropped,
         **more,

@@ -47,7 +47,7 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, 
     _check_count(_last(row_ends), camera, count, splats2d.radii.device)
     begins = _put(begins, order)
     spans, counts = wp.empty(_last(row_ends), dtype=wp.vec2i, device="cpu"), np.empty(count, dtype=np.int64)
-    inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, square]
+    inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, _boxes(options)]
     groups = -(-count // LANES)
     bounds = even_slices(groups, SMALLEST_SLICE // LANES)
     launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=bounds)
@@ -100,7 +100,7 @@ def _count_tiles(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> 
     gaussians, splats = empty(total, int, device), empty(total, Splat2D, device)
     counts = torch.empty(total, dtype=torch.int64, device=device)
     inputs = [view(order, wp.int64), splats2d.view(), camera.width, camera.height, options.alpha_min]
-    inputs.append(int(options.extent == "square"))
+    inputs += [int(options.extent == "square"), _boxes(options)]
     kernel = make_count_tiles(falloff_of(options).reach_of)
     launch(kernel, total, inputs, [gaussians, splats, view(counts, wp.int64)], device=device)
     return gaussians, splats, counts
@@ -114,10 +114,15 @@ def _list_tiles(
     ``counts`` [N], or [0], are counted anew.
     """
     begins, ranks = (torch.empty(size, dtype=torch.int32, device=ends.device) for size in (len(ends) + 1, len(listed)))
-    inputs = [splats, camera.width, camera.height, int(options.extent == "square"), view(ends, wp.int64)]
+    inputs = [splats, camera.width, camera.height, _boxes(options), view(ends, wp.int64)]
     outputs = [view(begins, wp.int32), _listed(listed), view(ranks, wp.int32), view(counts, wp.int32)]
     launch(make_list_tiles(listed.dtype == torch.int16), len(begins), inputs, outputs, device=ends.device)
     return begins, ranks
+
+
+def _boxes(options: RasterOptions) -> int:
+    """Whether a Gaussian is listed by all tiles of its box; the bound takes those for seen."""
+    return int(options.extent == "square" or options.bound)
 
 
 def _listed(tiles: torch.Tensor):

@@ -12,6 +12,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import (
     ADJOINTS,
+    BOUNDS_OF,
     CHANNELS_MOST,
     EXP_DEGREES,
     EXTENTS,
@@ -73,13 +74,13 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     if not isinstance(options.projection, Projection) and not is_one_of(options.projection, PROJECTIONS):
         wanted = f"one of {', '.join(PROJECTIONS)} or a warp_splat.kernels.project.Projection"
         raise InputError(f"options.projection: expected {wanted}, got {options.projection!r}.")
-    for name, choices in (("extent", EXTENTS), ("exp_degree", EXP_DEGREES)):
+    for name, choices in (("extent", EXTENTS), ("exp_degree", EXP_DEGREES), ("of", BOUNDS_OF)):
         if not is_one_of(getattr(options, name), choices):
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
     if not (options.falloff is None or isinstance(options.falloff, Falloff)):
         raise InputError(f"options.falloff: expected a warp_splat.Falloff or None, got {options.falloff!r:.80}.")
-    for name in ("depth", "antialiasing", "median_depth", "normals"):
+    for name in ("depth", "antialiasing", "median_depth", "normals", "bound"):
         if not isinstance(getattr(options, name), bool):
             raise InputError(f"options.{name}: expected True or False, got {getattr(options, name)!r}.")
     for name in ("alpha_min", "t_min"):
@@ -104,6 +105,22 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         **{name: float(getattr(options, name)) for name in ("alpha_min", "alpha_max", "t_min", "near", "blur")},
         max_steps=None if steps is None else int(steps),
     )
+
+
+def check_tolerance(options: RasterOptions, features: object = None) -> None:
+    """Raise InputError if the tolerance is no positive number, or if it asks for what only a single pass gives."""
+    tolerance = options.tolerance
+    if tolerance is None:
+        return
+    if not isinstance(tolerance, (numbers.Real, torch.Tensor)) or isinstance(tolerance, bool):
+        raise InputError(f"options.tolerance: expected a number or a tensor [H, W], got {type(tolerance).__name__}.")
+    if not bool(torch.as_tensor(tolerance > 0.0).all()):  # pyright: ignore[reportOperatorIssue]
+        raise InputError(f"options.tolerance: expected numbers above 0, got {tolerance!r:.60}.")
+    beside = ("normals", "median_depth", "strongest", "max_steps")
+    given = [name for name in beside if getattr(options, name) not in (False, 0, None)]
+    given += ["features"] if features is not None else []
+    if given:
+        raise InputError(f"options.tolerance: expected none of {', '.join(given)} beside it; leave one of them out.")
 
 
 def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:

@@ -6,7 +6,7 @@ N Gaussians, V splats, M tile instances (a splat in the list of a tile), T tiles
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -14,6 +14,7 @@ import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import T_LEAST, RasterOptions
+from warp_splat.kernels.bound import BoundView
 from warp_splat.kernels.falloff import FalloffFunctions, make_falloff
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.kernels.structs import BinsView, PixelsView, Splats2DView
@@ -65,6 +66,7 @@ class Bins:
     slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU; on a GPU empty
     tiles_x: int
     invalid: int | torch.Tensor  # Gaussians left out because an input was not finite or a quaternion was zero
+    bound: BoundView = field(default_factory=BoundView)  # filled in where the blend finds the bound
 
     def view(self) -> BinsView:
         """What every blend kernel reads first."""
@@ -183,9 +185,10 @@ def falloff_of(options: RasterOptions) -> FalloffFunctions:
     return make_falloff(variant_of(options).falloff)
 
 
-def variant_of(options: RasterOptions, keep: bool = False) -> BlendVariant:
-    """What the kernels are compiled for; with ``keep``, every transmittance is stored."""
-    return BlendVariant(3 + options.depth, options.exp_degree if options.falloff is None else options.falloff, keep)
+def variant_of(options: RasterOptions, keep: bool = False, bound: bool = False) -> BlendVariant:
+    """What the kernels are compiled for; see :class:`BlendVariant`."""
+    falloff = options.exp_degree if options.falloff is None else options.falloff
+    return BlendVariant(3 + options.depth, falloff, keep, bound)
 
 
 def alphas_of(options: RasterOptions) -> wp.vec2:

@@ -97,8 +97,8 @@ class Driver:
         pixels = Pixels.empty(camera, options, background)
         final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.layout.counts)
         saved = Saved(final, count, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
-        kernel = self.kernels.blend(variant_of(options, keep))
-        inputs = [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32)]
+        kernel = self.kernels.blend(variant_of(options, keep, options.bound))
+        inputs = [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32), bins.bound]
         self.launch_tiles(kernel, bins, inputs, [pixels.view(), *self.view_walk(*saved)])
         return pixels, saved
 

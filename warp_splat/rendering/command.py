@@ -29,6 +29,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
+from warp_splat.rendering.certificates import write_bounds
 from warp_splat.rendering.photographed import as_photographed
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
@@ -65,12 +66,14 @@ def render_model(config: RenderConfig) -> int:
         if model_folder.read_refined(config.model_path, iteration):
             say(f"The cameras are those of the model, which were refined in iteration {iteration}.")
     options, linear = options_of(trained), is_linear(scene, trained)
+    options = replace(options, of=config.of, tolerance=config.tolerance or None)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
         white = bool(trained.get("white_background"))
         harmonics = model_folder.read_environment(config.model_path, iteration)
         exposures = read_exposures(config.model_path, iteration)
         picture = make_picture(model.to(device), white, options, linear, harmonics, exposures)
+        certified = make_renderer(model, white, replace(options, bound=True), harmonics)
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -80,6 +83,7 @@ def render_model(config: RenderConfig) -> int:
                 written = folder / "train" / f"ours_{iteration}"
                 write_views(picture, scene.train, written)
                 print(f"  train  {len(scene.train)} views in {written}")
+                _certify(config, certified, scene.train, written)
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}
                 where = None
@@ -88,8 +92,16 @@ def render_model(config: RenderConfig) -> int:
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
+                _certify(config, certified, scene.test, folder / "test" / f"ours_{iteration}")
                 print(f"  {metrics_line(means)}: {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
     return 0
+
+
+def _certify(config: RenderConfig, draw: Callable[..., RenderOutput], views: list[View], folder: Path) -> None:
+    """Write how wrong pixels may be, if asked for."""
+    if config.bound:
+        largest = write_bounds(draw, views, folder)
+        print(f"  no pixel is farther from the {config.of} than {largest:.1e}: {folder / 'bound'}")
 
 
 def _check(config: RenderConfig) -> None:

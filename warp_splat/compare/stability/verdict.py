@@ -93,6 +93,7 @@ class Case:
     claim: str  # the stated outcome
     run: Callable[[str], Outcome]
     modal: bool = True
+    build: Callable[[], Problem] | None = None  # of a case that is rendered
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,4 +276,4 @@ def _summary(image: torch.Tensor, gradients: dict[str, torch.Tensor]) -> str:
 
 def rendered(name: str, group: str, claim: str, build: Callable[[], Problem]) -> Case:
     """A case that compares a render and its gradients with the oracle's."""
-    return Case(name, group, claim, lambda mode: judge(truth(build), mode))
+    return Case(name, group, claim, lambda mode: judge(truth(build), mode), build=build)

@@ -34,8 +34,10 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.bound import BoundView, skipped
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
+from warp_splat.kernels.cpu.settle import SETTLED, make_settle
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, total, vec16, where_less
@@ -135,17 +137,24 @@ def walk(bins, near, start, count, way, x0, y0, out, begin, step, finish):
 def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     CHANNELS = variant.channels
-    T, WALKED, RGB, DEPTH, STATE = 0, BLOCKS, 2 * BLOCKS, 5 * BLOCKS, (2 + CHANNELS) * BLOCKS
+    T, WALKED, RGB, DEPTH, SKIPPED = 0, BLOCKS, 2 * BLOCKS, 5 * BLOCKS, (2 + CHANNELS) * BLOCKS
+    STATE = SKIPPED + SETTLED * variant.bound
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
     fall_at, way = make_falloff(variant.falloff).value, 1
+    expect, conclude = make_settle(RGB, SKIPPED, AHEAD)
 
-    def begin(k, here, out):
+    def begin(k, here, out, s, bound, tile, bins, near, length):
         """Instances walked."""
+        if wp.static(variant.bound):
+            expect(s, bound, tile, bins, near, k, length)
         return here + vec16(1.0)
 
-    def step(k, splat, dx, dy, block, here, walked, kept_out, s, alphas, t_min):
+    def step(k, splat, dx, dy, block, here, walked, kept_out, s, alphas, t_min, bound):
         fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
         alpha = alpha_of(fall * splat.opacity, alphas)
+        if wp.static(variant.bound):
+            row = SKIPPED + block
+            s[row] = skipped(fall * splat.opacity, alphas[0], splat.color, bound, s[row])
         behind = advance(s[T + block], alpha, t_min)
         w = weight(s[T + block], alpha, behind)
         if wp.static(variant.keep):
@@ -175,6 +184,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         t_min: float,
         max_steps: int,
         background: wp.array[float],  # [3]
+        bound: BoundView,
         # out
         pixels_out: PixelsView,
         final_out: wp.array2d[vec16],  # [T, BLOCKS] transmittance behind the last Gaussian
@@ -196,6 +206,8 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             s[row] = vec16(0.0)
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
         walk(bins, near, start, length, way, x0, y0, kept_out, begin, step, finish)
+        if wp.static(variant.bound):
+            conclude(s, bound, tile, bins, length)
         for block in range(BLOCKS):
             s[T + block] = wp.max(s[T + block], -s[T + block])
             final_out[tile, block] = s[T + block]

@@ -10,6 +10,8 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.bound import BoundView, Since
+from warp_splat.kernels.cuda.settle import conclude, expect, mat_settled, skip
 from warp_splat.kernels.cuda.warps import (
     COLUMNS,
     WARP,
@@ -69,6 +71,17 @@ def going_of(ts: vec_each, thread: int):
     return going
 
 
+@wp.func
+def write_pixel(pixels_out: PixelsView, background: wp.array[float], y: int, x: int, sums: wp.vec4, t: float):
+    """Write a pixel, if it is one of the image: sums of color and depth, and what shines through."""
+    if y < pixels_out.image.shape[0] and x < pixels_out.image.shape[1]:
+        for channel in range(3):
+            pixels_out.image[y, x, channel] = sums[channel] + t * background[channel]
+        pixels_out.alpha[y, x] = 1.0 - t
+        if pixels_out.depth.shape[0] > 0:
+            pixels_out.depth[y, x] = sums[3]
+
+
 @functools.cache
 def make_blend_block(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
@@ -82,6 +95,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         t_min: float,
         max_steps: int,
         background: wp.array[float],  # [3]
+        bound: BoundView,
         # out
         pixels_out: PixelsView,
         final_out: wp.array2d[float],  # [T, THREADS] transmittance behind the last Gaussian
@@ -97,6 +111,8 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         top = float(line) + 0.5
         start = bins.ranges[tile][0]
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
+        settled = mat_settled()
+        since = Since()
         ts = vec_each(1.0)
         counts = vec_each(float(length))
         reds = vec_each(0.0)
@@ -112,11 +128,16 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         going = going_of(ts, thread)
         for batch in range((length + BATCH - 1) // BATCH):
             first = batch * BATCH
+            if wp.static(variant.bound):
+                settled, since = expect(
+                    settled, ts, reds, greens, blues, bound, since, bins, tile, lane, half, start + first,
+                    wp.min(BATCH, length - first),
+                )  # fmt: skip
             mine = vec12(0.0)
             if first + thread < length:
                 splat = bins.splats[bins.instances[start + first + thread]]
-                touched = int(-1)  # every T is kept
-                if wp.static(not variant.keep):
+                touched = int(-1)  # every T is kept, or every pixel's bound
+                if wp.static(not (variant.keep or variant.bound)):
                     touched = blocks_of(splat, 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0]), left, top)
                 mine = with_blocks(staged_of(splat), touched)
             staged = wp.tile(mine, preserve_type=True)
@@ -138,6 +159,9 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
                             dy = g[MEAN_Y] - (top + float(down_of(lane, half + p)))
                             fall = fall_at(exponent(dx, dy, g[XX], g[XY], g[YY]))
                             alpha = alpha_of(fall * g[OPACITY], alphas)
+                            if wp.static(variant.bound):
+                                color = wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2])
+                                settled = skip(settled, p, fall * g[OPACITY], alphas[0], color, bound)
                             behind = advance(ts[p], alpha, t_min)
                             if behind < 0.0:
                                 counts[p] = wp.min(counts[p], here)
@@ -161,14 +185,9 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             t = wp.abs(ts[p])
             final_out[tile, down * TILE + across] = t
             count_out[tile, down * TILE + across] = int(counts[p])
-            y = line + down
-            x = column + across
-            if y < pixels_out.image.shape[0] and x < pixels_out.image.shape[1]:
-                pixels_out.image[y, x, 0] = reds[p] + t * background[0]
-                pixels_out.image[y, x, 1] = greens[p] + t * background[1]
-                pixels_out.image[y, x, 2] = blues[p] + t * background[2]
-                pixels_out.alpha[y, x] = 1.0 - t
-                if wp.static(CHANNELS > 3):
-                    pixels_out.depth[y, x] = fars[p]
+            shown = wp.vec4(reds[p], greens[p], blues[p], fars[p])
+            write_pixel(pixels_out, background, line + down, column + across, shown, t)
+            if wp.static(variant.bound):
+                conclude(settled, p, shown, ts[p], bound, since, bins, tile, lane, half, length)
 
     return blend

@@ -51,6 +51,7 @@ def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
         height: int,
         alpha_min: float,
         square: int,  # 1: look at the square of the reference instead of the ellipse
+        boxes: int,  # 1: list all tiles of the box
         # out
         gaussians_out: wp.array[int],  # [N] that order
         splats_out: wp.array[Splat2D],  # [N]; undefined where not drawn
@@ -63,7 +64,7 @@ def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
         if splats2d.radii[i] > 0:
             top, below = tile_rows_of(splat, height)
             for row in range(top, below):
-                _left, count = tiles_of_row(splat, row, width, square)
+                _left, count = tiles_of_row(splat, row, width, boxes)
                 found += count
         gaussians_out[rank] = i
         splats_out[rank] = splat

@@ -1,0 +1,161 @@
+"""Error against run time: a tolerance, and each knob of the forward pass alone.
+
+Truth is float64 without any cut, at random pixels of one view. A training view is shrunk to --width. Errors are those
+of the worst of these pixels and of half of them; the bound is found with a tolerance alone.
+
+    python benchmarks/tolerance.py -s SCENE -m MODEL [-s SCENE -m MODEL ...] [--crowd 1000000] [--out docs/benchmarks]
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+import torch
+from common import interleaved_medians, machine, write_table
+from made_up import cameras, make_crowd
+
+from warp_splat.camera import Camera
+from warp_splat.compare import oracle
+from warp_splat.compare.knobs import KNOBS
+from warp_splat.config import ALPHA_MIN, RasterOptions
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
+from warp_splat.runtime import launch, pool
+from warp_splat.scene import load_scene
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+HEADERS = ("scene", "options", "error, worst", "error, median", "bound, worst", "bound, median", "bound : error")
+HEADERS += ("times default", "adjoint")
+ROUNDS = 5
+
+
+def variants() -> dict[str, tuple[str, RasterOptions]]:
+    """By name: the curve that it belongs to, and the options."""
+    found = {"default": ("default", RasterOptions(bound=True))}
+    for of in ("ideal", "trained"):
+        for tolerance in TOLERANCES:
+            found[f"tolerance {tolerance:g}, {of}"] = (f"tolerance, {of}", RasterOptions(tolerance=tolerance, of=of))
+    for knob, values in KNOBS.items():
+        for value in values:
+            if value != getattr(RasterOptions(), knob):
+                shown = f"{value:.3g}" if isinstance(value, float) else value
+                found[f"{knob} {shown}"] = (knob, RasterOptions(**{knob: value}))
+    return found
+
+
+def exact(gaussians: Gaussians, camera: Camera, pixels: torch.Tensor, alpha_min: float, at_once: int) -> torch.Tensor:
+    """The ideal at ``pixels`` [P, 2], [P, 3] float64; with ``alpha_min``, what is trained."""
+    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double() for tensor in gaussians)
+    splats = (means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1))
+    cuts = {"alpha_min": alpha_min, "t_min": 0.0}
+    parts = [oracle.exact_render(*splats, camera, pixels=part, **cuts).image for part in pixels.split(at_once)]
+    return torch.cat(parts)
+
+
+def measure(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
+    """A row for each variant."""
+    generator, black = torch.Generator().manual_seed(0), torch.zeros(3)
+    sides = (camera.height, camera.width)
+    pixels = torch.stack([torch.randint(0, side, (count,), generator=generator) for side in sides], 1)
+    at_once = max(2_000_000 // len(gaussians.means), 1)
+    truths = {
+        of: exact(gaussians, camera, pixels, alpha_min, at_once)
+        for of, alpha_min in (("ideal", 0.0), ("trained", ALPHA_MIN))
+    }
+    leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in gaussians))
+
+    def adjoint(options: RasterOptions) -> None:
+        render(leaves, camera, black, options).image.sum().backward()
+
+    rows, forward, both = [], {}, {}
+    for variant, (curve, options) in variants().items():
+        with torch.no_grad():
+            out = render(gaussians, camera, black, options)
+        rows_of, columns_of = pixels.T
+        error = (out.image[rows_of, columns_of].double() - truths[options.of]).abs().amax(1)
+        row = {"scene": name, "options": variant, "curve": curve, "of": options.of}
+        row |= {"worst": error.max().item(), "median": error.median().item()}
+        if out.bound is not None:
+            bound = out.bound[rows_of, columns_of]
+            ratio = bound / error.clamp_min(1e-9)
+            row |= {"bound": bound.max().item(), "bound_median": bound.median().item()}
+            row |= {"ratio": ratio.median().item(), "ratio_99": ratio.quantile(0.99).item()}
+            row |= {"exceeded": int((error > bound).sum())}
+        rows.append(row)
+        timed = replace(options, bound=False)
+        forward[variant] = lambda options=timed: render(gaussians, camera, black, options)
+        both[variant] = lambda options=timed: adjoint(options)
+    with torch.no_grad():
+        seconds = interleaved_medians(forward, ROUNDS)
+        bounded = {
+            "bound": lambda: render(gaussians, camera, black, RasterOptions(bound=True)),
+            "none": lambda: render(gaussians, camera, black, RasterOptions()),
+        }
+        cost = interleaved_medians(bounded, 4 * ROUNDS)
+    with_adjoint = interleaved_medians(both, ROUNDS)
+    for row in rows:
+        variant = row["options"]
+        row |= {"seconds": seconds[variant], "times": seconds[variant] / seconds["default"]}
+        row["adjoint"] = with_adjoint[variant] / with_adjoint["default"]
+    rows[0]["cost of bound"] = cost["bound"] / cost["none"]
+    return rows
+
+
+def plot(path: Path, rows: list[dict]) -> None:
+    """Worst error over time, one panel for each scene."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    _, panels = plt.subplots(1, len(scenes), figsize=(5 * len(scenes), 4), squeeze=False)
+    for axes, scene in zip(panels[0], scenes, strict=True):
+        for curve in dict.fromkeys(row["curve"] for row in rows if row["of"] == "ideal"):
+            points = sorted(
+                (row["times"], row["worst"]) for row in rows if (row["scene"], row["curve"]) == (scene, curve)
+            )
+            style = {"linewidth": 2.5, "color": "black"} if curve.startswith("tolerance") else {"alpha": 0.8}
+            axes.loglog(*zip(*points, strict=True), marker="o", markersize=4, label=curve, **style)
+        axes.set(title=scene, xlabel="time of the forward pass, times the default's", ylabel="error of the worst pixel")
+        axes.grid(alpha=0.3)
+    panels[0][0].legend(fontsize=7)
+    plt.tight_layout()
+    plt.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-s", "--scenes", nargs="*", default=[], action="extend")
+    parser.add_argument("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene")
+    parser.add_argument("--width", type=int, default=480, help="of the view [px]")
+    parser.add_argument("--crowd", type=int, default=0, help="Gaussians of a crowd made up; 0: none")
+    parser.add_argument("--pixels", type=int, default=200)
+    parser.add_argument("--out", type=Path, help="folder for tolerance.md, .json and .png")
+    arguments = parser.parse_args()
+    launch.prepare("cpu", 0)
+    rows: list[dict] = []
+    for folder, model in zip(arguments.scenes, arguments.models, strict=True):
+        view = load_scene(folder, resolution=arguments.width, eval=True, report=lambda _: None).train[0].camera
+        with torch.no_grad():
+            gaussians = GaussianModel.load(model).arranged().activated()
+        rows += measure(Path(folder).name, gaussians, view, arguments.pixels)
+    if arguments.crowd:
+        with torch.no_grad():
+            gaussians = make_crowd(arguments.crowd, "cpu").activated()
+        camera = cameras(arguments.width, arguments.width * 9 // 16, 1)[0]
+        rows += measure(f"crowd of {arguments.crowd}", gaussians, camera, arguments.pixels // 4)
+    keys = ("worst", "median", "bound", "bound_median", "ratio", "times", "adjoint")
+    cells = [(row["scene"], row["options"], *(f"{row[key]:.2g}" if key in row else "" for key in keys)) for row in rows]
+    costs = [f"{row['scene']} {row['cost of bound']:.2f}" for row in rows if "cost of bound" in row]
+    note = (
+        f"{arguments.pixels} pixels of a view {arguments.width} px wide; {pool.get_threads()} threads. With the bound, "
+        f"the default takes so many times as long: {', '.join(costs)}."
+    )
+    write_table("tolerance", arguments.out, HEADERS, cells, note, {"rows": rows, "machine": machine()})
+    if arguments.out:
+        plot(arguments.out / "tolerance.png", rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""No pixel is farther from the ideal than its bound says: the oracle without any cut, in float64."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import warp_splat
+from warp_splat.compare import oracle
+from warp_splat.compare.scenes import cloud, look, tensors
+from warp_splat.compare.stability import cases, verdict
+from warp_splat.compare.truth import for_oracle
+from warp_splat.config import ALPHA_MIN, RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.raster import drivers
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians
+from warp_splat.runtime.pool import get_threads, set_threads
+
+RENDERED = [case for case in cases.CASES if case.build]
+IDEAL = {"alpha_min": 0.0, "t_min": 0.0, "sh_degree": None}
+
+
+def ideal(gaussians, camera, background, options):
+    """What no cut gives, in float64, and where the order of what is blended is beyond doubt."""
+    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.detach().double() for tensor in gaussians)
+    keywords = for_oracle(options) | IDEAL
+    sh = torch.cat([sh_dc, sh_rest], 1)
+    out = oracle.exact_render(means, quats, scales, opacities, sh, camera, background.double(), **keywords)
+    return out.image, ~out.fragile
+
+
+def ratios(gaussians, camera, background, options, sure=None):
+    """Bound over error of the pixels whose order is beyond doubt, after a check that none is below 1."""
+    out = render(gaussians, camera, background, replace(options, bound=True))
+    exact, known = ideal(gaussians, camera, background, options)
+    known = known if sure is None else sure
+    error = (out.image.detach().double() - exact).abs().amax(2)
+    assert out.bound is not None and out.bound.isfinite().all()
+    worst = (error - out.bound)[known].max().item() if known.any() else 0.0
+    assert worst <= 0.0, f"error above its bound by {worst:.1e}, largest error {error.max():.1e}"
+    return (out.bound / error.clamp_min(1e-12))[known]
+
+
+@pytest.mark.parametrize("case", RENDERED, ids=[case.name for case in RENDERED])
+def test_stiff_and_extreme_cases(case):
+    problem = case.build()
+    count = len(problem.gaussians["means"])
+    kept = torch.tensor(sorted(set(range(count)) - set(problem.left_out)), dtype=torch.int64)
+    drawn = replace(problem, gaussians={name: rows[kept] for name, rows in problem.gaussians.items()})
+    leaves = verdict.leaves_of(drawn, torch.float32)
+    with torch.no_grad():
+        gaussians = verdict.activated(drawn, leaves)
+        background = leaves["background"].detach()
+        ratios(gaussians, problem.camera, background, problem.options)
+
+
+def made_up(seed, count, sigma, opacity, aspect, bright, camera):
+    arrays = cloud(seed, count, camera, sigma=sigma, opacity=opacity, aspect=aspect)
+    arrays["sh_dc"] = arrays["sh_dc"] * bright
+    return Gaussians(**{name: rows for name, rows in tensors(arrays).items() if name in Gaussians._fields})
+
+
+OPTIONS = st.fixed_dictionaries(
+    {
+        "alpha_min": st.sampled_from([0.0, 1e-5, ALPHA_MIN, 0.05, 0.4]),
+        "t_min": st.sampled_from([0.0, 1e-4, 0.05, 0.5]),
+        "extent": st.sampled_from(["ellipse", "square"]),
+        "exp_degree": st.sampled_from([5]),
+        "sh_degree": st.sampled_from([None, 0]),
+        "max_steps": st.sampled_from([None, 7]),
+        "antialiasing": st.booleans(),
+        "projection": st.sampled_from(["affine", "ellipsoid", "unscented"]),
+    }
+)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(
+    options=OPTIONS,
+    seed=st.integers(0, 999),
+    count=st.integers(1, 80),
+    largest=st.sampled_from([1.0, 5.0, 60.0]),
+    opacity=st.sampled_from([(0.001, 0.02), (0.05, 0.9), (0.9, 1.0)]),
+    aspect=st.sampled_from([1e-4, 0.05, 0.9]),
+    bright=st.sampled_from([0.0, 1.0, 8.0]),
+    behind=st.sampled_from([0.0, 1.0]),
+)
+def test_random_scenes(options, seed, count, largest, opacity, aspect, bright, behind):
+    camera = look(40, 36)
+    gaussians = made_up(seed, count, (0.3, largest), opacity, aspect, bright, camera)
+    ratios(gaussians, camera, torch.full((3,), behind), RasterOptions(**options))
+
+
+def ordinary():
+    camera = look(70, 50)
+    return made_up(3, 400, (0.5, 6.0), (0.05, 0.9), 0.2, 1.0, camera), camera
+
+
+def test_the_image_is_the_same_and_threads_change_nothing():
+    gaussians, camera = ordinary()
+    black, found, before = torch.zeros(3), [], get_threads()
+    plain = render(gaussians, camera, black, RasterOptions())
+    try:
+        for threads in (1, 3):
+            set_threads(threads)
+            found.append(render(gaussians, camera, black, RasterOptions(bound=True)))
+    finally:
+        set_threads(before)
+    assert torch.equal(found[0].bound, found[1].bound)
+    assert (found[0].image - plain.image).abs().max() < 1e-6
+    assert torch.equal(found[0].image, found[1].image)
+    assert plain.bound is None
+
+
+def test_kernels_of_cuda_find_a_bound_as_well():
+    camera = look(24, 20)
+    gaussians = made_up(5, 60, (0.5, 6.0), (0.05, 0.9), 0.2, 1.0, camera)
+    on_cpu = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True)).bound
+    with drivers.using(drivers.CUDA):
+        ratios(gaussians, camera, torch.zeros(3), RasterOptions())
+        on_cuda = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True)).bound
+    assert np.median(on_cuda / on_cpu) < 1.5
+
+
+def test_less_is_cut_and_the_bound_falls():
+    gaussians, camera = ordinary()
+    found = [
+        render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True, alpha_min=alpha, t_min=alpha**2))
+        for alpha in (0.1, ALPHA_MIN, 1e-4, 1e-6)
+    ]
+    medians = [(out.bound - out.rounding).median().item() for out in found]
+    assert medians == sorted(medians, reverse=True)
+    assert medians[-1] < 1e-2 * medians[0]
+
+
+def test_a_negative_background_is_refused():
+    gaussians, camera = ordinary()
+    with pytest.raises(InputError, match=r"options\.bound: expected a background of one color"):
+        warp_splat.rasterize(
+            *gaussians[:4],
+            (gaussians.sh_dc, gaussians.sh_rest),
+            camera,
+            (-0.1, 0.0, 0.0),
+            options=RasterOptions(bound=True),
+        )
+
+
+@pytest.mark.parametrize("of", ["ideal", "trained"])
+@pytest.mark.parametrize("tolerance", [1e-1, 3e-3])
+def test_cuts_stay_below_a_tolerance(of, tolerance):
+    gaussians, camera = ordinary()
+    options = RasterOptions(tolerance=tolerance, of=of)
+    out = render(gaussians, camera, torch.zeros(3), options)
+    means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double() for tensor in gaussians)
+    keywords = for_oracle(RasterOptions()) | {"t_min": 0.0, "alpha_min": 0.0 if of == "ideal" else ALPHA_MIN}
+    exact = oracle.exact_render(means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), camera, **keywords)
+    error = (out.image - exact.image).abs().amax(2)
+    assert (error <= out.bound)[~exact.fragile].all()
+    above = out.bound - out.rounding > tolerance
+    # where an opacity is 1/255 but for rounding, nothing smaller than what it counts can be said
+    assert above.double().mean() < (0.02 if of == "trained" else 1e-9)
+
+
+def test_a_tolerance_for_each_pixel_and_any_number_of_threads():
+    gaussians, camera = ordinary()
+    tolerance = torch.full((camera.height, camera.width), 1e-1)
+    tolerance[10:20, 30:50] = 1e-4
+    found, before = [], get_threads()
+    try:
+        for threads in (1, 3):
+            set_threads(threads)
+            found.append(render(gaussians, camera, torch.zeros(3), RasterOptions(tolerance=tolerance)))
+    finally:
+        set_threads(before)
+    assert torch.equal(found[0].image, found[1].image)
+    assert (found[0].bound - found[0].rounding <= tolerance).all()
+
+
+def test_gradients_within_a_tolerance():
+    gaussians, camera = ordinary()
+    found = []
+    for options in (RasterOptions(tolerance=1e-4), RasterOptions(alpha_min=1e-9, t_min=1e-9)):
+        leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in gaussians))
+        out = render(leaves, camera, torch.zeros(3), options)
+        out.image.square().sum().backward()
+        found.append([leaf.grad for leaf in leaves])
+    for cut, whole in zip(*found, strict=True):
+        assert (cut - whole).norm() < 2e-3 * whole.norm()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"tolerance": 0.0}, r"options\.tolerance: expected numbers above 0, got 0\.0"),
+        ({"tolerance": "much"}, r"options\.tolerance: expected a number or a tensor \[H, W\], got str"),
+        ({"tolerance": 1e-2, "normals": True}, r"options\.tolerance: expected none of normals beside it"),
+        ({"of": "truth"}, r"options\.of: expected one of ideal, trained, got 'truth'"),
+    ],
+)
+def test_bad_values(options, words):
+    gaussians, camera = ordinary()
+    with pytest.raises(InputError, match=words):
+        warp_splat.rasterize(
+            *gaussians[:4], (gaussians.sh_dc, gaussians.sh_rest), camera, options=RasterOptions(**options)
+        )

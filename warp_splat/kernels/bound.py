@@ -1,0 +1,297 @@
+"""How wrong a pixel can be: what the cuts leave out and what rounding adds. docs/tolerance.md derives every line.
+
+A Gaussian adds to the bound wherever the blend does not look at it: in boxes around it, of which each is larger and its
+alpha outside lower. Boxes are added into differences over blocks of 4 x 4 pixels, in whole numbers, so that their order
+does not matter. There is a map for each of a few ranges of depth: what lies behind others counts as little as it shows.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.falloff import LOG2_E, FalloffFunctions
+from warp_splat.kernels.simd import fill, fma, times, where_less
+from warp_splat.kernels.structs import BinsView, Splats2DView
+from warp_splat.kernels.tiles import square_of
+
+wp.set_module_options(FORWARD_ONLY)
+
+EPS = wp.constant(2.0**-24)  # of float32, half a unit in the last place of 1
+BLOCK = wp.constant(4.0)  # px
+FAINT = 1.0e-13  # alpha at which the last box ends
+SEEN = 0.25  # share of the cut down to which the blend looks: where the tails matter most, they are summed exactly
+SHARE = wp.constant(1.0 / 40.0)  # of that, alpha at which the first box around ends; the second ends at FAINT
+
+
+@wp.struct
+class Rules:
+    """What the bound needs of the camera and the options."""
+
+    focal: wp.vec2  # px
+    principal: wp.vec2  # px
+    alpha_min: float
+    seen: float  # alpha down to which the blend looks
+    faint: float
+    floor: float  # alpha below which the ideal has nothing
+    square: int
+    exp_error: float  # relative
+    unit: float  # of a map's whole numbers
+    usual: float  # brightness of a color; the weight of a brighter one is larger
+
+
+@wp.struct
+class BoundView:
+    """What the blend reads for the bound, and where it writes it."""
+
+    outside: wp.array3d[int]  # [K, rows, columns] of blocks: alpha that no list holds, in units
+    unit: float
+    usual: float
+    floor: float  # alpha below which the ideal has nothing
+    begins: wp.array[float]  # [K] depths at which the maps begin; the first is below all
+    errors: wp.array[wp.vec3]  # [V] of splats: of alpha, relative; alpha that rounding may hide below the cut; of color
+    brightest: float  # of all colors and the background
+    darkest: float  # of the background
+    behind: float  # brightest of the background
+    everywhere: float  # alpha of all Gaussians outside their last box
+    bound_out: wp.array2d[float]  # [H, W]
+    rounding_out: wp.array2d[float]  # [H, W] the part of it that is rounding
+
+
+@wp.struct
+class Since:
+    """What a tile has seen since it settled last."""
+
+    map: int  # that follows
+    steps: float  # entries of the list
+    error: float  # of alpha, relative
+    shade: float  # error of a color
+    hidden: float  # sum of alpha that rounding may hide
+
+
+@wp.func
+def watch(bound: BoundView, since: Since, bins: BinsView, first: int, count: int):
+    """Some entries of the list, from ``first`` on."""
+    for k in range(first, first + count):
+        error = bound.errors[bins.instances[k]]
+        since.steps += 1.0
+        since.error = wp.max(since.error, error[0])
+        since.hidden += error[1]
+        since.shade = wp.max(since.shade, error[2])
+    return since
+
+
+@wp.func
+def next_map(bound: BoundView, begin: int, last: float):
+    """The first map from ``begin`` on that begins farther than ``last``."""
+    end = begin
+    while end < bound.begins.shape[0] and bound.begins[end] <= last:
+        end += 1
+    return end
+
+
+@wp.func
+def outside_of(bound: BoundView, begin: int, end: int, tile: int, tiles_x: int, block: int):
+    """What some maps hold at one of the 16 blocks of a tile."""
+    found = int(0)
+    for depth in range(begin, end):
+        found += bound.outside[depth, (tile // tiles_x) * 4 + (block >> 2), (tile % tiles_x) * 4 + (block & 3)]
+    return float(found) * bound.unit
+
+
+@wp.func
+def brightness(color: wp.vec3, usual: float):
+    """What alpha of that color counts, in units of the usual; no less than 1."""
+    return wp.max(wp.max(color) / usual, 1.0)
+
+
+@wp.func
+def skipped(raw: Any, alpha_min: float, color: wp.vec3, bound: BoundView, before: Any):
+    """Add alpha that the cut leaves out, and the ideal does not, by its :func:`brightness`."""
+    none = fill(0.0, raw)
+    left_out = where_less(raw, fill(alpha_min, raw), where_less(raw, fill(bound.floor, raw), none, raw), none)
+    return fma(left_out, fill(brightness(color, bound.usual), raw), before)
+
+
+@wp.func
+def light_behind(total: Any, gained: Any, before: Any):
+    """What left-out Gaussians take from those behind them, if they were blended: their alpha times that light."""
+    return fma(total, gained, before)
+
+
+@wp.func
+def own_light(t: Any, mass: Any, usual: float, before: Any):
+    """What left-out Gaussians would add, if they were blended; ``mass``: their alpha by :func:`brightness`."""
+    return fma(times(t, usual), mass, before)
+
+
+@wp.func
+def rounding_of(t: Any, after: Any, light: Any, since: Since, brightest: float):
+    """What rounding and colors change between the transmittances ``t`` and ``after``."""
+    passed = t - after
+    own = times(passed, brightest * since.error + since.shade)
+    sums = wp.min(times(light, since.steps * EPS), times(passed, brightest))
+    return fma(t, fill(brightest * (2.0 * EPS * since.steps + since.hidden), t), own + sums)
+
+
+@wp.func
+def all_rounding(rounding: Any, bound: BoundView):
+    """What rounding changes, with that of the last sums."""
+    return (rounding + fill(8.0 * EPS * bound.brightest, rounding)) * 1.001
+
+
+@wp.func
+def all_cuts(taken: Any, added: Any, rest: Any, bound: BoundView):
+    """What cuts change: what is taken and what is added have different signs; the rest lies where the pixel stopped."""
+    return (wp.max(taken, added) + rest + fill(bound.brightest * bound.everywhere, rest)) * 1.001
+
+
+@wp.func
+def first_and_last(mean: float, half: float, blocks: int):
+    """Of a row of blocks, those with a pixel center within ``half`` of ``mean``: the first, one after the last."""
+    most = float(blocks)
+    first = wp.ceil(mean - half - 0.5)
+    last = wp.floor(mean + half - 0.5)
+    low = wp.clamp(wp.floor(first / BLOCK), 0.0, most)
+    high = wp.clamp(wp.floor(last / BLOCK) + 1.0, low, most)
+    if last < first:
+        high = low
+    return int(low), int(high)
+
+
+@wp.func
+def box_of(maps: wp.array4d[int], mean: wp.vec2, half: wp.vec2):
+    """The blocks of a box: left, right, top, bottom, one after the last."""
+    left, right = first_and_last(mean[0], half[0], maps.shape[3] - 1)
+    top, bottom = first_and_last(mean[1], half[1], maps.shape[2] - 1)
+    return wp.vec4i(left, right, top, bottom)
+
+
+@wp.func
+def add_box(maps: wp.array4d[int], band: int, depth: int, box: wp.vec4i, amount: int):
+    """Add ``amount`` to the blocks of a box, as differences."""
+    if box[0] < box[1] and box[2] < box[3] and amount != 0:
+        wp.atomic_add(maps, band, depth, box[2], box[0], amount)
+        wp.atomic_add(maps, band, depth, box[2], box[1], -amount)
+        wp.atomic_add(maps, band, depth, box[3], box[0], -amount)
+        wp.atomic_add(maps, band, depth, box[3], box[1], amount)
+
+
+@wp.func
+def short_axis(conic: wp.vec3):
+    """Variance along the short axis [px^2]."""
+    return 2.0 / (conic[0] + conic[2] + wp.length(wp.vec2(conic[0] - conic[2], 2.0 * conic[1])))
+
+
+@wp.func
+def alpha_error(rules: Rules, mean: wp.vec2, conic: wp.vec3, spread: wp.vec2, size: float, z: float, q: float):
+    """Relative error of alpha at the exponent ``q`` (docs/tolerance.md, Rounding).
+
+    ``spread``: standard deviations along x and y [px]; ``size``: the largest scale; ``z``: depth.
+    """
+    short = short_axis(conic)
+    u = wp.cw_div(mean - rules.principal, rules.focal)
+    aside = 1.0 + wp.dot(u, u)
+    most = wp.max(rules.focal[0], rules.focal[1])
+    long = most * size / z
+    condition = wp.sqrt((3.0 * aside * long * long + wp.dot(spread, spread)) / short)
+    shift = EPS * (2.5 * aside * most + wp.length(mean) + wp.length(rules.principal))
+    return rules.exp_error + 16.0 * EPS * (1.0 + condition * q) + wp.sqrt(2.0 * q / short) * shift
+
+
+@functools.cache
+def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
+    """What of each Gaussian lies outside of where the blend looks, and how far its alpha may be off."""
+    reach_of, fall_at = falloff.reach_of, falloff.value
+
+    @wp.func
+    def beyond(maps: wp.array4d[int], box: wp.vec4i, mean: wp.vec2, sigma: wp.vec2, most: float):
+        """The largest alpha to the left of a box of blocks, to its right, above and below it, rounded up.
+
+        Nothing is beyond the image.
+        """
+        ends = wp.vec4i(0, maps.shape[3] - 1, 0, maps.shape[2] - 1)
+        distances = wp.vec4(
+            (mean[0] + 0.5 - BLOCK * float(box[0])) / sigma[0],
+            (BLOCK * float(box[1]) + 0.5 - mean[0]) / sigma[0],
+            (mean[1] + 0.5 - BLOCK * float(box[2])) / sigma[1],
+            (BLOCK * float(box[3]) + 0.5 - mean[1]) / sigma[1],
+        )
+        found = wp.vec4i()
+        for side in range(4):
+            d = wp.max(distances[side] * 0.9999 - 1.0e-3, 0.0)
+            if box[side] != ends[side]:
+                found[side] = int(wp.ceil(most * fall_at(0.5 * LOG2_E * d * d)))
+        return found
+
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
+    def spread(
+        first: int,  # band of this slice
+        bands: wp.array[int],  # [B + 1] bounds of the bands in the Gaussians
+        splats2d: Splats2DView,  # extents where alpha is `faint`
+        scales: wp.array[wp.vec3],  # [N]
+        rules: Rules,
+        begins: wp.array[float],  # [K]
+        # out
+        maps_out: wp.array4d[int],  # [B or 1, K, rows + 1, columns + 1] differences
+        lost_out: wp.array[int],  # [1] Gaussians of which nothing is known
+        extents_out: wp.array[wp.vec2],  # [N] where alpha is `seen`
+        radii_out: wp.array[int],  # [N]
+        errors_out: wp.array[wp.vec3],  # [N]; that of the color is the caller's
+    ):
+        band = first + wp.tid()
+        here = band % maps_out.shape[0]
+        for i in range(bands[band], bands[band + 1]):
+            radii_out[i] = wp.min(splats2d.radii[i], 0)
+            extents_out[i] = wp.vec2(0.0)
+            if splats2d.radii[i] > 0:
+                mean, conic, opacity = splats2d.means2d[i], splats2d.conics[i], splats2d.opacities[i]
+                z = splats2d.depths[i]
+                far = reach_of(opacity, rules.faint)
+                near = reach_of(opacity, rules.seen)
+                sigma = splats2d.extents[i] / wp.sqrt(far)
+                half = sigma * wp.sqrt(near)
+                size = wp.max(scales[i])
+                error = alpha_error(rules, mean, conic, sigma, size, z, wp.max(0.5 * near, 1.0))
+                hidden = rules.alpha_min * error * (1.0 + error)  # as exp(e) - 1 is less
+                if error > 1.0:  # nothing is known of its place
+                    hidden = opacity
+                errors_out[i] = wp.vec3(wp.where(error > 1.0, 0.0, error * (1.0 + error)), hidden, errors_out[i][2])
+                depth = int(0)
+                while depth + 1 < begins.shape[0] and begins[depth + 1] <= z:
+                    depth += 1
+                loose = wp.exp(wp.min(alpha_error(rules, mean, conic, sigma, size, z, 0.5 * far), 1.0))
+                unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0)  # the blend looks a tenth below a floor
+                if unsure:
+                    wp.atomic_add(lost_out, 0, 1)
+                most = opacity * loose * brightness(splats2d.colors[i], rules.usual) * 1.001 / rules.unit
+                margin = 1.0e-2 + 1.0e-6 * (wp.max(wp.abs(mean)) + wp.max(splats2d.extents[i]))
+                slack = wp.vec2(margin, margin)
+                level = wp.min(rules.seen, opacity)
+                if opacity >= rules.seen:
+                    radius = wp.ceil(float(splats2d.radii[i]) * wp.sqrt(near / far))
+                    radii_out[i] = wp.max(int(wp.min(radius, 1.0e9)), 1)
+                    extents_out[i] = half
+                    if rules.square != 0:
+                        half = square_of(half, conic, near)
+                else:
+                    half = wp.vec2(0.0)
+                seen = box_of(maps_out, mean, half - slack)
+                for step in range(2):
+                    alpha = wp.where(step == 0, wp.max(level * SHARE, rules.faint), rules.faint)
+                    wider = wp.max(sigma * wp.sqrt(reach_of(opacity, alpha)), half) + slack
+                    box = box_of(maps_out, mean, wider)
+                    if rules.floor == 0.0 and not unsure and wp.length_sq(box - seen) != 0:
+                        most_of = beyond(maps_out, seen, mean, sigma, most)
+                        left = wp.vec4i(box[0], seen[0], box[2], box[3])
+                        right = wp.vec4i(seen[1], box[1], box[2], box[3])
+                        above = wp.vec4i(seen[0], seen[1], box[2], seen[2])
+                        below = wp.vec4i(seen[0], seen[1], seen[3], box[3])
+                        add_box(maps_out, here, depth, left, most_of[0])
+                        add_box(maps_out, here, depth, right, most_of[1])
+                        add_box(maps_out, here, depth, above, most_of[2])
+                        add_box(maps_out, here, depth, below, most_of[3])
+                    seen = box
+
+    return spread

@@ -1,0 +1,119 @@
+"""The bound beside the CPU's blend: what was skipped is settled where a map of depth begins, and at the end.
+
+So it costs the loop over blocks one sum. Sixteen rows each, one for every block of pixels.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_splat.config import TILE
+from warp_splat.kernels.bound import (
+    BoundView,
+    Since,
+    all_cuts,
+    all_rounding,
+    light_behind,
+    next_map,
+    outside_of,
+    own_light,
+    rounding_of,
+    watch,
+)
+from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.simd import LANES, times, vec16, where_less
+from warp_splat.kernels.splat import Splat2D
+from warp_splat.kernels.structs import BinsView
+
+wp.set_module_options(FORWARD_ONLY)
+
+BLOCKS = TILE * TILE // LANES
+SETTLED = 9 * BLOCKS + 1  # rows
+
+
+@functools.cache
+def make_settle(rgb: int, skipped: int, ahead: int) -> tuple[wp.Function, wp.Function]:
+    """What settles before entries, and what concludes.
+
+    ``rgb`` and ``skipped``: the first rows of the colors and of what was skipped. Transmittances are the first of all.
+    ``ahead``: entries of the list that are read together.
+    """
+    TOTAL, TAKEN, ADDED, ROUNDING, BEFORE, LIGHT = (skipped + row * BLOCKS for row in range(1, 7))
+
+    @wp.func
+    def settle(s: wp.array[vec16], bound: BoundView, since: Since, tile: int, tiles_x: int, end: int):
+        """The sums up to here, where the map ``end`` follows those that begin."""
+        begin = since.map
+        block = int(0)
+        while block < BLOCKS:  # Warp would unroll a range
+            t = wp.max(s[block], -s[block])
+            gained = vec16(0.0)
+            light = vec16(0.0)
+            for channel in range(3):
+                now = s[rgb + channel * BLOCKS + block]
+                gained = wp.max(gained, now - s[LIGHT + channel * BLOCKS + block])
+                light = wp.max(light, now)
+                s[LIGHT + channel * BLOCKS + block] = now
+            q = s[skipped + block]
+            total = s[TOTAL + block] + q
+            before = wp.max(s[BEFORE + block], t)
+            s[TAKEN + block] = light_behind(total, gained, s[TAKEN + block])
+            s[ROUNDING + block] = s[ROUNDING + block] + rounding_of(before, t, light, since, bound.brightest)
+            outside = vec16(outside_of(bound, begin, end, tile, tiles_x, block))
+            added = own_light(before, q, bound.usual + since.shade, s[ADDED + block])
+            s[ADDED + block] = own_light(t, outside, bound.usual, added)
+            s[TOTAL + block] = total + outside
+            s[BEFORE + block] = t
+            s[skipped + block] = vec16(0.0)
+            block += 1
+        started = Since()
+        started.map = end
+        return started
+
+    @wp.func
+    def memory(s: wp.array[vec16]):
+        """What is known since the sums were settled last, in the last row."""
+        return wp.array(ptr=s.ptr + wp.uint64(64 * (s.shape[0] - 1)), shape=(1,), dtype=Since)
+
+    @wp.func
+    def expect(
+        s: wp.array[vec16], bound: BoundView, tile: int, bins: BinsView, near: wp.array[Splat2D], k: int, length: int
+    ):
+        """Before ``ahead`` entries from ``k`` on, which are ``near``."""
+        start = bins.ranges[tile][0]
+        if (k - start) & (ahead - 1) != 0:
+            return
+        count = wp.min(ahead, start + length - k)
+        since = memory(s)
+        end = next_map(bound, since[0].map, near[count - 1].depth)
+        if end > since[0].map:
+            since[0] = settle(s, bound, since[0], tile, bins.tiles_x, end)
+        since[0] = watch(bound, since[0], bins, k, count)
+
+    @wp.func
+    def conclude(s: wp.array[vec16], bound: BoundView, tile: int, bins: BinsView, length: int):
+        """The bound of every pixel, which saw ``length`` entries of the list."""
+        since = memory(s)
+        settle(s, bound, since[0], tile, bins.tiles_x, bound.begins.shape[0])
+        tiles_x = bins.tiles_x
+        cut = bins.ranges[tile][1] - bins.ranges[tile][0] > length
+        left = (tile % tiles_x) * TILE
+        top = (tile // tiles_x) * TILE
+        block = int(0)
+        while block < BLOCKS:
+            t = wp.max(s[block], -s[block])
+            stopped = where_less(s[block], vec16(0.0), vec16(1.0), vec16(wp.where(cut, 1.0, 0.0)))
+            hidden = times(stopped, wp.max(bound.brightest - bound.darkest, bound.behind))
+            last = wp.max(times(stopped, bound.brightest), vec16(bound.behind))
+            taken = light_behind(s[TOTAL + block], times(t, last), s[TAKEN + block])
+            rounding = all_rounding(s[ROUNDING + block], bound)
+            found = all_cuts(taken, s[ADDED + block], times(t, hidden), bound) + rounding
+            for lane in range(LANES):
+                y = top + 4 * (block >> 2) + lane // 4
+                x = left + 4 * (block & 3) + lane % 4
+                if y < bound.bound_out.shape[0] and x < bound.bound_out.shape[1]:
+                    bound.bound_out[y, x] = found[lane]
+                    bound.rounding_out[y, x] = rounding[lane]
+            block += 1
+
+    return expect, conclude
