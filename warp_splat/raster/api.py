@@ -229,9 +229,8 @@ def render(
     if certificate:
         more |= {"bound": certificate.bound, "rounding": certificate.rounding}
         splats = splats._replace(radii=drawn.radii[: len(splats.radii)])
-    all_valid = (
-        isinstance(blending.bins.invalid, int) and not blending.bins.invalid
-    )  # a GPU would have to stop for the answer
+    invalid = blending.bins.invalid
+    all_valid = isinstance(invalid, int) and not invalid  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,
         alpha=alpha,
