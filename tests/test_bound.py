@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -15,10 +16,13 @@ from warp_splat.compare.stability import cases, verdict
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ALPHA_MIN, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.formats.png import load_png
 from warp_splat.raster import drivers
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
+from warp_splat.rendering.certificates import write_bounds
 from warp_splat.runtime.pool import get_threads, set_threads
+from warp_splat.scene.types import View
 
 RENDERED = [case for case in cases.CASES if case.build]
 IDEAL = {"alpha_min": 0.0, "t_min": 0.0, "sh_degree": None}
@@ -190,6 +194,18 @@ def test_gradients_within_a_tolerance():
         found.append([leaf.grad for leaf in leaves])
     for cut, whole in zip(*found, strict=True):
         assert (cut - whole).norm() < 2e-3 * whole.norm()
+
+
+def test_pictures_of_the_bound(tmp_path):
+    gaussians, camera = ordinary()
+    out = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True))
+    photo = np.zeros((camera.height, camera.width, 3), np.uint8)
+    largest = write_bounds(lambda _camera: out, [View("a", camera, photo, camera)], tmp_path)
+    assert largest == out.bound.max().item()
+    read = oiio.ImageBuf(str(tmp_path / "bound" / "00000.exr")).get_pixels(oiio.FLOAT)
+    assert np.array_equal(read[..., 0], out.bound.numpy())
+    height, width, _ = load_png(tmp_path / "bound" / "00000.png").shape
+    assert height == camera.height and width > camera.width  # the scale is beside it
 
 
 @pytest.mark.parametrize(

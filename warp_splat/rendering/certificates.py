@@ -33,6 +33,7 @@ def write_bounds(draw: Callable[..., RenderOutput], views: list[View], folder: P
         bound = draw(view.camera).bound
         assert bound is not None
         values = bound.cpu().numpy()
+        (folder / "bound").mkdir(parents=True, exist_ok=True)
         largest = max(largest, float(values.max()))
         save_scaled(folder / "bound" / f"{index:05d}.png", values)
         save_exr(folder / "bound" / f"{index:05d}.exr", values)
