@@ -181,13 +181,12 @@ def main() -> None:
     costs = [f"{row['scene']} {row['cost of bound']:.2f}" for row in rows if "cost of bound" in row]
     note = (
         f"{arguments.pixels} pixels of a view {arguments.width} px wide; {pool.get_threads()} threads. With the bound, "
-        f"the default takes so many times as long: {', '.join(costs)}. In {len(extreme)} stiff and extreme cases, bound "
-        f"over error is {ratios[len(ratios) // 2]:.0f} in the median case. {exceeded} pixels were off by more than "
-        "their bound."
+        f"the default takes so many times as long: {', '.join(costs)}. In {len(extreme)} stiff and extreme cases, "
+        f"bound over error is {ratios[len(ratios) // 2]:.0f} in the median case. {exceeded} pixels were off by more "
+        "than their bound."
     )
-    write_table(
-        "tolerance", arguments.out, HEADERS, cells, note, {"rows": rows, "stiff": extreme, "machine": machine()}
-    )
+    data = {"rows": rows, "stiff": extreme, "machine": machine()}
+    write_table("tolerance", arguments.out, HEADERS, cells, note, data)
     if arguments.out:
         plot(arguments.out / "tolerance.png", rows)
 
