@@ -125,7 +125,10 @@ PANORAMA = {"model": "EQUIRECTANGULAR", "coefficients": ()}
         (lambda: picture("ORTHO"), "Lens model: expected one of SIMPLE_RADIAL, .*, got 'ORTHO'"),
         (lambda: picture(coefficients=(0.1, 0.2)), r"Lens OPENCV: expected 4 finite coefficients, got \(0.1, 0.2\)"),
         (lambda: picture(coefficients=(0.1, 0.2, 0.0, np.nan)), "expected 4 finite coefficients"),
-        (lambda: picture(coefficients=(-0.5, 0, 0, 0)), "Camera lens OPENCV: .* fold it 39 degrees from the axis"),
+        (
+            lambda: picture(coefficients=(-0.5, 0, 0, 0)),
+            "Camera lens OPENCV: expected .* fold it 39 degrees from the axis",
+        ),
         (
             lambda: picture("OPENCV_FISHEYE", (-0.5, 0, 0, 0), focal=(9, 9)),
             "Camera lens OPENCV_FISHEYE: expected .* fold it 47 degrees",

@@ -14,6 +14,7 @@ from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
 from warp_splat.training.config_file import OF_ONE_RUN, read_config, write_config
 from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import PARTS
 from warp_splat.training.photographs import shares_of_size, shrink_at
 from warp_splat.training.trainer import Trainer
 
@@ -41,10 +42,16 @@ def test_every_option_survives_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("train --parts random_background --no-random_background", "--parts random_background; leave one of them out"),
+        (
+            "train --parts random_background --no-random_background",
+            "got --parts random_background; leave one of them out",
+        ),
         ("train --parts auto --no-random_background", "got --parts auto; name the parts to use"),
         ("train --parts floaters,floaters", "--parts floaters,floaters: expected each part once, got floaters twice"),
-        ("train --parts random_background,weather", "--parts: expected auto, or some of random_background, sky,"),
+        (
+            "train --parts random_background,weather",
+            f"--parts: expected auto, or some of {', '.join(PARTS)} between commas",
+        ),
         ("train --port 0", "--port: expected 1 to 65535, got 0."),
         ("train --lambda_dssim 1.5", "--lambda_dssim: expected a finite number, 0 to 1, got 1.5."),
         ("train --opacity_lr nan", "--opacity_lr: expected a finite number, at least 0, got nan."),
@@ -57,7 +64,10 @@ def test_every_option_survives_the_file(tmp_path):
         ("train --minutes -2", "--minutes: expected more than 0, got -2"),
         ("train --minutes nan", "--minutes: expected more than 0, got nan"),
         ("train --minutes inf", "--minutes: expected a finite number"),
-        ("train --minutes 3 --iterations 100", "no --iterations beside it, since it plans the steps"),
+        (
+            "train --minutes 3 --iterations 100",
+            "--minutes: expected no --iterations beside it, since it plans the steps",
+        ),
         ("train --minutes 3 --densify_until_iter 100", "--minutes: expected no --densify_until_iter beside it"),
         ("train --depth_l1_weight_final=0 --parts depth", "--depth_l1_weight_final: expected a positive number"),
         ("train --pose_lr=-1", "--pose_lr: expected"),

@@ -170,7 +170,11 @@ def test_every_room_can_be_imported():
     ("make", "run", "words"),
     [
         (write_colmap, lambda root: load_scene(root, report=str), ("COLMAP model", "sparse")),
-        (lambda root: write_transforms(root, k1=0.1), lambda root: load_scene(root, report=str), ("OPENCV", "frame 0")),
+        (
+            lambda root: write_transforms(root, k1=0.1),
+            lambda root: load_scene(root, report=str),
+            ("lens OPENCV", "frame 0"),
+        ),
         (plain_photos, lambda root: sfm(SfmConfig(str(root), str(root / "scene"))), ("warp-splat sfm",)),
     ],
     ids=["COLMAP", "distortion", "sfm"],

@@ -127,7 +127,10 @@ BAD = {
         colmap_case(lambda root: [(root / "images" / name).unlink() for name in ("b.png", "c.png")]),
         ["images", "2 of them cannot be found", "'b.png'"],
     ),
-    "no-image-folder": (colmap_case(options={"images": "images_4"}), ["images_4", "3 of them cannot", "--images"]),
+    "no-image-folder": (
+        colmap_case(options={"images": "images_4"}),
+        ["images_4", "3 of them cannot be found", "--images"],
+    ),
     "cut-image": (image_case(lambda path: cut(path, 0.5)), ["c.png", "complete image"]),
     "cut-jpeg": (image_case(lambda path: cut(path, 0.7), ["a.jpg"]), ["a.jpg", "complete image", "Premature end"]),
     "empty-image": (image_case(lambda path: cut(path, 0)), ["c.png", "complete image"]),

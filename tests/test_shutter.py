@@ -157,11 +157,11 @@ def test_two_poses_make_a_shutter():
         (lambda c: replace(c, shutter=0.1), r"Camera shutter: expected a warp_splat\.Shutter or None, got 0.1"),
         (
             lambda c: replace(c, shutter=Shutter((0.9, 0, 0))),
-            "Camera shutter: expected a turn that moves .* half",
+            "Camera shutter: expected a turn that moves .* by at most half",
         ),
         (
             lambda c: Camera.rolling(c, replace(c, rotation=HALF_TURN @ c.rotation)),
-            "Camera.rolling: expected a turn",
+            "Camera.rolling: expected a turn of at most 1 rad",
         ),
     ],
 )
@@ -172,7 +172,9 @@ def test_bad_input(make, message):
 
 def test_a_projection_of_ones_own_knows_no_shutter():
     scene, own = scene_of("rolling single"), RasterOptions(projection=affine.PROJECTION)
-    with pytest.raises(InputError, match=r"options\.projection: expected one by name for a camera with a rolling"):
+    with pytest.raises(
+        InputError, match=r"options\.projection: expected one by name for a camera with a rolling shutter"
+    ):
         rasterize(*scene.parameters(), scene.camera, options=own)
 
 

@@ -152,7 +152,11 @@ def parts(tmp_path):
         ("means", [], "no object 'means' in its meta.json"),
         ("means.files", ["means_l.webp"], "no name of image 1 of 'means'"),
         ("means.files", ["means_l.webp", "none.webp"], "no file 'none.webp' in it"),
-        ("means.files", ["means_l.webp", "shN_centroids.webp"], "'shN_centroids.webp' of 192x1 pixels|broadcast"),
+        (
+            "means.files",
+            ["means_l.webp", "shN_centroids.webp"],
+            "an image 'shN_centroids.webp' of 192x1 pixels|broadcast",
+        ),
         ("means.mins", [0, 1], "mins that are not 3 numbers"),
         ("means.mins", [0, 1, 10**400], "too large"),
         ("scales.codebook", [0.0] * 255, "codebook that are not 256 numbers"),
