@@ -114,7 +114,11 @@ def test_flags_exist(page):
 @functools.cache
 def benchmark_flags():
     scripts = [*(ROOT / "benchmarks").glob("*.py"), *DOCS.glob("*.py")]
-    return {flag for script in scripts for flag in re.findall(r'add_argument\([^)]*"(--\w+)"', script.read_text())}
+    return {
+        flag
+        for script in scripts
+        for flag in re.findall(r'(?:add_argument|option)\([^)]*"(--\w+)"', script.read_text())
+    }
 
 
 def test_every_input_and_output_has_its_test():
