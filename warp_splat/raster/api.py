@@ -112,7 +112,7 @@ def rasterize(
         InputError: if a shape, dtype, device or value is not as stated (the message names the argument), or if the
             memory does not suffice.
     """
-    return _checked(means, quats, scales, opacities, sh, [camera], background, adjoint, options, features)[0]
+    return rasterize_views(means, quats, scales, opacities, sh, [camera], background, adjoint, options, features)[0]
 
 
 def rasterize_views(
@@ -153,13 +153,6 @@ def rasterize_views(
     """
     if isinstance(cameras, (Camera, CameraParameters)) or not isinstance(cameras, Sequence):
         raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
-    return _checked(means, quats, scales, opacities, sh, cameras, background, adjoint, options, features)
-
-
-def _checked(
-    means, quats, scales, opacities, sh, cameras, background, adjoint, options, features
-) -> list[RenderOutput]:
-    """See :func:`rasterize_views`."""
     for camera in cameras:
         check_camera(camera)
     options = check_options(adjoint, options)

@@ -151,6 +151,24 @@ def intrinsics_gradient(
     return torch.tensor(sums + np.array([0.0, time[0], 0.0, time[1]]) / camera.height).to(intrinsics)
 
 
+def coefficients_gradient(lens: Lens, found: list[torch.Tensor], coefficients: torch.Tensor) -> torch.Tensor:
+    """Of a lens's coefficients, like them; ``found``: of each group, of the formula's."""
+    total = in_pairs(torch.cat(found)).cpu().numpy()
+    return torch.tensor((total[:, None] * _prepared(lens)).sum(0)).to(coefficients)
+
+
+def _prepared(lens: Lens) -> np.ndarray:
+    """Derivatives of the formula's coefficients by the model's, [K, C], by differences: most are one and the same."""
+    columns = []
+    for index, value in enumerate(lens.coefficients):
+        step = 1e-5 * max(1.0, abs(value))
+        ends = [list(lens.coefficients) for _ in range(2)]
+        ends[0][index], ends[1][index] = value + step, value - step
+        above, below = (np.array(Lens(lens.model, tuple(end)).numbers) for end in ends)
+        columns.append((above - below) / (ends[0][index] - ends[1][index]))
+    return np.stack(columns, 1)
+
+
 def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> np.ndarray:
     """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
     count = len(like)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,12 +24,17 @@ from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES, vec16
 from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.lenses import Lens
-from warp_splat.raster.camera_parameters import CameraParameters, intrinsics_gradient, pose_gradient, twist_gradient
+from warp_splat.raster.camera_parameters import (
+    CameraParameters,
+    coefficients_gradient,
+    intrinsics_gradient,
+    pose_gradient,
+    twist_gradient,
+)
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.raster.lens_gradient import bent_groups, coefficients_gradient
 from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
-from warp_splat.runtime.launch import filled_up, launch, pack_struct, view
+from warp_splat.runtime.launch import filled_up, lanes_of, launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
 
@@ -85,6 +90,17 @@ def projection_of(options: RasterOptions, lens: Lens | None = None, learned: boo
     return own or (module.through(lens.family, learned) if lens else module.PROJECTION)
 
 
+class Projecting(NamedTuple):
+    """One projection: through which camera, by which kernels."""
+
+    camera: Camera
+    cam: CameraView
+    kernel: wp.Kernel
+    bend: wp.Kernel | None  # whose adjoint takes the place of the kernel's where a lens is learned
+    driver: Driver
+    dropped: Dropped
+
+
 def project(
     gaussians: Gaussians,
     camera: Camera | CameraParameters,
@@ -103,12 +119,12 @@ def project(
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     projection = projection_of(options, camera.lens)
     kernel = make_project(projection, reach_of, driver.lanes, exposed_by(camera, options, driver.lanes))
-    return Splats2D(*Project.apply(*gaussians, *learned, camera, cam, kernel, bend, driver, dropped or Dropped()))
+    it = Projecting(camera, cam, kernel, bend, driver, dropped or Dropped())
+    return Splats2D(*Project.apply(*gaussians, *learned, it))
 
 
-def _in_groups(
-    launch_groups: Callable[..., list[torch.Tensor]],
-    lanes: int,
+def _launch_geometry(
+    it: Projecting,
     inputs: Sequence[torch.Tensor],
     outputs: Sequence[torch.Tensor],
     adj_inputs: Sequence[torch.Tensor] = (),
@@ -116,60 +132,63 @@ def _in_groups(
 ) -> list[torch.Tensor]:
     """The geometry of N Gaussians; or, with adjoints, the adjoint of that, added to ``adj_inputs``.
 
-    In groups of ``lanes``: the last ones are filled up with zeros, which are no Gaussians.
+    In groups of lanes: the last ones are filled up with zeros, which are no Gaussians.
 
     Args:
-        launch_groups: takes the other arguments of a multiple of ``lanes``.
-        lanes: Gaussians that a kernel takes at once.
+        it: what to launch.
         inputs: means, quats, scales, opacities.
         outputs: means2d, conics, opacities2d, depths, extents, all zero, and radii, all UNSEEN.
         adj_inputs: of all inputs.
         adj_outputs: of all outputs; those of the last two are not read.
 
     Returns:
-        What ``launch_groups`` did, of all groups.
+        The gradients, of each group, of what all Gaussians share: of a shutter's motion with the quaternions
+        (:func:`.moving.motion_gradient`), or of the formula's coefficients [N / lanes, K]; else nothing.
     """
-    count = len(outputs[-1])
+    lanes, count = it.driver.lanes, len(outputs[-1])
     whole = count - count % lanes
     tables = (inputs, outputs, adj_inputs, adj_outputs)
-    found = launch_groups(*([tensor[:whole] for tensor in table] for table in tables))
+    found = _launch_whole_groups(it, *([tensor[:whole] for tensor in table] for table in tables))
     if whole < count:
         last = [[filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
-        found += launch_groups(*last)
+        found += _launch_whole_groups(it, *last)
         for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
             tensor[whole:] = group[: count - whole]
     return found
 
 
-def _project_groups(kernel, cam, lanes, motion, inputs, outputs, adj_inputs, adj_outputs) -> list[torch.Tensor]:
-    """See :func:`_in_groups`; N is a multiple of ``lanes``. ``motion``: of the camera with a rolling shutter.
-
-    With adjoints and a motion, what holds its gradient (:func:`.moving.motion_gradient`); else nothing.
-    """
+def _launch_whole_groups(it: Projecting, inputs, outputs, adj_inputs, adj_outputs) -> list[torch.Tensor]:
+    """See :func:`_launch_geometry`; N is a multiple of the lanes."""
+    lanes, kernel, motion, count = it.driver.lanes, it.kernel, motion_of(it.camera), len(outputs[-1])
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
+    shared, adj_shared = None, None  # what all Gaussians share, a row for each group, and its gradient
 
-    def in_groups(tensors, types):
-        sizes = [wp.types.type_size_in_bytes(dtype) // 4 for dtype in types]
-        shapes = [(-1, size) if size > 1 else (-1,) for size in sizes]
-        rows = [t if t.dim() == 3 else t.view(shape) for t, shape in zip(tensors, shapes, strict=False)]
-        return [view(row, dtype) for row, dtype in zip(rows, types, strict=False)]
+    def as_arrays(tensors, types):
+        return [lanes_of(dtype, tensor)[0] for tensor, dtype in zip(tensors, types, strict=False)]
 
-    adj_quats = adj_inputs[1] if adj_inputs else None
-    if motion is not None:
-        inputs = [inputs[0], with_motion(inputs[1], motion, lanes), *inputs[2:]]
-    if motion is not None and adj_inputs:
-        adj_inputs = [adj_inputs[0], with_motion(adj_inputs[1], 0.0, lanes), *adj_inputs[2:]]
-    adjoint = {}
-    if adj_inputs:
-        adj_in, adj_out = in_groups(adj_inputs, types_in), in_groups(adj_outputs[:4], types_out)
-        adjoint = {"adj_inputs": [cam, *adj_in], "adj_outputs": [*adj_out, None, None]}
-    given, found = [cam, *in_groups(inputs, types_in)], in_groups(outputs, types_out)
-    _launch_groups(kernel, lanes, len(outputs[-1]), given, found, outputs[-1].device, **adjoint)
-    if motion is None or adj_quats is None:
-        return []
-    adj_quats.copy_(adj_inputs[1][:, 0].reshape_as(adj_quats))
-    return [adj_inputs[1]]
+    given, found = as_arrays(inputs, types_in), as_arrays(outputs, types_out)
+    adj_given, adj_found = as_arrays(adj_inputs, types_in), [*as_arrays(adj_outputs[:4], types_out), None, None]
+    if it.bend and adj_inputs:
+        kernel, numbers = it.bend, torch.tensor(it.camera.lens.numbers, dtype=torch.float32, device=inputs[0].device)
+        shared = numbers.repeat(count // lanes, 1)
+        adj_shared = torch.zeros_like(shared)
+        given, adj_given = (
+            [view(shared, wp.float32), *given, found[-1]],
+            [view(adj_shared, wp.float32), *adj_given, None],
+        )
+        found, adj_found = found[:4], adj_found[:4]
+    elif motion is not None:
+        shared = with_motion(inputs[1], motion, lanes)
+        given[1] = view(shared, row4)
+        if adj_inputs:
+            adj_shared = with_motion(adj_inputs[1], 0.0, lanes)
+            adj_given[1] = view(adj_shared, row4)
+    adjoint = {"adj_inputs": [it.cam, *adj_given], "adj_outputs": adj_found} if adj_inputs else {}
+    _launch_groups(kernel, lanes, count, [it.cam, *given], found, outputs[-1].device, **adjoint)
+    if adj_shared is not None and motion is not None:
+        adj_inputs[1].copy_(adj_shared[:, 0].reshape_as(adj_inputs[1]))
+    return [] if adj_shared is None else [adj_shared]
 
 
 def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
@@ -193,21 +212,20 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means, quats, scales, opacities, sh_dc, sh_rest, *more):
-        *learned, camera, cam, kernel, bend, driver, dropped = more
+        *learned, it = more
         gaussians = Gaussians(*(tensor.contiguous() for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
-        count, new, lanes = means.shape[0], means.new_empty, driver.lanes
+        count, new, lanes = means.shape[0], means.new_empty, it.driver.lanes
         splats = Splats2D(
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
             radii=new(count, dtype=torch.int32),
         )
         set_all(0, *splats[:-1])
         set_all(int(UNSEEN), splats.radii)
-        launch_groups = partial(_project_groups, kernel, cam, lanes, motion_of(camera))
-        _in_groups(launch_groups, lanes, _shapes(gaussians), _geometry(splats))
-        given = [cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
+        _launch_geometry(it, _shapes(gaussians), _geometry(splats))
+        given = [it.cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
         ctx.save_for_backward(*gaussians, *splats, *learned)
-        ctx.camera, ctx.cam, ctx.kernel, ctx.bend, ctx.driver, ctx.dropped = camera, cam, kernel, bend, driver, dropped
+        ctx.it = it
         ctx.mark_non_differentiable(splats.extents, splats.radii)
         ctx.set_materialize_grads(False)  # of these two, which no one reads, nor of what has no influence
         return tuple(splats)
@@ -216,6 +234,7 @@ class Project(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
+            it: Projecting = ctx.it
             given = Gaussians(*ctx.saved_tensors[: len(Gaussians._fields)])
             splats = Splats2D(*ctx.saved_tensors[len(given) : -4])
             twist, intrinsics, last_twist, coefficients = ctx.saved_tensors[-4:]
@@ -226,12 +245,12 @@ class Project(torch.autograd.Function):
                 for found, adj in zip(splats[:5], adj_outputs[:5], strict=True)
             ]
             adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)
-            lanes, count, device = ctx.driver.lanes, len(given.means), given.means.device
+            lanes, count, device = it.driver.lanes, len(given.means), given.means.device
             seen, rest = view(splats.radii, wp.int32), given.sh_rest
             adj_means, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
             tensors = (given.means, splats.colors, adj_splats.colors)
             means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
-            inputs = [ctx.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
+            inputs = [it.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
             outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
@@ -240,34 +259,31 @@ class Project(torch.autograd.Function):
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
             adj_inputs = _shapes(adj._replace(means=adj_placed))
-            launch_groups = partial(_project_groups, ctx.kernel, ctx.cam, lanes, motion_of(ctx.camera))
-            if ctx.bend:
-                launch_groups = partial(bent_groups, ctx.bend, ctx.cam, lanes, ctx.camera.lens)
-            found = _in_groups(launch_groups, lanes, _shapes(given), outputs, adj_inputs, adj_outputs)
+            found = _launch_geometry(it, _shapes(given), outputs, adj_inputs, adj_outputs)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
-            adj_motion = motion_gradient([] if ctx.bend else found, lanes, wants_pose or wants_intrinsics)
+            adj_motion = motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
                 adj_means += adj_placed
-                pose = pose_gradient(ctx.camera, ctx.cam, lanes, given, adj, adj_placed)
-                first, last = pose_gradients(ctx.camera.shutter, pose, adj_motion)
+                pose = pose_gradient(it.camera, it.cam, lanes, given, adj, adj_placed)
+                first, last = pose_gradients(it.camera.shutter, pose, adj_motion)
                 adj_twist = twist_gradient(first, twist) if wants_twist else None
                 adj_last = twist_gradient(last, last_twist) if wants_last else None
             if wants_intrinsics:
                 adj_intrinsics = intrinsics_gradient(
-                    ctx.camera, ctx.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3]
+                    it.camera, it.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3]
                 )
-            if ctx.bend:
-                adj_coefficients = coefficients_gradient(ctx.camera.lens, found, coefficients)
+            if it.bend:
+                adj_coefficients = coefficients_gradient(it.camera.lens, found, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
-            if not (ctx.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
+            if not (it.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
                 launch(quarantine, count, [seen], outputs, device=device)
-                ctx.dropped.gaussian_count = plus(ctx.dropped.gaussian_count, torch.count_nonzero(bad))
+                it.dropped.gaussian_count = plus(it.dropped.gaussian_count, torch.count_nonzero(bad))
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
         learned = adj_twist, adj_intrinsics, adj_last, adj_coefficients
-        return *(tensor if wants else None for tensor, wants in wanted), *learned, *[None] * 6
+        return *(tensor if wants else None for tensor, wants in wanted), *learned, None
 
 
 def _geometry(splats: Splats2D) -> list[torch.Tensor]:
