@@ -15,7 +15,7 @@ from warp_splat.kernels.simd import vec48
 from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import PerGroup, launch_in_lanes, load, view
+from warp_splat.runtime.launch import launch_in_lanes, load, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -81,10 +81,8 @@ class _PutBehind(torch.autograd.Function):
     def backward(ctx, adj):
         with stage("adjoint of environment"):
             alpha, rays, behind = ctx.saved_tensors
-            adj, lanes, count = adj.contiguous(), driver_of(alpha.device).lanes, alpha.numel()
-            runs = -(-(count // lanes) // RUN)
-            adj_alpha, sums = torch.empty_like(alpha), alpha.new_empty(runs + -(-(count % lanes) // RUN), 48)
+            adj, adj_alpha, lanes = adj.contiguous(), torch.empty_like(alpha), driver_of(alpha.device).lanes
             inputs = [ctx.rotation, rays, alpha.view(-1), behind.view(-1, 3), adj.view(-1, 3)]
-            outputs = [adj_alpha.view(-1), PerGroup(sums, vec48)]
-            launch_in_lanes(make_adj_put_behind, lanes, count, inputs, outputs, alpha.device, run=RUN)
+            given = (make_adj_put_behind, lanes, alpha.numel(), inputs, [adj_alpha.view(-1)], alpha.device)
+            sums = launch_in_lanes(*given, run=RUN, sums=(48, vec48))
             return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None

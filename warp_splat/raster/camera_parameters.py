@@ -18,7 +18,7 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import cross, rotated
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.moving import Tangent
-from warp_splat.runtime.launch import PerGroup, launch_in_lanes
+from warp_splat.runtime.launch import launch_in_lanes
 from warp_splat.runtime.sums import in_pairs
 
 LONGEST = 2.0 * math.pi  # rotation vector; a longer one says what a shorter one does
@@ -171,9 +171,7 @@ def _prepared(lens: Lens) -> np.ndarray:
 
 def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> np.ndarray:
     """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
-    count = len(like)
-    sums = like.new_empty(count // lanes + count % lanes, columns)
-    launch_in_lanes(make, lanes, count, inputs, [PerGroup(sums, wp.float32)], like.device)
+    sums = launch_in_lanes(make, lanes, len(like), inputs, [], like.device, sums=(columns, wp.float32))
     return in_pairs(sums).cpu().numpy()
 
 

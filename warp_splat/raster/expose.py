@@ -8,7 +8,7 @@ from torch.nn import functional
 
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import PerGroup, launch_in_lanes, load, view
+from warp_splat.runtime.launch import launch_in_lanes, load, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -86,11 +86,10 @@ class _ColorMap(torch.autograd.Function):
     def backward(ctx, adj):
         with stage("adjoint of exposure"):
             image, numbers = ctx.saved_tensors
-            adj, lanes, count = adj.contiguous(), driver_of(image.device).lanes, image.numel() // 3
-            adj_image, sums = torch.empty_like(image), image.new_empty(count // lanes + count % lanes, 12)
-            inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.view(-1, 3)]
-            outputs = [adj_image.view(-1, 3), PerGroup(sums, vec12)]
-            launch_in_lanes(make_adj_map_colors, lanes, count, inputs, outputs, image.device)
+            adj_image, lanes, device = torch.empty_like(image), driver_of(image.device).lanes, image.device
+            inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.contiguous().view(-1, 3)]
+            outputs, count = [adj_image.view(-1, 3)], image.numel() // 3
+            sums = launch_in_lanes(make_adj_map_colors, lanes, count, inputs, outputs, device, sums=(12, vec12))
             return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import psutil
 import torch
@@ -123,13 +123,6 @@ def launch(
     in_slices(run, bounds)
 
 
-class PerGroup(NamedTuple):
-    """A table for :func:`launch_in_lanes` with a row for each index of the kernel."""
-
-    rows: torch.Tensor
-    dtype: type
-
-
 def launch_in_lanes(
     make: Callable[[int], wp.Kernel],
     lanes: int,
@@ -138,30 +131,44 @@ def launch_in_lanes(
     outputs: Sequence,
     device: torch.device | str = "cpu",
     run: int = 1,
-) -> None:
+    sums: tuple[int, type] | None = None,
+) -> torch.Tensor:
     """Launch ``make(lanes)``, a kernel for so many rows at once, on ``count`` rows, ``make(1)`` on those left over.
 
-    Inputs and outputs are dense tensors of ``count`` rows of 1 to 4 numbers, functions of the kernel's types and a
-    slice of the rows, :class:`PerGroup` (of groups first, then of those left over), or else the same for all. An index
-    of the kernel takes ``run`` groups of rows.
+    Args:
+        make: of a number of lanes.
+        lanes: of the device.
+        count: of rows.
+        inputs: dense tensors of ``count`` rows of 1 to 4 numbers, functions of the kernel's types and a slice of the
+            rows, or what is the same for all.
+        outputs: likewise.
+        device: of the tensors.
+        run: groups of rows that an index of the kernel takes.
+        sums: how many numbers each index writes besides, and their type for the kernel.
+
+    Returns:
+        Those numbers, a row for each index of both kernels; none, if not asked for.
     """
-    whole, first = count - count % lanes, 0
-    for size, rows in ((lanes, slice(0, whole)), (1, slice(whole, count))):
-        runs = -(-((rows.stop - rows.start) // size) // run)
+    whole, done = count - count % lanes, 0
+    parts = [(lanes, slice(0, whole)), (1, slice(whole, count))]
+    parts = [(size, rows, -(-((rows.stop - rows.start) // size) // run)) for size, rows in parts]
+    rows_of_sums, columns = sum(runs for *_, runs in parts), sums[0] if sums else 0
+    found = torch.empty(rows_of_sums, columns, dtype=torch.float32, device=device)
+    for size, rows, runs in parts:
         if runs:
             bounds = even_slices(runs, max(SMALLEST_SLICE // (size * run), 1))
-            groups = slice(first, first + runs)
             given, made = (
-                [_in_lanes(table, TYPES[size], count, rows, groups) for table in tables] for tables in (inputs, outputs)
+                [_in_lanes(table, TYPES[size], count, rows) for table in tables] for tables in (inputs, outputs)
             )
+            if sums:
+                made.append(view(found[done : done + runs], sums[1]))
             launch(make(size), runs, given, made, bounds=bounds, device=device)
-            first += runs
+            done += runs
+    return found
 
 
-def _in_lanes(table: Any, types: Types, count: int, rows: slice, groups: slice) -> Any:
+def _in_lanes(table: Any, types: Types, count: int, rows: slice) -> Any:
     """The part of a table that a kernel gets; see :func:`launch_in_lanes`."""
-    if isinstance(table, PerGroup):
-        return view(table.rows[groups], table.dtype)
     if isinstance(table, torch.Tensor):
         narrow = types.integer if table.dtype == torch.int32 else types.number
         by_width = {1: narrow, 2: types.row2, 3: types.row3, 4: types.row4}
