@@ -18,7 +18,7 @@ from warp_splat.kernels.falloff import LN_2
 from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import lanes_of, launch_in_lanes
+from warp_splat.runtime.launch import arrays_of, launch_in_lanes
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
@@ -33,7 +33,7 @@ def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tens
 
 def _launch_activation(make, inputs: Sequence[torch.Tensor], outputs: Sequence[torch.Tensor]) -> None:
     def number_by_number(tensor: torch.Tensor):
-        return lambda types, rows: lanes_of(types.number, tensor[rows])[0]
+        return lambda types, rows: arrays_of([types.number], [tensor[rows]])[0]
 
     given, made = ([number_by_number(tensor) for tensor in tensors] for tensors in (inputs, outputs))
     device = outputs[1].device

@@ -34,7 +34,7 @@ from warp_splat.raster.camera_parameters import (
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
-from warp_splat.runtime.launch import filled_up, lanes_of, launch, pack_struct, view
+from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
 
@@ -145,50 +145,36 @@ def _launch_geometry(
         The gradients, of each group, of what all Gaussians share: of a shutter's motion with the quaternions
         (:func:`.moving.motion_gradient`), or of the formula's coefficients [N / lanes, K]; else nothing.
     """
-    lanes, count = it.driver.lanes, len(outputs[-1])
-    whole = count - count % lanes
-    tables = (inputs, outputs, adj_inputs, adj_outputs)
-    found = _launch_whole_groups(it, *([tensor[:whole] for tensor in table] for table in tables))
-    if whole < count:
-        last = [[filled_up(tensor[whole:], lanes) for tensor in table] for table in tables]
-        found += _launch_whole_groups(it, *last)
-        for tensor, group in zip(adj_inputs or outputs, last[2] or last[1], strict=True):
-            tensor[whole:] = group[: count - whole]
-    return found
-
-
-def _launch_whole_groups(it: Projecting, inputs, outputs, adj_inputs, adj_outputs) -> list[torch.Tensor]:
-    """See :func:`_launch_geometry`; N is a multiple of the lanes."""
-    lanes, kernel, motion, count = it.driver.lanes, it.kernel, motion_of(it.camera), len(outputs[-1])
+    lanes, count, motion, shared_grads = it.driver.lanes, len(outputs[-1]), motion_of(it.camera), []
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
-    shared, adj_shared = None, None  # what all Gaussians share, a row for each group, and its gradient
-
-    def as_arrays(tensors, types):
-        return [lanes_of(dtype, tensor)[0] for tensor, dtype in zip(tensors, types, strict=False)]
-
-    given, found = as_arrays(inputs, types_in), as_arrays(outputs, types_out)
-    adj_given, adj_found = as_arrays(adj_inputs, types_in), [*as_arrays(adj_outputs[:4], types_out), None, None]
-    if it.bend and adj_inputs:
-        kernel, numbers = it.bend, torch.tensor(it.camera.lens.numbers, dtype=torch.float32, device=inputs[0].device)
-        shared = numbers.repeat(count // lanes, 1)
-        adj_shared = torch.zeros_like(shared)
-        given, adj_given = (
-            [view(shared, wp.float32), *given, found[-1]],
-            [view(adj_shared, wp.float32), *adj_given, None],
+    whole = count - count % lanes
+    for part in [slice(0, whole)] + [slice(whole, count)] * (whole < count):
+        rows, kernel = -(-(part.stop - part.start) // lanes) * lanes, it.kernel
+        given, made, adj_given, adj_made = (
+            [filled_up(tensor[part], rows) for tensor in table] for table in (inputs, outputs, adj_inputs, adj_outputs)
         )
-        found, adj_found = found[:4], adj_found[:4]
-    elif motion is not None:
-        shared = with_motion(inputs[1], motion, lanes)
-        given[1] = view(shared, row4)
-        if adj_inputs:
-            adj_shared = with_motion(adj_inputs[1], 0.0, lanes)
-            adj_given[1] = view(adj_shared, row4)
-    adjoint = {"adj_inputs": [it.cam, *adj_given], "adj_outputs": adj_found} if adj_inputs else {}
-    _launch_groups(kernel, lanes, count, [it.cam, *given], found, outputs[-1].device, **adjoint)
-    if adj_shared is not None and motion is not None:
-        adj_inputs[1].copy_(adj_shared[:, 0].reshape_as(adj_inputs[1]))
-    return [] if adj_shared is None else [adj_shared]
+        arrays, adj_arrays = [it.cam, *arrays_of(types_in, given)], [it.cam, *arrays_of(types_in, adj_given)]
+        if it.bend and adj_inputs:
+            kernel, numbers = it.bend, given[0].new_tensor(it.camera.lens.numbers).repeat(rows // lanes, 1)
+            shared_grads.append(torch.zeros_like(numbers))
+            arrays.insert(0, view(numbers, wp.float32))
+            adj_arrays.insert(0, view(shared_grads[-1], wp.float32))
+        elif motion is not None:
+            moved = with_motion(given[1], motion, lanes)
+            arrays[2] = view(moved, row4)
+            if adj_inputs:
+                shared_grads.append(with_motion(adj_given[1], 0.0, lanes))
+                adj_arrays[2] = view(shared_grads[-1], row4)
+        adj_out = [*arrays_of(types_out, adj_made[:4]), None, None]
+        adjoint = {"adj_inputs": adj_arrays, "adj_outputs": adj_out} if adj_inputs else {}
+        _launch_groups(kernel, lanes, rows, arrays, arrays_of(types_out, made), given[0].device, **adjoint)
+        if motion is not None and adj_inputs:
+            adj_given[1].copy_(shared_grads[-1][:, 0].reshape_as(adj_given[1]))
+        if rows > part.stop - part.start:
+            for tensor, group in zip(adj_inputs or outputs, adj_given or made, strict=True):
+                tensor[part] = group[: count - whole]
+    return shared_grads
 
 
 def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:

@@ -172,7 +172,7 @@ def _in_lanes(table: Any, types: Types, count: int, rows: slice) -> Any:
     if isinstance(table, torch.Tensor):
         narrow = types.integer if table.dtype == torch.int32 else types.number
         by_width = {1: narrow, 2: types.row2, 3: types.row3, 4: types.row4}
-        return lanes_of(by_width[table.numel() // count], table[rows])[0]
+        return arrays_of([by_width[table.numel() // count]], [table[rows]])[0]
     return table(types, rows) if callable(table) else table
 
 
@@ -204,10 +204,11 @@ def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     return full
 
 
-def lanes_of(dtype: type, *tensors: torch.Tensor) -> list:
-    """Dense tensors as arrays of ``dtype``, as many numbers in each element as that has."""
-    size = wp.types.type_size_in_bytes(dtype) // 4
-    return [view(tensor.view(-1, size) if size > 1 else tensor.view(-1), dtype) for tensor in tensors]
+def arrays_of(types: Sequence[type], tensors: Sequence[torch.Tensor]) -> list:
+    """Dense tensors as arrays of these types, as many numbers in each element as its type has."""
+    sizes = [wp.types.type_size_in_bytes(dtype) // 4 for dtype in types]
+    shapes = [(-1, size) if size > 1 else (-1,) for size in sizes]
+    return [view(tensor.view(shape), dtype) for tensor, shape, dtype in zip(tensors, shapes, types, strict=False)]
 
 
 def load(kernel: wp.Kernel, device: torch.device) -> None:
