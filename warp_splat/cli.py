@@ -1,7 +1,5 @@
 """The command line: flags from the fields of the configurations, errors as one sentence."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import importlib

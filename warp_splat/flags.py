@@ -1,7 +1,5 @@
 """Command-line flags as fields of dataclasses, under the headings of ``--help``. Standard library only."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import MISSING, Field, field, fields
 from functools import partial

@@ -1,7 +1,5 @@
 """Other defaults: of ``--preset``, and of training the embedded scene. Standard library only."""
 
-from __future__ import annotations
-
 from typing import Any
 
 #: What the embedded scene changes by preset when no ``-s`` is given: schedules that end within minutes on two cores.

@@ -4,8 +4,6 @@ Warp could not derive the loop over a tile's list (docs/adjoints.md). So the lau
 renderer stands on the tape as one function with its own adjoint, whichever of the four is asked for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Tables and lists as text."""
 
-from __future__ import annotations
-
 import math
 import re
 import string

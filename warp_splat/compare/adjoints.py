@@ -6,8 +6,6 @@ instance (:mod:`warp_splat.raster.drivers` says where they differ). Beside the m
 ``tape`` (``manual`` between Warp's arrays, with what that adds), the thesis's loop cap, and central differences.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """``warp-splat compare``: which comparison to run, and where its results go."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path

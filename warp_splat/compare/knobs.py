@@ -4,8 +4,6 @@ The truth of a knob is float64 with this knob at its most exact and the others a
 ``t_min``, no cut for ``alpha_min``, the plain definition for the others.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace

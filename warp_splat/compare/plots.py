@@ -1,7 +1,5 @@
 """Every plot of the comparison: error against run time, growth of errors, shares of stages, maps of errors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest

@@ -1,7 +1,5 @@
 """Cameras and Gaussians made up: ordinary ones, of which a case, a workload or a test changes what it is about."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

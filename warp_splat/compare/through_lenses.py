@@ -6,8 +6,6 @@ is the projection's own error. Gradients are those of a random loss, of cameras 
 shutter.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -10,8 +10,6 @@ up every 100 steps, the rate of the means at its end at step 300. PSNR is measur
 (all 7 of the embedded scene); time is that of training steps alone. Adjoints take three seeds, the others the first.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -1,7 +1,5 @@
 """Images and gradients of a workload in float64 and by the renderer, and how far they are apart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

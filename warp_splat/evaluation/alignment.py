@@ -1,7 +1,5 @@
 """Where a photograph was really taken: its pose is refined, while the model stays as it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -3,8 +3,6 @@
 Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64. CC_PSNR is PSNR after a fit of colors.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ FLIP (Andersson et al. 2020) is made for renders and needs no weights. LPIPS (Zh
 network that was trained on photographs. Its package would download them; here they are read from disk.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from importlib.util import find_spec

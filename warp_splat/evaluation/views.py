@@ -1,7 +1,5 @@
 """Renders beside photographs, in the reference's folders, and their metrics: as numbers, a table and a sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """``warp-splat export-html``: one file with the Gaussians, the cameras and the program that draws them."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -5,8 +5,6 @@ covariance and its cover (moment matching, as in hierarchies of Gaussians: Goldb
 2024).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

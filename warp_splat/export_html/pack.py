@@ -14,8 +14,6 @@ Both are cut into parts of CHUNK Gaussians, of which a large model's first is of
 so they compress. Half a step is the largest error.
 """
 
-from __future__ import annotations
-
 import gzip
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files are written beside their final name and moved there when complete: a reader never sees half a file."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

@@ -5,8 +5,6 @@ that the arrays fill the file exactly. A CRC-32 of names, shapes, bytes and text
 the names.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Cameras and points as a COLMAP model in text: cameras.txt, images.txt, points3D.txt."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 

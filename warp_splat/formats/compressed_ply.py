@@ -6,8 +6,6 @@ largest, then the others, 10 bits each), the scale (11, 10, 11 bits) and the col
 ``sh``: harmonics as ``f_rest_*`` of the PLY file, in steps of 1/32 from -4 to 4. The axes are those of the PLY file.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """From one format of Gaussians to another, and what that cost, measured by reading the new file again."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -4,8 +4,6 @@ Models stay near the origin of their frame, since float32 would round UTM coordi
 east, y down, z north, as of a camera that looks north: so every format and viewer shows them upright.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The order in which Gaussians lie, in memory and in files: along a curve through space."""
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.formats.splats import SplatArrays

@@ -1,7 +1,5 @@
 """Files of Gaussians by the endings of their names: the one place that knows all formats."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """How the photographs of a model were exposed: a file beside its Gaussians, for pictures that look as they do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ without the extension show. The extension has no word for Mip-Splatting: "extras
 file say where in the world the Gaussians are.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

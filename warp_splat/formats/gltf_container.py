@@ -6,8 +6,6 @@ hold. No other files are opened than buffers in the folder of the .gltf file or 
 Own code, plain JSON and NumPy: the libraries for glTF build objects from the JSON without checking it.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A few values for many: codebooks of numbers and palettes of vectors, as compressed formats store them."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

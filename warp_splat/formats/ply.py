@@ -5,8 +5,6 @@ Values are stored before their activation: opacity as a logit, scales as natural
 length. ``f_rest`` is channel-major: all coefficients of red, then of green, then of blue; here they are [N, K, 3].
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

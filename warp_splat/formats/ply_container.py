@@ -3,8 +3,6 @@
 Own code, since no permissively licensed reader of arbitrary properties is well kept.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from itertools import islice

@@ -1,7 +1,5 @@
 """8-bit images to and from PNG (Pillow), and films as MP4 (PyAV)."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """What all readers of strangers' files share: one clear sentence for anything that is wrong with a file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -7,8 +7,6 @@ developer.playcanvas.com (the SOG format). It says that axes are right, up, back
 among them, keep those of the PLY file, and so do we.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct

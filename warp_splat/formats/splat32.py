@@ -4,8 +4,6 @@ Three float32 of position, three of standard deviation, then bytes: red green bl
 as 128 * q + 128. The axes are those of the PLY file. Spherical harmonics above degree 0 have no place.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

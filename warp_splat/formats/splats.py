@@ -4,8 +4,6 @@ The frame is that of the scene's files, as trained (COLMAP: x right, y down, z f
 turn the Gaussians on writing and back on reading (:func:`turned`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

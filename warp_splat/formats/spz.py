@@ -9,8 +9,6 @@ The axes are right, up, back (OpenGL's) unless an extension record names others.
 Own code: the one Python package of its authors is not on PyPI, and no other is well kept.
 """
 
-from __future__ import annotations
-
 import gzip
 import os
 import struct

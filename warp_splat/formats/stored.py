@@ -1,7 +1,5 @@
 """How numbers of Gaussians are stored: activations, rotations in few bytes, ranges of formats."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from warp_splat.text import Report

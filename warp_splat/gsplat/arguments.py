@@ -1,7 +1,5 @@
 """What :func:`warp_splat.gsplat.rasterization` demands of its arguments, said in one sentence when it is not met."""
 
-from __future__ import annotations
-
 import math
 import numbers
 from typing import Any, NamedTuple

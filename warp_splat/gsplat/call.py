@@ -1,7 +1,5 @@
 """``rasterization`` as gsplat 1.5.3 has it: its parameters in its order, its three results."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Real spherical harmonics in torch: differentiable in the viewing direction, hence in the camera."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """What gsplat's strategies call beside its ``rasterization``, in torch, with its names and arguments."""
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.gsplat.turns import rotations, rows_turned

@@ -1,7 +1,5 @@
 """The dictionary that gsplat's function returns beside the images: what its strategies read."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """From Gaussians on images to pixels: this package's lists and blend, view by view."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch.autograd.function import once_differentiable

@@ -3,8 +3,6 @@
 The kernels' projection (``kernels/project``) knows a camera of one pose and a few numbers, not matrices of any entries.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

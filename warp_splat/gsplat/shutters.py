@@ -5,8 +5,6 @@ point is seen depend on each other. The fixed point is found by iterating, witho
 method from there has the gradient of the implicit function.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

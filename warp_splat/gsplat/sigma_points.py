@@ -7,8 +7,6 @@ images from that of the mean, w = 1 / (6 alpha^2) and the shift m = w sum e_i:
     mean p_0 + m,  covariance w sum e_i e_i' + (beta - alpha^2) m m'
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Turning points and axes in torch, term by term: in torch's own product bits depend on how many there are."""
 
-from __future__ import annotations
-
 import torch
 
 

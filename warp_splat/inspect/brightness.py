@@ -1,7 +1,5 @@
 """Check of exposure: whether photographs show the same points as bright, and what EXIF says."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``warp-splat inspect``: all checks, a line for each finding, a page with pictures."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter

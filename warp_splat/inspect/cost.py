@@ -1,7 +1,5 @@
 """What a training will take on this machine: memory (:mod:`warp_splat.training.memory`), and time, guessed."""
 
-from __future__ import annotations
-
 import psutil
 
 from warp_splat.config import CORES

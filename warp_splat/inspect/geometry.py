@@ -1,7 +1,5 @@
 """Checks of cameras against points: reprojection, coverage, points that nobody sees, axes that are mixed up."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any

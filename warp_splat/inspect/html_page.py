@@ -1,7 +1,5 @@
 """The page of ``inspect``: one HTML file that holds its pictures and needs nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path

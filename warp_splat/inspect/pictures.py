@@ -1,7 +1,5 @@
 """Pictures of a scene for the page: thumbnails, points on photographs, a map of cameras and points."""
 
-from __future__ import annotations
-
 import base64
 import io
 import math

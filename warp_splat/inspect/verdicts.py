@@ -1,7 +1,5 @@
 """Checks that need no pixels: cameras, names, masks, what the loader and the training will say."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterator

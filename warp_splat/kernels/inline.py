@@ -4,8 +4,6 @@ As calls, the projection takes 13 % longer and its adjoint 24 % (50,000 Gaussian
 kernels share, and what each of them does in it, are parts as well (:func:`warp_splat.kernels.cpu.blend.walk`).
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import linecache

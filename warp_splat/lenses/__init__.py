@@ -1,7 +1,5 @@
 """Lenses with distortion, as they are: what a camera has besides its focal lengths and principal point."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

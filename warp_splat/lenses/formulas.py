@@ -8,8 +8,6 @@ and chooses by ``np.where``, with harmless numbers where a branch is not taken.
 Models, names and the order of the coefficients are COLMAP's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

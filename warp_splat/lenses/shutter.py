@@ -1,7 +1,5 @@
 """Rolling shutter: how a camera moves while its rows are read, and rotations by series."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

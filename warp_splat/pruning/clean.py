@@ -10,8 +10,6 @@ scenes, 31.57 and 21.78 dB before:
 - 31.57 and 21.79 dB: instead of near, before what many views carry, by an adjoint of an image of that
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """What simplify and clean begin and end with: a model and its scene opened, a file written, in numbers."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path

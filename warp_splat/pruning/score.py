@@ -6,8 +6,6 @@ shines through then; and dC/dcolor is w. For upstream gradients r that are 1 or 
 (sum of r dC/do)^2 has as its mean the sum of (dC/do)^2 (Hutchinson 1990).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """``warp-splat simplify``: a finished model in fewer Gaussians and harmonics, to a share, a loss or a size of file."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A set of Gaussians in fewer: which to leave out, of which harmonics, and training that makes up for it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What lies behind the Gaussians, in place of one color: harmonics of the direction, differentiable in torch."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -4,8 +4,6 @@ The color is blended first. These kernels repeat its weights, from what it has f
 cost nothing where they are not asked for. Channels go in groups, so that memory does not grow with their number.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """From 2D Gaussians and their tile lists to pixels, differentiable in torch: the kernels of the device's driver."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import torch

@@ -1,7 +1,5 @@
 """A camera that is learned: its parameters as torch tensors, and their gradients."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A camera that learns, in parts: what :func:`warp_splat.check_gradients` looks at one by one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

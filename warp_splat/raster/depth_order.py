@@ -1,7 +1,5 @@
 """The order of splats by depth on the CPU."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

@@ -19,8 +19,6 @@ Steps are rounded so that value + step is exact in float32: a mean far from the 
 An intermediate is moved alone, with the tile lists built anew: its differences see binning and blend, not projection.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """How a camera shows an image: a map of its colors and how its lens darkens it, differentiable in torch."""
 
-from __future__ import annotations
-
 import torch
 from torch.autograd.function import once_differentiable
 from torch.nn import functional

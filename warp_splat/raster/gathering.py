@@ -3,8 +3,6 @@
 Always in the same order and without atomics: the same bits for any number of threads.
 """
 
-from __future__ import annotations
-
 from itertools import accumulate
 
 import torch

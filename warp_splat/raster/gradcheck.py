@@ -3,8 +3,6 @@
 :mod:`warp_splat.raster.differences` says what is differenced, and how jumps and rounding are kept out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A camera that moves while its rows are read: how the projection is told, and its gradient."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From 3D Gaussians to 2D ones, differentiable in torch: the kernels of :mod:`warp_splat.kernels.project`."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Sequence

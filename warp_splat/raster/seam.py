@@ -1,7 +1,5 @@
 """Where a panorama ends it begins: what crosses its left or right edge shows at the other one as well."""
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.camera import Camera

@@ -11,8 +11,6 @@ near ball's first scale is that of sum (c1 - b) a1 dx^2 / v1^2 (f / z1)^2 s1.
 Beside it, random needles: a GPU counts their tiles, then lists them, and has to find as many.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

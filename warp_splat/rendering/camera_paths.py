@@ -1,7 +1,5 @@
 """Cameras for videos: an orbit, a spiral, or a smooth path through the cameras of training."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures as a photograph was exposed."""
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.formats.exposures import Exposures

@@ -1,7 +1,5 @@
 """Which device a run uses, why a GPU cannot be used, and what to say when memory runs out."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys

@@ -5,8 +5,6 @@ the same step everywhere. Nothing else is sent. The models stay the same bytes, 
 numbers that are the same. :meth:`Processes.check_identical` proves it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence

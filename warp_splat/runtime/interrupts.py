@@ -1,7 +1,5 @@
 """Ctrl-C that waits until what is at hand is whole, or that waits for nothing."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -10,8 +10,6 @@ No launch is recorded: tapes are the process's, and a user's would try to differ
 All memory is torch's, on either device: its caching allocator gives what a stage frees to the next.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Sums that are the same for any number of threads and on any processor, unlike torch's."""
 
-from __future__ import annotations
-
 import torch
 
 

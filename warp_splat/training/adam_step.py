@@ -1,7 +1,5 @@
 """A step of Adam on many tables: the launches of :mod:`warp_splat.kernels.adam`, on a CPU or a GPU."""
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import chain
 

@@ -1,7 +1,5 @@
 """Training options in files: ``--config`` and checkpoints in, ``config.toml`` in the model folder out."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """A training that ends in time: the machine is measured before the first step, and a clock is asked after each."""
 
-from __future__ import annotations
-
 import json
 import math
 import statistics

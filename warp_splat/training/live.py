@@ -1,7 +1,5 @@
 """A training in the browser: its progress, pause and continue, and frames between two steps."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The training loss: (1 - lambda) L1 + lambda (1 - SSIM), on a CPU and on a GPU."""
 
-from __future__ import annotations
-
 import functools
 import math
 from numbers import Real

@@ -1,7 +1,5 @@
 """Before the first step: options become what holds on this machine, the folder is chosen, the scene is read."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Adam over the Gaussians' parameters, and its moments through every change of the set."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence

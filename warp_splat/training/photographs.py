@@ -1,7 +1,5 @@
 """Which photograph a step sees; on its device and at its size, which may double from coarse to fine."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A run of training: what has happened so far, and what of it is kept: models, checkpoints, the summary."""
 
-from __future__ import annotations
-
 import hashlib
 import shlex
 import sys

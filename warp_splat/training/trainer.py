@@ -1,7 +1,5 @@
 """One training step after another: sample a view, render, compare, adapt. No files, no printing."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable

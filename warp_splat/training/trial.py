@@ -4,8 +4,6 @@ They see small images, and are judged on training photographs that are held back
 them together take SHARE of the training's own work at most, by a count of steps and pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any

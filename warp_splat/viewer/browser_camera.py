@@ -1,7 +1,5 @@
 """From the camera of a browser to ours, and from a photograph's camera to the browser's window."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

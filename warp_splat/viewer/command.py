@@ -1,7 +1,5 @@
 """``warp-splat view``: a model in a browser, until Ctrl-C."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from warp_splat.config import ViewConfig

@@ -4,8 +4,6 @@ A browser lets any page open a WebSocket to any machine, and says in ``Origin`` 
 to point at this machine after its page was loaded (DNS rebinding) gives itself away in ``Host``.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 from collections.abc import Iterator

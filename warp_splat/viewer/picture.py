@@ -1,7 +1,5 @@
 """What a frame shows: colors, depth or opacity, and a photograph over them."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Extremes outside the pixel loop: the determinant of needles, SSIM, Adam, and more tile instances than fit."""
 
-from __future__ import annotations
-
 import functools
 import re
 from dataclasses import replace

@@ -6,8 +6,6 @@ table, and the tests run the same catalog. The bounds are those of Higham, Accur
 Algorithms, 2002: n eps for a product of n rounded factors, and the condition of a problem where that is larger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Extremes of the pixel loop: opacities at their ends, long chains, the edge of the stop, odd upstream gradients."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

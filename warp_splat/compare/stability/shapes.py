@@ -1,7 +1,5 @@
 """Extremes of geometry: needles, pancakes, scales and quaternions at the ends of float32, odd depths and cameras."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from functools import partial

@@ -15,8 +15,6 @@ Splatting (Zwicker et al. 2001, "EWA volume splatting"; Kerbl et al. 2023) takes
 are 2D Gaussians, and those are blurred a little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

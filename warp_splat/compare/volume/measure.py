@@ -3,8 +3,6 @@
 The physics is :mod:`warp_splat.compare.volume.light`; here are the media and scenes, the measurements and tables.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence

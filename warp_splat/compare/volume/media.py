@@ -1,7 +1,5 @@
 """Media, scenes and integrators that the comparison with physics measures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ corrected. :class:`Projection` is what it has to give; all else (reading, cullin
 antialiasing, writing) is :mod:`warp_splat.kernels.project.shared`. Warp derives the adjoint.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

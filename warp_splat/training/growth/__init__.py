@@ -1,7 +1,5 @@
 """How the set of Gaussians grows and shrinks: the options of each growth, and the table. Standard library only."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from warp_splat.errors import InputError

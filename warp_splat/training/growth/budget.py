@@ -1,7 +1,5 @@
 """Growing to a budget: what pulls most at its place is split, until there are as many as asked for."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

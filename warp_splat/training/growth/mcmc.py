@@ -5,8 +5,6 @@ opacity and size let what is not needed die. Index logic, no kernels. The number
 supplement. Prices are on means over the Gaussians, not on sums, so that they do not depend on their number.
 """
 
-from __future__ import annotations
-
 import math
 from decimal import Decimal
 

@@ -1,7 +1,5 @@
 """Growing and pruning the set (Kerbl et al. 2023, section 5.2), as the reference does it. Index logic, no kernels."""
 
-from __future__ import annotations
-
 import functools
 import math
 from statistics import NormalDist

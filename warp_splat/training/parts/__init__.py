@@ -1,7 +1,5 @@
 """What is learned or done besides the Gaussians: the options of each part, and the table. Standard library only."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from warp_splat.flags import learning, rendering

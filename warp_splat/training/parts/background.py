@@ -1,7 +1,5 @@
 """A random background in every step, so that what is transparent in photographs has to become so in the model."""
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.formats.checkpoint import Checkpoint

@@ -4,8 +4,6 @@ What is compared is 1 / depth, as errors of triangulation are even there. It is 
 so that nothing depends on the unit of the scene. The renderer's depth is the expected one of a pixel.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

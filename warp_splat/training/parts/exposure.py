@@ -5,8 +5,6 @@ rounded to whole UNITs, whose sums are exact, and the mean is taken off. So the 
 without a map are those of the mean photograph.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fewer floaters, which hang before few cameras: opacity has a price, which what few photographs need does not earn."""
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.raster.api import RenderOutput

@@ -7,8 +7,6 @@ Photographs cannot tell a turn, a shift or a growth of all cameras from the oppo
 motions are taken out of the poses after every step, to first order: the set as a whole stays where it was given.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

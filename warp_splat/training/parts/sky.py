@@ -3,8 +3,6 @@
 Without it Gaussians have to be where the sky is: huge ones, far away, or streaks before the cameras that saw it.
 """
 
-from __future__ import annotations
-
 import torch
 
 from warp_splat.errors import InputError
