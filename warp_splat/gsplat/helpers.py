@@ -2,7 +2,8 @@
 
 import torch
 
-from warp_splat.gsplat.turns import rotations, rows_turned
+from warp_splat.gsplat.turns import rows_turned
+from warp_splat.raster.beside import rotations
 
 
 def quat_scale_to_covar_preci(

@@ -11,7 +11,8 @@ from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
 from warp_splat.gsplat.arguments import Request
 from warp_splat.gsplat.shutters import moved
 from warp_splat.gsplat.sigma_points import TINY, pixels_at, see_points
-from warp_splat.gsplat.turns import rotations, rows_turned
+from warp_splat.gsplat.turns import rows_turned
+from warp_splat.raster.beside import rotations
 
 
 class Seen(NamedTuple):

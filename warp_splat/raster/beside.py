@@ -113,19 +113,24 @@ def normals_of(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
     Differentiable in the quaternions.
     """
-    w, x, y, z = torch.nn.functional.normalize(gaussians.quats, dim=1).unbind(1)
-    columns = (  # of the rotation
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    axes = torch.stack([torch.stack(column, 1) for column in columns], 1)
+    axes = rotations(gaussians.quats).mT
     shortest = gaussians.scales.detach().argmin(1)
     normals = axes.gather(1, shortest[:, None, None].expand(-1, 1, 3)).squeeze(1)
     with torch.no_grad():
         center = torch.tensor(camera.center, dtype=torch.float32, device=normals.device)
         away = (normals * (gaussians.means - center)).sum(1, keepdim=True) > 0
     return torch.where(away, -normals, normals)
+
+
+def rotations(quats: torch.Tensor) -> torch.Tensor:
+    """Matrices [..., 3, 3] of quaternions w first, any norm; of zero, the identity."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 class Channels(torch.autograd.Function):

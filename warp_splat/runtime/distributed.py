@@ -26,16 +26,22 @@ class GroupError(InputError):
 
 
 class Processes:
-    """A process that trains alone: nothing is exchanged.
+    """One of several processes, all of which call the same methods in the same order; or one that trains alone.
 
     Attributes:
         rank: number of this process; 0 prints, evaluates and saves.
-        count: of all processes; images in a step, by which an iteration number grows.
+        count: of all processes; images in a step, by which an iteration number grows. Of one, nothing is exchanged.
         local_count: of those on this machine.
         lost: whether another process went away. Then this one saves the model, even if its rank is not 0.
+
+    Raises:
+        GroupError: from every method, if another process has ended or is silent for longer than PATIENCE.
     """
 
-    rank, count, local_count, lost = 0, 1, 1, False
+    lost = False
+
+    def __init__(self, rank: int = 0, count: int = 1, local_count: int = 1):
+        self.rank, self.count, self.local_count = rank, count, local_count
 
     def reaches(self, iteration: int, marks: Iterable[int]) -> bool:
         """Whether one of ``marks`` is among the iterations of the step that ends with ``iteration``."""
@@ -43,43 +49,8 @@ class Processes:
 
     def average(self, tensors: Sequence[torch.Tensor]) -> None:
         """Replace the tensors by their means over the processes."""
-
-    def sum(self, tensor: torch.Tensor) -> None:
-        """Replace ``tensor`` by its sum over the processes."""
-
-    def maximum(self, tensor: torch.Tensor) -> None:
-        """Replace each element of ``tensor`` by its largest value in any process."""
-
-    def largest(self, value: int) -> int:
-        """The largest ``value`` of all processes."""
-        return value
-
-    def gather(self, tensor: torch.Tensor) -> torch.Tensor:
-        """The tensors of all processes, stacked: [count, ...]."""
-        return tensor[None]
-
-    def first(self, text: str) -> str:
-        """What process 0 calls ``text``."""
-        return text
-
-    def check_identical(self, tensors: Iterable[torch.Tensor], iteration: int) -> None:
-        """Compare the bytes of ``tensors`` over the processes. Raises GroupError if they differ."""
-
-
-ALONE = Processes()
-
-
-class ProcessGroup(Processes):
-    """One of several processes, all of which call the same methods in the same order.
-
-    Raises:
-        GroupError: from every method, if another process has ended or is silent for longer than PATIENCE.
-    """
-
-    def __init__(self, rank: int, count: int, local_count: int):
-        self.rank, self.count, self.local_count = rank, count, local_count
-
-    def average(self, tensors: Sequence[torch.Tensor]) -> None:
+        if self.count == 1:
+            return
         with stage("all-reduce"):
             flat = torch.cat([tensor.reshape(-1) for tensor in tensors])  # one exchange: each waits for all processes
             self.sum(flat)
@@ -88,27 +59,35 @@ class ProcessGroup(Processes):
                 tensor.copy_(mean.view(tensor.shape))
 
     def sum(self, tensor: torch.Tensor) -> None:
+        """Replace ``tensor`` by its sum over the processes."""
         self._exchange(dist.all_reduce, tensor, dist.ReduceOp.SUM)
 
     def maximum(self, tensor: torch.Tensor) -> None:
+        """Replace each element of ``tensor`` by its largest value in any process."""
         self._exchange(dist.all_reduce, tensor, dist.ReduceOp.MAX)
 
     def largest(self, value: int) -> int:
+        """The largest ``value`` of all processes."""
         found = torch.tensor([value], dtype=torch.int32)
         self.maximum(found)
         return int(found)
 
     def gather(self, tensor: torch.Tensor) -> torch.Tensor:
-        found = [torch.empty_like(tensor) for _ in range(self.count)]
+        """The tensors of all processes, stacked: [count, ...]."""
+        found = [torch.empty_like(tensor) if self.count > 1 else tensor for _ in range(self.count)]
         self._exchange(dist.all_gather, found, tensor)
         return torch.stack(found)
 
     def first(self, text: str) -> str:
+        """What process 0 calls ``text``."""
         box = [text]
         self._exchange(dist.broadcast_object_list, box, 0)
         return box[0]
 
     def check_identical(self, tensors: Iterable[torch.Tensor], iteration: int) -> None:
+        """Compare the bytes of ``tensors`` over the processes. Raises GroupError if they differ."""
+        if self.count == 1:
+            return
         digest = hashlib.sha256()
         for tensor in tensors:
             digest.update(tensor.detach().cpu().contiguous().numpy().data)
@@ -122,6 +101,8 @@ class ProcessGroup(Processes):
             )
 
     def _exchange(self, collective: Callable, *arguments) -> None:
+        if self.count == 1:
+            return
         try:
             collective(*arguments)
         except RuntimeError as error:
@@ -134,6 +115,9 @@ class ProcessGroup(Processes):
                 f"Process {self.rank}: expected an answer from all {self.count} processes, but one {what}; see which "
                 "one, and why, in its own message or in torchrun's report."
             ) from error
+
+
+ALONE = Processes()
 
 
 @contextmanager
@@ -177,6 +161,6 @@ def join(device: str) -> Iterator[Processes]:
             f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges ({str(error).splitlines()[0]})."
         ) from error
     try:
-        yield ProcessGroup(rank, count, local_count)
+        yield Processes(rank, count, local_count)
     finally:
         dist.destroy_process_group()
