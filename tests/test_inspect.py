@@ -13,8 +13,8 @@ from test_scene_input import BAD
 
 from warp_splat.cli import main
 from warp_splat.inspect import geometry
-from warp_splat.inspect.cost import forecast
 from warp_splat.inspect.subject import read_subject
+from warp_splat.inspect.verdicts import forecast
 
 
 @pytest.fixture

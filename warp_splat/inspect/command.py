@@ -8,8 +8,7 @@ from pathlib import Path
 from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
 from warp_splat.inspect import brightness, geometry, verdicts
-from warp_splat.inspect.html_page import write_page
-from warp_splat.inspect.pictures import draw_pictures
+from warp_splat.inspect.page import draw_pictures, write_page
 from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos
 

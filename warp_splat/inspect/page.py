@@ -1,16 +1,19 @@
-"""Pictures of a scene for the page: thumbnails, points on photographs, a map of cameras and points."""
+"""The page of ``inspect``, one HTML file, and its pictures: thumbnails, points on photographs, a map of cameras."""
 
 import base64
 import io
 import math
 from collections.abc import Iterable
+from html import escape
+from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, new_panels, plain_axes
+from warp_splat.formats.atomic import write_text
 from warp_splat.inspect.geometry import Measured, sample, worst_and_best
-from warp_splat.inspect.subject import THUMBNAIL, Subject
+from warp_splat.inspect.subject import THUMBNAIL, Finding, Subject
 from warp_splat.scene.types import visible
 
 SHEET, COLUMNS = 60, 10  # thumbnails, at most, and in a row
@@ -19,6 +22,40 @@ DOTS = 1500  # points drawn on a photograph
 MOST = 3.0  # px; larger errors have the same color
 MAPPED = 5000  # points drawn on the map
 PAGE_DPI = 110
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
+table { border-collapse: collapse; width: 100%; }
+td { border-bottom: 1px solid #d9d9d9; padding: .35rem .6rem; vertical-align: top; white-space: nowrap; }
+td:first-child { font-weight: 600; }
+td:last-child { white-space: normal; overflow-wrap: anywhere; }
+.ok { color: #009e73; } .note { color: #0072b2; } .warning { color: #b35900; } .error { color: #c00000; }
+img { max-width: 100%; } figure { margin: 2rem 0; } figcaption { font-weight: 600; margin-bottom: .4rem; }
+"""
+
+
+def write_page(
+    path: Path, title: str, verdict: str, findings: list[Finding], pictures: Iterable[tuple[str, str]]
+) -> None:
+    """Write the verdict, a row for each finding, and the pictures (captions, addresses of data).
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    rows = "\n".join(
+        f'<tr><td class="{finding.level}">{finding.level}</td><td>{escape(finding.check)}</td>'
+        f"<td>{escape(finding.text)}</td></tr>"
+        for finding in findings
+    )
+    figures = "\n".join(
+        f'<figure><figcaption>{escape(caption)}</figcaption><img src="{address}" alt="{escape(caption)}"></figure>'
+        for caption, address in pictures
+    )
+    write_text(
+        path,
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1><p>{escape(verdict)}</p>\n"
+        f"<table>\n{rows}\n</table>\n{figures}\n</body></html>\n",
+    )
 
 
 def draw_pictures(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:
