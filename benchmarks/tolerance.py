@@ -6,13 +6,12 @@ of the worst of these pixels and of half of them; the bound is found with a tole
     python benchmarks/tolerance.py -s SCENE -m MODEL [-s SCENE -m MODEL ...] [--crowd 1000000] [--out docs/benchmarks]
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
 import torch
-from common import interleaved_medians, machine, write_table
+from common import interleaved, option, parse, write_table
 from made_up import cameras, make_crowd
 
 from warp_splat.camera import Camera
@@ -33,7 +32,7 @@ import matplotlib.pyplot as plt
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 HEADERS = ("scene", "options", "error, worst", "error, median", "bound, worst", "bound, median", "bound : error")
 HEADERS += ("times default", "adjoint")
-ROUNDS = 3
+ROUNDS = 2
 
 
 def variants() -> dict[str, tuple[str, RasterOptions]]:
@@ -93,13 +92,13 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list
         forward[variant] = lambda options=timed: render(gaussians, camera, black, options)
         both[variant] = lambda options=timed: adjoint(options)
     with torch.no_grad():
-        seconds = interleaved_medians(forward, ROUNDS)
+        seconds = interleaved(forward, ROUNDS)
         bounded = {
             "bound": lambda: render(gaussians, camera, black, RasterOptions(bound=True)),
             "none": lambda: render(gaussians, camera, black, RasterOptions()),
         }
-        cost = interleaved_medians(bounded, 4 * ROUNDS)
-    with_adjoint = interleaved_medians(both, ROUNDS)
+        cost = interleaved(bounded, 4 * ROUNDS)
+    with_adjoint = interleaved(both, ROUNDS)
     for row in rows:
         variant = row["options"]
         row |= {"seconds": seconds[variant], "times": seconds[variant] / seconds["default"]}
@@ -111,7 +110,9 @@ def measure(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list
 def stiff() -> list[dict]:
     """A row for each stiff or extreme case that is rendered: error and bound of the pixels whose order is known."""
     rows = []
-    for case in (case for case in cases.CASES if case.build):
+    for case in cases.CASES:
+        if not case.build:
+            continue
         problem = case.build()
         kept = torch.tensor(sorted(set(range(len(problem.gaussians["means"]))) - set(problem.left_out)))
         drawn = replace(problem, gaussians={name: found[kept] for name, found in problem.gaussians.items()})
@@ -152,43 +153,46 @@ def plot(path: Path, rows: list[dict]) -> None:
     plt.savefig(path, dpi=110)
 
 
+def write(rows: list[dict], extreme: list[dict], count: int, out: Path | None) -> None:
+    """The table, and the plot."""
+    keys = ("worst", "median", "bound", "bound_median", "ratio", "times", "adjoint")
+    cells = [(row["scene"], row["options"], *(f"{row[key]:.2g}" if key in row else "" for key in keys)) for row in rows]
+    ratios = sorted(row["ratio"] for row in extreme)
+    exceeded = sum(row.get("exceeded", 0) for row in rows + extreme)
+    costs = [f"{row['scene']} {row['cost of bound']:.2f}" for row in rows if "cost of bound" in row]
+    note = (
+        f"{count} pixels of a view; {pool.get_threads()} threads. With the bound, the default takes so many times as "
+        f"long: {', '.join(costs)}. In {len(extreme)} stiff and extreme cases, bound over error is "
+        f"{ratios[len(ratios) // 2]:.0f} in the median case. {exceeded} pixels were off by more than their bound."
+    )
+    write_table("tolerance", out, HEADERS, cells, note, {"rows": rows, "stiff": extreme})
+    if out:
+        plot(out / "tolerance.png", rows)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-s", "--scenes", nargs="*", default=[], action="extend")
-    parser.add_argument("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene")
-    parser.add_argument("--width", type=int, default=480, help="of the view [px]")
-    parser.add_argument("--crowd", type=int, default=0, help="Gaussians of a crowd made up; 0: none")
-    parser.add_argument("--pixels", type=int, default=200)
-    parser.add_argument("--out", type=Path, help="folder for tolerance.md, .json and .png")
-    arguments = parser.parse_args()
+    arguments = parse(
+        __doc__,
+        option("-s", "--scenes", nargs="*", default=[], action="extend"),
+        option("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene"),
+        option("--width", type=int, default=480, help="of the view [px]"),
+        option("--crowd", type=int, default=0, help="Gaussians of a crowd made up; 0: none"),
+        option("--pixels", type=int, default=200),
+    )
     launch.prepare("cpu", 0)
-    rows: list[dict] = []
+    rows, extreme = [], stiff()
     for folder, model in zip(arguments.scenes, arguments.models, strict=True):
         view = load_scene(folder, resolution=arguments.width, eval=True, report=lambda _: None).train[0].camera
         with torch.no_grad():
             gaussians = GaussianModel.load(model).arranged().activated()
         rows += measure(Path(folder).name, gaussians, view, arguments.pixels)
+        write(rows, extreme, arguments.pixels, arguments.out)
     if arguments.crowd:
         with torch.no_grad():
             gaussians = make_crowd(arguments.crowd, "cpu").activated()
         camera = cameras(arguments.width, arguments.width * 9 // 16, 1)[0]
         rows += measure(f"crowd of {arguments.crowd}", gaussians, camera, arguments.pixels // 4)
-    keys = ("worst", "median", "bound", "bound_median", "ratio", "times", "adjoint")
-    cells = [(row["scene"], row["options"], *(f"{row[key]:.2g}" if key in row else "" for key in keys)) for row in rows]
-    extreme = stiff()
-    ratios = sorted(row["ratio"] for row in extreme)
-    exceeded = sum(row.get("exceeded", 0) for row in rows + extreme)
-    costs = [f"{row['scene']} {row['cost of bound']:.2f}" for row in rows if "cost of bound" in row]
-    note = (
-        f"{arguments.pixels} pixels of a view {arguments.width} px wide; {pool.get_threads()} threads. With the bound, "
-        f"the default takes so many times as long: {', '.join(costs)}. In {len(extreme)} stiff and extreme cases, "
-        f"bound over error is {ratios[len(ratios) // 2]:.0f} in the median case. {exceeded} pixels were off by more "
-        "than their bound."
-    )
-    data = {"rows": rows, "stiff": extreme, "machine": machine()}
-    write_table("tolerance", arguments.out, HEADERS, cells, note, data)
-    if arguments.out:
-        plot(arguments.out / "tolerance.png", rows)
+        write(rows, extreme, arguments.pixels, arguments.out)
 
 
 if __name__ == "__main__":
