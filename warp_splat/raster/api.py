@@ -4,8 +4,6 @@ The first and the last are autograd functions. So what lies between them are tor
 above all the 2D means, whose gradient steers densification.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """From 2D Gaussians to lists: which Gaussians touch which tile of the image, in depth order. No gradient."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

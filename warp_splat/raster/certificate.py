@@ -1,7 +1,5 @@
 """How far each pixel can be from the ideal: what kernels are told, and where they write it (docs/tolerance.md)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """What :func:`warp_splat.rasterize` demands of its arguments, said in one sentence when it is not met."""
 
-from __future__ import annotations
-
 import numbers
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager

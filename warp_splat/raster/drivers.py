@@ -6,8 +6,6 @@ the rows and their summation; they differ in the kernel between them alone. Two 
 kernel that writes every T, and ``generated`` (for the comparison) reads a copy of the Gaussian per tile instance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The cheapest cuts whose bound stays below a tolerance. Tiles where they were too hopeful are drawn again."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Pictures of how wrong each pixel of a view may be: colors on a logarithmic scale, and floats."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping

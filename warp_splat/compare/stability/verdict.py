@@ -9,8 +9,6 @@ A limit above the usual one is never chosen. It is measured, as the condition of
 itself moves when its inputs move by half a unit in the last place of float32 (Higham 2002, 1.6).
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
