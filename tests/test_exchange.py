@@ -262,6 +262,14 @@ def test_glb_has_a_largest_size(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_glb_of_another_version_is_refused(tmp_path):
+    save_gaussians(tmp_path / "a.glb", some_file(3), report=silent)
+    data = (tmp_path / "a.glb").read_bytes()
+    (tmp_path / "a.glb").write_bytes(data[:4] + struct.pack("<I", 1) + data[8:])
+    with pytest.raises(InputError, match=r"a\.glb: .*version 1"):
+        load_gaussians(tmp_path / "a.glb")
+
+
 def test_an_older_gltf_keeps_its_data(tmp_path):
     """The .bin file of another scene has another name, so a crash between two writes breaks nothing."""
     save_gaussians(tmp_path / "a.gltf", some_file(seed=1))

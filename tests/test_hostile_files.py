@@ -210,6 +210,7 @@ EXTENSION = f"{PRIMITIVE}extensions__KHR_gaussian_splatting__"
         (f"{EXTENSION}extensions", {"spz": {}}, "in a compressed form"),
         (f"{PRIMITIVE}attributes", {}, "0 coefficients of SH"),
         (f"{PRIMITIVE}attributes__POSITION", 99, "index of accessors 99"),
+        (f"{PRIMITIVE}attributes", 5, "a primitive without attributes"),
         ("nodes__0__scale", [1e100, 1e100, 1e100], None),  # positions beyond float32: every Gaussian is left out
     ],
 )

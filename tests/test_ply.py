@@ -10,7 +10,7 @@ from splat_files import some_splats
 
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.ply import load_ply, save_ply, save_points
+from warp_splat.formats.ply import load_ply, load_points, save_ply, save_points
 from warp_splat.formats.splats import SplatFile
 
 REST = {1: 0, 4: 9, 9: 24, 16: 45}
@@ -154,6 +154,14 @@ def test_points_are_as_the_reference_writes_them(tmp_path):
     header = ["ply", "format binary_little_endian 1.0", "element vertex 2", *(f"property {name}" for name in names)]
     rows = b"".join(struct.pack("<6f3B", *point, 0, 0, 0, *color) for point, color in zip(points, colors, strict=True))
     assert (tmp_path / "input.ply").read_bytes() == "\n".join([*header, "end_header", ""]).encode() + rows
+
+
+def test_points_that_are_not_finite_are_left_out_and_counted(tmp_path):
+    points, lines = np.array([[1.5, -2, 3], [np.nan, 5, 6]]), []
+    save_points(tmp_path / "a.ply", points, np.full((2, 3), 7, np.uint8))
+    found, colors = load_points(tmp_path / "a.ply", report=lines.append)
+    np.testing.assert_array_equal(found, points[:1])
+    assert colors.tolist() == [[7] * 3] and len(lines) == 1 and "1 of 2 points that are not finite" in lines[0]
 
 
 def test_every_cut_gives_one_sentence(tmp_path):
