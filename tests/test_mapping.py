@@ -58,6 +58,18 @@ def test_models_that_share_photographs_are_joined(truth, tmp_path):
     assert [other.num_reg_images() for other in others if not seen.intersection(other.reg_image_ids())] == [6]
 
 
+def test_what_hardly_anything_holds_together_is_no_part_of_a_model(truth):
+    """Points that the last 8 photographs share with others are left out, but for 5."""
+    some = pycolmap.Reconstruction(truth[1])
+    apart = set(sorted(some.reg_image_ids())[-8:])
+    for index, number in enumerate(sorted(some.point3D_ids())):
+        for image, place in [(each.image_id, each.point2D_idx) for each in some.point3D(number).track.elements]:
+            if index > 5 and (image in apart) == (index % 3 > 0):
+                some.delete_observation(image, place)
+    assert mapping.held_together(truth[1]) == set(truth[1].reg_image_ids())
+    assert mapping.held_together(some) == set(some.reg_image_ids()) - apart
+
+
 def test_the_better_mapper_is_taken_and_completed(truth, tmp_path, monkeypatch):
     """Global finds 12, incremental 9 of other photographs: they are joined, and the rest is added."""
     database, model = truth

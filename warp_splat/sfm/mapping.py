@@ -13,6 +13,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
 from warp_splat.config import SfmConfig
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.sfm.stages import opened, run_watched
@@ -20,6 +24,7 @@ from warp_splat.sfm.stages import opened, run_watched
 # Global mapping alone is enough if it registers this share of more photographs than that: incremental mapping takes
 # longer the more there are, and could add little.
 ENOUGH, MANY = 0.98, 100
+LINK = 30  # points that two photographs of one model share at least, one by one
 SHARED = 3  # photographs that two models need to have in common to become one
 RELAXED = {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.1, "abs_pose_max_error": 16.0}  # 30, 0.25, 12
 SECONDS_PER_MATCH = 1e-4  # of global mapping (AMD EPYC), for the time that the bar says is left
@@ -88,12 +93,30 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
         if not known:
             calibrated = Path(shutil.copyfile(database, part / database.name))  # it is written to
             pycolmap.calibrate_view_graph(calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=config.seed))
-        pycolmap.global_mapping(calibrated, root, part, options)
+        for number, model in pycolmap.global_mapping(calibrated, root, part, options).items():
+            kept = held_together(model)
+            for image in (model.image(each) for each in set(model.reg_image_ids()) - kept):
+                model.deregister_frame(image.frame_id)
+            model.write(part / str(number))
 
     began = time.monotonic()
     passed = lambda: int(time.monotonic() - began)  # noqa: E731
     run_watched("cameras (s)", round(seconds) + 1, work, passed, config.quiet, stops=False)
     (part / database.name).unlink(missing_ok=True)
+
+
+def held_together(model: pycolmap.Reconstruction) -> set[int]:
+    """The largest set of images of which each shares LINK points or more with another.
+
+    Global mapping puts parts of a capture into one model that hardly anything holds together, each at any place.
+    """
+    numbers = np.array(sorted(model.reg_image_ids()))
+    seen = [np.unique([element.image_id for element in point.track.elements]) for point in model.points3D.values()]
+    rows = np.searchsorted(numbers, np.concatenate(seen)) if seen else np.zeros(0, int)
+    columns = np.repeat(np.arange(len(seen)), [len(each) for each in seen])
+    sees = csr_matrix((np.ones(len(rows), np.int32), (rows, columns)), (len(numbers), len(seen)))
+    _, labels = connected_components((sees @ sees.T) >= LINK)
+    return set(numbers[labels == np.bincount(labels).argmax()].tolist())
 
 
 def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, start: Path | None = None) -> None:
