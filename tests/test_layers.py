@@ -19,6 +19,7 @@ LAYERS = [
     {"training"},
     {"pruning"},
     {"compare", "inspect", "export_html"},
+    {"audit"},
     {"cli", "__init__", "__main__"},
 ]
 

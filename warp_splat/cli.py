@@ -10,6 +10,7 @@ from typing import Any
 
 from warp_splat import __version__
 from warp_splat.config import (
+    AuditConfig,
     CleanConfig,
     CompareConfig,
     ConvertConfig,
@@ -42,6 +43,7 @@ COMMANDS = {
     "simplify": (SimplifyConfig, "pruning.simplify.simplify", "leave out what a finished model does not need"),
     "clean": (CleanConfig, "pruning.clean.clean", "leave out what hangs right before few cameras"),
     "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
+    "audit": (AuditConfig, "audit.command.audit", "measure any renderer of Gaussians against float64"),
     "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
 }
 

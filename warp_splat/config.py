@@ -246,3 +246,17 @@ class CompareConfig:
     full: bool = flag(False, "train by the whole schedule instead of 300 steps")
     device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     threads: int = flag(0, "CPU threads; 0: all cores")
+
+
+@dataclass
+class AuditConfig:
+    """Options of the audit of a renderer."""
+
+    target: str = argument("MODULE:function, a name of the table in docs/audit.md, or with --command any name")
+    program: str = flag(
+        "", "a program instead: 'prog {ply} {cameras} {out}' writes a PNG; {exr} and {background} too", "--command"
+    )
+    case: str = flag("", "only this scene, made as small as still shows what is wrong with it")
+    out: str = flag("output/audit", "folder for audit.json and audit.html, or for the files of --case", "-o")
+    degree: int = flag(3, "of harmonics, the highest that the renderer claims", most=3)
+    limit: float = flag(60.0, "seconds for a picture, after which it counts as hanging")

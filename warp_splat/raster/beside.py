@@ -124,6 +124,8 @@ def normals_of(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
 
 def rotations(quats: torch.Tensor) -> torch.Tensor:
     """Matrices [..., 3, 3] of quaternions w first, any norm; of zero, the identity."""
+    # brought to a length of about 1 by a power of two, which changes no bit: squares of 1e-20 underflow
+    quats = torch.ldexp(quats, -torch.frexp(quats.detach().abs().amax(-1, keepdim=True)).exponent)
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),

@@ -1,0 +1,90 @@
+"""Which renderer draws what the file says? Every renderer of the table that is there, in small scenes, against float64.
+
+A renderer that was measured before and is not named keeps its row. Minutes for each; those in a browser take longer.
+
+    python benchmarks/audit.py [TARGET ...] [--scenes one two] [--out docs/benchmarks]
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from warp_splat.audit.command import run_audit, side_by_side, target_of, worst_gradient
+from warp_splat.audit.renderer import Renderer
+from warp_splat.audit.small_scenes import SCENES
+from warp_splat.audit.targets import TARGETS
+from warp_splat.config import AuditConfig
+from warp_splat.formats.atomic import write_json, write_text
+from warp_splat.formats.png import save_png
+from warp_splat.text import table_of
+
+USUAL = 1e-2  # the first scene is pictured where more than this share of the pixels is off
+
+
+def measured(name: str, scenes: tuple[str, ...], out: Path) -> None:
+    config = AuditConfig(target=name, limit=120.0)
+    target = target_of(config)
+    renderer = Renderer(target.place, limit=config.limit)
+    facts, rows = run_audit(renderer, target, name, scenes)
+    renderer.close()
+    write_json(out / "audit" / f"{name}.json", facts | {"scenes": [row.record() for row in rows]})
+    shown = next((row for row in rows if row.off > USUAL), None)
+    if shown:
+        save_png(out / "audit" / f"{name}.png", side_by_side(*shown.pictures))
+        print(f"{name}.png: {shown.scene}")
+
+
+def summary(facts: dict) -> dict:
+    rows = facts["scenes"]
+    drawn = [row for row in rows if row["largest"] is not None]
+    gradients = {
+        row["scene"]: max(value for value in row["gradients"].values() if value is not None)
+        for row in drawn
+        if any(value is not None for value in row["gradients"].values())
+    }
+    return facts | {
+        "package": facts["package"].rsplit("@", 1)[0],
+        "right": f"{sum(row['off'] == 0 for row in drawn)} of {len(rows)}",
+        "by_rules": sum(row["own"] == 0 for row in drawn),
+        "failed": len(rows) - len(drawn),
+        "mean": float(np.mean([row["mean"] for row in drawn])) if drawn else None,
+        "gradient": float(np.median(list(gradients.values()))) if gradients else None,
+        "worst": worst_gradient({"gradients": gradients}),
+        "same": "yes" if all(row["same"] for row in drawn) else "no",
+    }
+
+
+def write_summary(out: Path) -> None:
+    files = [out / "audit" / f"{name}.json" for name in TARGETS]
+    records = [summary(json.loads(path.read_text())) for path in files if path.exists()]
+    columns = {
+        "target": "{target}",
+        "version": "{package} {version}",
+        "SH": "{degree}",
+        "scenes right": "{right}",
+        "by its own rules": "{by_rules}",
+        "mean error": "{mean:.1e}",
+        "gradients, median": "{gradient:.1e}",
+        "worst gradient": "{worst}",
+        "same bits": "{same}",
+        "failed": "{failed}",
+    }
+    note = f"Measured by `benchmarks/audit.py` on {records[0]['machine']}."
+    write_text(out / "audit.md", f"{table_of(records, columns)}\n\n{note}\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("targets", nargs="*", default=list(TARGETS))
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES))
+    parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
+    arguments = parser.parse_args()
+    for name in arguments.targets:
+        measured(name, tuple(arguments.scenes), arguments.out)
+    write_summary(arguments.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""The audit of renderers: a deliberately wrong one is found out, one that hangs or dies gets a row."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import wrong_renderer
+
+from warp_splat.audit.judged import measure
+from warp_splat.audit.renderer import Renderer
+from warp_splat.audit.rules import find_rules
+from warp_splat.audit.small_scenes import SCENES, on_all_pixels
+from warp_splat.audit.targets import TARGETS, own
+from warp_splat.cli import main
+from warp_splat.formats.ply import load_ply
+from warp_splat.formats.png import load_png
+
+USUAL = {"blur": 0.3, "antialiasing": False, "alpha_min": 1 / 255, "alpha_max": 0.99, "t_min": 1e-4, "near": 0.2}
+
+
+def rules_of(eight_bit=False, **broken):
+    def draw(workload):
+        *geometry, dc, rest = workload.gaussians
+        given = (*geometry, torch.cat([dc, rest], 1), workload.camera, workload.background)
+        image = wrong_renderer.draw(wrong_renderer.Wrong(**broken), *given).float().double().numpy()
+        return (np.round(image.clip(0, 1) * 255) / 255, True) if eight_bit else (image, False)
+
+    return find_rules(draw)
+
+
+@pytest.fixture(scope="module")
+def right():
+    return rules_of()
+
+
+def test_a_right_renderer_has_the_usual_rules(right):
+    assert right.options == pytest.approx(USUAL)
+    assert "matches" in right.sentences["camera"] and "axis" in right.sentences["order"]
+    assert "usual" in right.sentences["harmonics"] and "no antialiasing" in right.sentences["antialiasing"]
+
+
+#: What is broken, whose sentence changes, what it then says, and what becomes of the options.
+BROKEN = [
+    ({"alpha_min": 1 / 512}, "cut", "1/512", {"alpha_min": 1 / 512}),
+    ({"alpha_min": 0.0}, "cut", "No alpha is left out", {"alpha_min": 0.0}),
+    ({"alpha_max": 0.999}, "clamp", "at 0.999", {"alpha_max": 0.999}),
+    ({"alpha_max": 1.0}, "clamp", "not clamped", {"alpha_max": 0.9999}),
+    ({"t_min": 1e-3}, "stop", "below 0.001", {"t_min": 1e-3}),
+    ({"t_min": 0.0}, "stop", "does not stop", {"t_min": 0.0}),
+    ({"near": 0.01}, "near plane", "about 0.01", {"near": 0.01}),
+    ({"near": 0.0}, "near plane", "no near plane", {"near": 1e-6}),
+    ({"blur": 0.1}, "low-pass", "0.1 px", {"blur": 0.1}),
+    ({"blur": 0.0}, "low-pass", "no low-pass", {"blur": 1e-6}),
+    ({"antialiasing": True}, "antialiasing", "scaled by the share", {"antialiasing": True}),
+    ({"extent": 3.0}, "extent", "ends 3.0 standard deviations", {}),
+    ({"rotation": "xyzw"}, "rotation", "x, y, z, w.", {}),
+    ({"rotation": "inverse"}, "rotation", "inverse", {}),
+    ({"flipped": (1, 3)}, "harmonics", "1 has the other sign; 3 has the other sign", {}),
+    ({"flipped": (9,)}, "harmonics", "coefficient 9 has the other sign.", {}),
+    ({"swapped": (1, 2)}, "harmonics", "1 is taken for 2; 2 is taken for 1", {}),
+    ({"order": "distance"}, "order", "distance from the camera", {}),
+    ({"order": "reversed"}, "order", "reversed", {}),
+    ({"order": "file"}, "order", "not sorted: the first", {}),
+    ({"space": "encoded"}, "color space", "after blending: it comes out too bright", {}),
+    ({"space": "decoded"}, "color space", "decoded from sRGB before blending", {}),
+    ({"space": "linear"}, "color space", "blended in linear light", {}),
+    ({"background": "black"}, "background", "ignored; it is black", {}),
+    ({"background": "white"}, "background", "ignored; it is white", {}),
+    ({"shift": 0.5}, "camera", "on average by (0.50, 0.50)", {}),
+]
+
+
+@pytest.mark.parametrize(("broken", "name", "says", "options"), BROKEN, ids=lambda value: str(value)[:40])
+def test_a_broken_rule_is_found_and_no_other(broken, name, says, options, right):
+    found = rules_of(**broken)
+    assert says in found.sentences[name]
+    assert found.options == pytest.approx(USUAL | options, abs=1e-9)
+    others = {rule for rule, sentence in found.sentences.items() if sentence != right.sentences[rule]} - {name}
+    assert others <= {"camera"}  # which tells a figure that depends on the others
+
+
+@pytest.mark.parametrize(("broken", "name", "says", "options"), BROKEN, ids=lambda value: str(value)[:40])
+@pytest.mark.slow
+def test_a_broken_rule_is_found_in_eight_bits(broken, name, says, options):
+    if {"t_min", "alpha_max"} & set(broken):
+        pytest.skip("8 bits do not show it")
+    assert says in rules_of(eight_bit=True, **broken).sentences[name]
+
+
+@pytest.fixture
+def importable(monkeypatch):
+    """Processes of their own find wrong_renderer."""
+    here = str(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([here, os.environ.get("PYTHONPATH", "")]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("function", "says"),
+    [("hangs", "hangs: no answer in 1 s"), ("crashes", "ended with 7"), ("draws_nothing", "draws nothing")],
+)
+def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says):
+    renderer = Renderer(f"wrong_renderer:{function}", limit=1.0 if function == "hangs" else 60.0)
+    rows = list(measure(renderer, {}, scenes=("one", "two")))
+    renderer.close()
+    assert [says in row.verdict for row in rows] == [True, True]
+    assert {row.level for row in rows} <= {"warning", "error"}
+
+
+@pytest.mark.slow
+def test_this_renderer_is_as_float64(importable):
+    renderer = Renderer("warp_splat.audit.targets.own:manual")
+    (row,) = measure(renderer, {}, scenes=("cloud",))
+    renderer.close()
+    assert row.verdict == "as in float64" and row.same and row.largest < 1e-4
+    assert set(row.gradients) == {"means", "quats", "scales", "opacities", "sh", "background"}
+    assert max(row.gradients.values()) < 1e-4
+
+
+@pytest.mark.slow
+def test_a_program_is_audited_and_its_finding_made_small(tmp_path):
+    """It draws black whatever it is asked."""
+    program = tmp_path / "program.py"
+    program.write_text("import sys\nfrom PIL import Image\nImage.new('RGB', (64, 48)).save(sys.argv[3])\n")
+    command = f"{sys.executable} {program} {{ply}} {{cameras}} {{out}}"
+    assert main(["audit", "black", "--command", command, "--case", "cloud", "--out", str(tmp_path / "out")]) == 1
+    assert len(load_ply(tmp_path / "out" / "scene.ply").splats.means) < len(SCENES["cloud"][1]()[0]["means"]) / 4
+    assert len(json.loads((tmp_path / "out" / "cameras.json").read_text())) == 1
+    assert not load_png(tmp_path / "out" / "found.png").any() and load_png(tmp_path / "out" / "expected.png").any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nobody"], "MODULE:function, or one of"),
+        (["no_module:draw"], "that can be imported"),
+        (["x", "--command", "prog {ply}"], "{out}"),
+        (["manual", "--case", "nothing"], "expected one of one, two"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, says, capsys):
+    assert main(["audit", *arguments]) == 1
+    assert says in capsys.readouterr().err
+
+
+def test_tiny_rotations_are_not_lost_in_gsplats_function():
+    """What the audit found: squares of 1e-20 underflow."""
+    drawn, camera = SCENES["quats_1e-20"][1]()
+    given = [drawn[name] for name in ("means", "quats", "scales", "opacities")]
+    given += [torch.cat([drawn["sh_dc"], drawn["sh_rest"]], 1), camera, torch.zeros(3)]
+    small = own.as_gsplat(*given)
+    given[1] = given[1] * 1e20
+    torch.testing.assert_close(small, own.as_gsplat(*given), atol=1e-5, rtol=0)
+
+
+def test_adapters_are_small():
+    folder = Path(sys.modules["warp_splat.audit.targets"].__file__).parent
+    assert {target.place.split(":")[0] for target in TARGETS.values()} <= {path.stem for path in folder.glob("*.py")}
+    for path in folder.iterdir():
+        assert path.is_dir() or len(path.read_text().splitlines()) <= 100, path
+
+
+def test_harmonics_are_cut_where_a_renderer_claims_none():
+    assert on_all_pixels("cloud", SCENES["cloud"][1](), degree=0).gaussians.sh_rest.shape[1] == 0

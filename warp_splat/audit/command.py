@@ -1,0 +1,148 @@
+"""``warp-splat audit``: a table, JSON and a page on a renderer, or the smallest scene that shows a finding."""
+
+from __future__ import annotations
+
+import base64
+import io
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from warp_splat.audit.judged import LEVEL, SceneRow, exact_image, in_eight_bits, measure, smallest
+from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
+from warp_splat.audit.rules import find_rules
+from warp_splat.audit.small_scenes import SCENES, on_all_pixels
+from warp_splat.audit.targets import TARGETS, NamedRenderer
+from warp_splat.audit.targets.program import draw_by_program, stored, write_files
+from warp_splat.config import AuditConfig
+from warp_splat.errors import InputError
+from warp_splat.evaluation.report import machine
+from warp_splat.formats.atomic import write_json
+from warp_splat.formats.png import save_png
+from warp_splat.inspect.page import write_page
+from warp_splat.inspect.subject import Finding
+from warp_splat.text import table_of
+
+ZOOM = 4
+SHOWN = 12  # pictures of a page
+
+
+def audit(config: AuditConfig) -> int:
+    """Audit as ``config`` says; returns the process's exit code: 1 if something is wrong.
+
+    Raises:
+        InputError: for a target, scene or command that there is not.
+    """
+    target = target_of(config)
+    renderer = Renderer(target.place, config.program, config.limit)
+    if config.case and config.case not in SCENES:
+        raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
+    try:
+        if config.case:
+            return _write_case(renderer, target, config.case, Path(config.out))
+        measured = run_audit(renderer, target, config.target)
+    finally:
+        renderer.close()
+    write_audit(Path(config.out), *measured)
+    return int(any(row.level in ("warning", "error") for row in measured[1]))
+
+
+def target_of(config: AuditConfig) -> NamedRenderer:
+    """Where the target is called, and what it claims: by its name, its place, or its command."""
+    if config.program:
+        draw_by_program(config.program)
+        return NamedRenderer("", "", config.program, config.degree, "{background}" in config.program)
+    if config.target in TARGETS:
+        found = TARGETS[config.target]
+        place = found.place if "." in found.place else f"warp_splat.audit.targets.{found.place}"
+        return found._replace(place=place, degree=min(found.degree, config.degree))
+    if ":" not in config.target:
+        raise InputError(f"{config.target}: expected MODULE:function, or one of {', '.join(TARGETS)}.")
+    function_of(config.target)
+    return NamedRenderer(config.target, config.target.split(".")[0].split(":")[0], degree=config.degree)
+
+
+def run_audit(
+    renderer: Renderer, target: NamedRenderer, name: str, scenes: tuple[str, ...] = tuple(SCENES)
+) -> tuple[dict[str, Any], list[SceneRow]]:
+    """What was found of rules and settings, and a row for each scene; prints both."""
+
+    def draw(workload):
+        answer = renderer.draw(workload)
+        return answer.image, answer.eight_bit
+
+    rules = find_rules(draw, target.degree)
+    facts = {"target": name, "package": target.package, "version": target.version, "settings": target.settings}
+    facts |= {"date": date.today().isoformat(), "machine": machine(), "degree": target.degree}
+    facts |= {"rules": rules.sentences, "options": rules.options}
+    print(f"{name} ({target.package} {target.version}; {target.settings})")
+    for rule, sentence in rules.sentences.items():
+        print(f"  {rule:13s} {sentence}")
+    rows = list(measure(renderer, rules.options, target.degree, target.background, scenes))
+    columns = {"scene": "{scene}", "largest": "{largest:.1g}", "mean": "{mean:.1g}", "off": "{off:.1%}"}
+    columns |= {"by its rules": "{own:.1%}", "gradients": worst_gradient, "verdict": "{verdict}"}
+    print(table_of([row.record() for row in rows], columns))
+    return facts, rows
+
+
+def worst_gradient(record) -> str:
+    """The largest relative error of a gradient, and whose it is."""
+    found = {name: value for name, value in record["gradients"].items() if value == value}
+    worst = max(found, key=found.__getitem__, default="")
+    return f"{found[worst]:.0e} {worst}" if worst else "-"
+
+
+def write_audit(out: Path, facts: dict[str, Any], rows: list[SceneRow]) -> None:
+    """``audit.json`` and ``audit.html`` in ``out``, and the worst scene as ``worst.png``."""
+    write_json(out / "audit.json", facts | {"scenes": [row.record() for row in rows]})
+    findings = [Finding(rule, "note", sentence) for rule, sentence in facts["rules"].items()]
+    findings += [Finding(row.scene, row.level, f"{row.shows}: {row.verdict}") for row in rows]
+    drawn = sorted((row for row in rows if row.pictures), key=lambda row: (-row.own, -row.off, -row.largest))
+    pictures = []
+    for row in drawn[:SHOWN]:
+        buffer = io.BytesIO()
+        Image.fromarray(side_by_side(*row.pictures)).save(buffer, "png")
+        address = f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+        pictures.append((f"{row.scene}: expected, found, difference (10 times)", address))
+    if drawn:
+        save_png(out / "worst.png", side_by_side(*drawn[0].pictures))
+    off = sum(row.level in ("warning", "error") for row in rows)
+    verdict = f"{off} of {len(rows)} scenes are off. {facts['settings']} {facts['version']}, {facts['date']}."
+    write_page(out / "audit.html", f"Audit of {facts['target']}", verdict, findings, pictures)
+    print(f"{verdict}\n  page {out / 'audit.html'}")
+
+
+def side_by_side(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """What was expected, what came, and ten times the difference, [H, 3 W, 3] uint8, enlarged."""
+    found = np.nan_to_num(found, nan=1.0, posinf=1.0, neginf=0.0)
+    strip = np.concatenate([expected, found, 10 * np.abs(expected - found)], 1)
+    return (in_eight_bits(strip) * 255).astype(np.uint8).repeat(ZOOM, 0).repeat(ZOOM, 1)
+
+
+def _write_case(renderer: Renderer, target: NamedRenderer, name: str, out: Path) -> int:
+    """The smallest scene that shows what a renderer does to ``name``: files, what was expected, what came."""
+    background = (0.25, 0.5, 0.75) if target.background else (0.0, 0.0, 0.0)
+    workload = on_all_pixels(name, SCENES[name][1](), background, target.degree)
+    try:
+        workload, answer = smallest(renderer, workload)
+    except RendererFailed as error:
+        print(f"{name}: the renderer {error}.")
+        answer = None
+    out.mkdir(parents=True, exist_ok=True)
+    *geometry, sh_dc, sh_rest = workload.gaussians
+    write_files(out, stored(*geometry, torch.cat([sh_dc, sh_rest], 1)), workload.camera)
+    expected = exact_image(workload)
+    np.save(out / "expected.npy", expected)
+    save_png(out / "expected.png", (in_eight_bits(expected) * 255).astype(np.uint8))
+    count = f"{name}: {len(workload.gaussians.means)} Gaussians on {background}"
+    if answer is None:
+        return 1
+    np.save(out / "found.npy", answer.image)
+    save_png(out / "found.png", (in_eight_bits(np.nan_to_num(answer.image)) * 255).astype(np.uint8))
+    error = float(np.abs(answer.image - expected).max())
+    print(f"{count}, off by {error:.3g} at most; expected and found in {out}.")
+    return int(error > 1.01 * LEVEL)

@@ -1,0 +1,109 @@
+"""Pictures of probes, and what can be read off them.
+
+Everything is read off the cover of a green Gaussian, 1 - T, which any color behind it allows, or off which of several
+candidates in float64 is nearest to the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from warp_splat.audit.small_scenes import balls, on_all_pixels
+from warp_splat.compare import oracle
+from warp_splat.compare.scenes import make_camera, tensors
+from warp_splat.compare.workloads import Workload
+
+GREEN, FOCAL = np.array([0.0, 1.0, 0.0]), 60.0
+CENTER = np.array([32.5, 24.5])  # px, the middle of a pixel and of the picture
+SEEN = {True: 0.6 / 255, False: 1e-9}  # of a cover, by whether pictures have 8 bits
+OPAQUE = 0.9995  # what lets through more than most stops
+ASKED = (0.25, 0.5, 0.75)
+#: Values that renderers are known to have; a measured interval that holds one is named by it.
+KNOWN = {"1/255": 1 / 255, "1/512": 1 / 512} | {
+    f"{value:g}": value for value in (1e-3, 1e-4, 1e-5, 1e-6, 0.01, 0.1, 0.2, 0.3, 0.99, 0.999)
+}
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """Encoded for a screen (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def decoded_srgb(shown: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`srgb`."""
+    shown = np.clip(shown, 0, 1)
+    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+
+
+def named_between(low: float, high: float) -> tuple[float, str]:
+    """The value in an interval, and its name: a known one if the interval holds it."""
+    for name, value in KNOWN.items():
+        if low * 0.999 <= value <= high * 1.001:
+            return value, name
+    middle = 0.5 * (low + high)
+    return middle, f"{middle:.3g}"
+
+
+@dataclass
+class Prober:
+    """Draws probes and gathers what they say."""
+
+    draw: Callable[[Workload], tuple[np.ndarray, bool]]  # picture, and whether it has 8 bits
+    degree: int = 3
+    sentences: dict[str, str] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)  # of the oracle, where they differ from the defaults
+    behind: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(2))  # px, of all places
+    encoded: bool = False  # the picture
+    decoded: bool = False  # colors, before they are blended
+    seen: float = SEEN[False]
+
+    def picture(self, arrays: dict[str, np.ndarray], background=(0.0, 0.0, 0.0), camera=None) -> np.ndarray:
+        """[H, W, 3] in the space in which it was blended."""
+        workload = on_all_pixels("probe", (tensors(arrays), camera or probe_camera()), background, self.degree)
+        image, eight_bit = self.draw(workload)
+        self.seen = SEEN[eight_bit]
+        return decoded_srgb(image) if self.encoded else image
+
+    def cover(self, pixels, depth, sigma, opacity) -> np.ndarray:
+        """1 - T of green balls, [H, W]."""
+        image = self.picture(balls(probe_camera(), np.asarray(pixels) - self.shift, depth, sigma, opacity, GREEN))
+        span = GREEN - self.behind
+        return (image - self.behind) @ span / (span @ span)
+
+    def blended(self, colors) -> np.ndarray:
+        """What is blended of colors of the file."""
+        return decoded_srgb(np.asarray(colors)) if self.decoded else np.asarray(colors)
+
+    def exact(self, arrays: dict[str, np.ndarray], camera=None, background=None) -> oracle.Render:
+        """What float64 says of a probe, at the places where the renderer draws it."""
+        camera = camera or probe_camera()
+        moved = replace(camera, cx=camera.cx + self.shift[0], cy=camera.cy + self.shift[1])
+        given = {name: torch.tensor(np.ascontiguousarray(array)) for name, array in arrays.items()}
+        sh = torch.cat([given.pop("sh_dc"), given.pop("sh_rest")], 1)
+        behind = tuple(self.behind if background is None else background)
+        return oracle.exact_render(**given, sh=sh, camera=moved, background=behind)
+
+    def nearest(self, image: np.ndarray, candidates: dict[str, np.ndarray]) -> str:
+        """The name of the candidate nearest to the picture; "other" if none is near."""
+        errors = {name: float(np.abs(image - each).mean()) for name, each in candidates.items()}
+        best = min(errors, key=errors.__getitem__)
+        others = [error for name, error in errors.items() if name != best]
+        return best if errors[best] < 0.5 * min(others) else "other"
+
+
+def probe_camera():
+    """On whose axis CENTER lies."""
+    return make_camera(65, 49, FOCAL, seed=None)
+
+
+def radii_of_pixels() -> np.ndarray:
+    """Of each pixel's center from CENTER, [H, W] px."""
+    y, x = np.mgrid[:49, :65] + 0.5
+    return np.hypot(x - CENTER[0], y - CENTER[1])

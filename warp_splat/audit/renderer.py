@@ -1,0 +1,142 @@
+"""A renderer in a process of its own, which may hang or die: what it drew, and how its gradients came out."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from warp_splat.audit.targets.program import draw_by_program
+from warp_splat.compare.workloads import Workload
+from warp_splat.errors import InputError
+
+START_LIMIT = 300.0  # s for its imports, of which some compile
+
+
+class RendererFailed(Exception):
+    """Why there is no picture: a phrase."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back."""
+
+    image: np.ndarray  # [H, W, 3] float64
+    eight_bit: bool
+    gradients: dict[str, torch.Tensor] | None  # by parameter; None: it has none
+    same: bool  # every run gave the same bits
+
+
+class Renderer:
+    """Draws with ``MODULE:function`` or a program's command line; started again after each failure.
+
+    The function takes means [N, 3], quats [N, 4] (w first), scales [N, 3], opacities [N], sh [N, K, 3] (float32,
+    activated), a :class:`warp_splat.Camera` and the background [3]. It returns the picture [H, W, 3], float or uint8.
+    """
+
+    def __init__(self, place: str, command: str = "", limit: float = 60.0):
+        self.place, self.command, self.limit = place, command, limit
+        self.process: Any = None
+
+    def draw(self, workload: Workload, upstream: torch.Tensor | None = None, runs: int = 1) -> Answer:
+        """The picture, and the gradients for ``upstream`` [H, W, 3].
+
+        Raises:
+            RendererFailed: if it hangs, dies, refuses, or returns something else.
+        """
+        if self.process is None:
+            context = multiprocessing.get_context("spawn")
+            self.connection, other = context.Pipe()
+            self.process = context.Process(target=_serve, args=(other, self.place, self.command), daemon=True)
+            self.process.start()
+            other.close()
+            self._receive(START_LIMIT)
+        given = [tensor.numpy() for tensor in (*workload.gaussians, workload.background)]
+        self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
+        image, gradients, same = self._receive(self.limit * runs)
+        shape = (workload.camera.height, workload.camera.width, 3)
+        if image.shape != shape:
+            raise RendererFailed(f"returned shape {image.shape}, not {shape}")
+        found = None if gradients is None else {name: torch.from_numpy(array) for name, array in gradients.items()}
+        eight_bit = image.dtype == np.uint8
+        return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same)
+
+    def _receive(self, limit: float):
+        if not self.connection.poll(limit):
+            self.close()
+            raise RendererFailed(f"hangs: no answer in {limit:.0f} s")
+        try:
+            found = self.connection.recv()
+        except EOFError:
+            self.process.join()
+            code = self.process.exitcode
+            self.close()
+            raise RendererFailed(f"crashes: its process ended with {code}") from None
+        if isinstance(found, str):
+            raise RendererFailed(found)
+        return found
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+            self.process = None
+
+
+def function_of(place: str):
+    """The function of ``MODULE:function``. Raises InputError if there is none."""
+    module, _, name = place.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"{place}: expected MODULE:function that can be imported, found {error}.") from error
+
+
+def _serve(connection, place: str, command: str) -> None:
+    """The loop of the process: Gaussians in, picture and gradients out, or a phrase that says what went wrong."""
+    try:
+        render = draw_by_program(command) if command else function_of(place)
+        connection.send(())
+    except Exception as error:
+        connection.send(_phrase(error))
+        return
+    while True:
+        try:
+            given, camera, upstream, runs = connection.recv()
+        except EOFError:
+            return
+        try:
+            runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
+            connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
+        except Exception as error:
+            connection.send(_phrase(error))
+
+
+def _phrase(error: Exception) -> str:
+    return f"refuses: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+def _bits(run) -> bytes:
+    image, gradients = run
+    return b"".join(array.tobytes() for array in (image, *(gradients or {}).values()))
+
+
+def _draw(render, given: list[np.ndarray], camera, upstream: np.ndarray | None):
+    *leaves, background = (torch.from_numpy(array.copy()).requires_grad_(upstream is not None) for array in given)
+    image = render(*leaves[:4], torch.cat(leaves[4:], 1), camera, background)
+    if not isinstance(image, torch.Tensor) or not image.requires_grad:
+        return np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image), None
+    names = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "background")
+    wanted = [leaf for leaf in (*leaves, background) if leaf.numel()]
+    gradient = torch.from_numpy(upstream).to(image)
+    found = iter(torch.autograd.grad(image, wanted, gradient, allow_unused=True))
+    by_name = {name: next(found) for name, leaf in zip(names, (*leaves, background), strict=True) if leaf.numel()}
+    dc, rest = by_name.pop("sh_dc"), by_name.pop("sh_rest", None)
+    by_name["sh"] = dc if dc is None or rest is None else torch.cat([dc, rest], 1)
+    gradients = {name: value.cpu().numpy() for name, value in by_name.items() if value is not None}
+    return image.detach().cpu().numpy(), gradients

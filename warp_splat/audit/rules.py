@@ -1,0 +1,284 @@
+"""What a renderer does, found from pictures of probes: each rule as a sentence, and as options for the oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from warp_splat.audit.probes import (
+    ASKED,
+    CENTER,
+    FOCAL,
+    GREEN,
+    OPAQUE,
+    Prober,
+    decoded_srgb,
+    named_between,
+    probe_camera,
+    radii_of_pixels,
+    srgb,
+)
+from warp_splat.audit.renderer import RendererFailed
+from warp_splat.audit.small_scenes import balls
+from warp_splat.compare import oracle
+from warp_splat.compare.scenes import make_camera
+from warp_splat.compare.workloads import Workload
+from warp_splat.formats.stored import SH_C0
+
+
+def find_background(prober: Prober) -> str:
+    """What is behind everything, asked for light blue and for black."""
+    arrays = balls(probe_camera(), [CENTER], 3.0, 3.0, 0.9, GREEN)
+    asked, black = (prober.picture(arrays, background)[0, 0] for background in (ASKED, (0.0, 0.0, 0.0)))
+    prober.behind = black
+    if min(np.abs(asked - each).max() for each in (ASKED, srgb(np.array(ASKED)))) < 0.01 and black.max() < 0.01:
+        return "The background asked for is blended behind the Gaussians."
+    shown = {"black": 0.0, "white": 1.0}
+    name = next((name for name, value in shown.items() if np.abs(asked - value).max() < 0.01), np.round(asked, 3))
+    return f"The background asked for is ignored; it is {name}."
+
+
+def find_color_space(prober: Prober) -> str:
+    """Whether and where the curve of sRGB is applied."""
+    colors = np.array([0.2, 0.45, 0.7])
+    arrays = balls(probe_camera(), [CENTER], 3.0, 8.0, 0.7, colors)
+    image, exact = prober.picture(arrays), prober.exact(arrays)
+    alpha, plain = exact.alpha.numpy()[..., None], exact.image.numpy()
+    candidates = {
+        "as they are": plain,
+        "encoded": srgb(plain),
+        "decoded": decoded_srgb(colors) * alpha + (1 - alpha) * prober.behind,
+        "in linear light": srgb(decoded_srgb(colors) * alpha + (1 - alpha) * prober.behind),
+    }
+    found = prober.nearest(image, candidates)
+    prober.encoded, prober.decoded = found in ("encoded", "in linear light"), found in ("decoded", "in linear light")
+    return {
+        "as they are": "Colors are blended and shown as the file says.",
+        "encoded": "The picture is encoded by the sRGB curve after blending: it comes out too bright.",
+        "decoded": "Colors are decoded from sRGB before blending, and not encoded again: it comes out too dark.",
+        "in linear light": "Colors are blended in linear light, and encoded by the sRGB curve after that.",
+        "other": "Colors are neither as the file says nor changed by the sRGB curve.",
+    }[found]
+
+
+def find_low_pass(prober: Prober) -> str:
+    """With the antialiasing: a ball of 0.5 px, its variance by the ratio of neighbors, its strength by its height."""
+    cover = prober.cover([CENTER], 4.0, 0.5, 0.9)
+    height, beside = cover[24, 32], np.mean([cover[24, 31], cover[24, 33], cover[23, 32], cover[25, 32]])
+    if height <= prober.seen or beside <= prober.seen:
+        return "Gaussians of half a pixel are not drawn, or have no width."
+    if height <= beside:
+        return "A Gaussian of half a pixel is as strong beside its pixel as in it: the low-pass filter was not found."
+    variance = 0.5 / np.log(height / beside)
+    blur, step = variance - 0.25, 4 * prober.seen / beside * variance
+    value, name = named_between(blur - step, blur + step)
+    share = height / 0.9
+    wanted = 0.25 / variance
+    antialiased = abs(share - wanted) < abs(share - 1)
+    prober.options |= {"blur": max(value, 1e-6), "antialiasing": bool(antialiased and blur > 0.02)}
+    if abs(share - (wanted if antialiased else 1)) > 0.05:
+        prober.sentences["antialiasing"] = f"A Gaussian of half a pixel has {share:.2f} of its opacity."
+    elif prober.options["antialiasing"]:
+        prober.sentences["antialiasing"] = "Opacities are scaled by the share of area that the low-pass filter added."
+    else:
+        prober.sentences["antialiasing"] = "There is no antialiasing: small Gaussians grow brighter."
+    return f"The low-pass filter adds {name} px² to the variances." if blur > 0.02 else "There is no low-pass filter."
+
+
+def find_cut(prober: Prober) -> str:
+    """With the extent: where stacks of faint balls end, once by alpha, once by standard deviations."""
+    edges, radii = [], radii_of_pixels()
+    for opacity in (0.05, 0.02):
+        cover = prober.cover([CENTER] * 32, np.linspace(3, 3.5, 32), 8.0, opacity)
+        alpha = opacity * np.exp(-(radii**2) / (2 * (64 + prober.options.get("blur", oracle.BLUR))))
+        drawn = cover > max(prober.seen, 1e-3 * alpha.max())
+        gone = alpha[~drawn & (32 * alpha > 2 * max(prober.seen, 1e-3 * alpha.max()))]
+        edges.append((gone.max(initial=0.0), alpha[drawn].min(initial=1.0)))
+    (low, high), other = edges
+    if low == 0:
+        prober.options["alpha_min"] = 0.0
+        return f"No alpha is left out, down to {max(high, prober.seen / 32):.1g}."
+    if not 0.8 < other[0] / low < 1.25:  # not by alpha: see find_extent
+        prober.options["alpha_min"] = 0.0
+        return f"No alpha is left out for being faint, down to {min(high, other[1]):.1g}."
+    value, name = named_between(min(low, high), max(low, high))
+    prober.options["alpha_min"] = value
+    return f"An alpha below {name} is left out."
+
+
+def find_extent(prober: Prober) -> str:
+    """Where a strong Gaussian ends although its alpha is not faint yet."""
+    variance, radii = 36 + prober.options.get("blur", oracle.BLUR), radii_of_pixels()
+    alpha = 0.95 * np.exp(-(radii**2) / (2 * variance))
+    drawn = prober.cover([CENTER], 3.0, 6.0, 0.95) > 0.3 * alpha
+    missing = ~drawn & (alpha > 1.1 * max(prober.options.get("alpha_min", 0), 1.5 * prober.seen, 1e-6))
+    if not missing.any():
+        return "A Gaussian reaches as far as its alpha does."
+    first, last = radii[missing].min() / variance**0.5, radii[drawn].max() / variance**0.5
+    shape = "round" if last - first < 0.25 else f"not round: some pixels up to {last:.1f} are drawn"
+    return f"A Gaussian ends {first:.1f} standard deviations from its center ({shape}), where alpha is still " \
+           f"{alpha[missing].max():.1g}."  # fmt: skip
+
+
+def find_clamp(prober: Prober) -> str:
+    """The largest alpha."""
+    top = prober.cover([CENTER], 3.0, 9.0, OPAQUE)[24, 32]
+    step = max(prober.seen, 2e-6)
+    if top > OPAQUE - 2 * step:
+        prober.options["alpha_max"] = 0.9999
+        return f"Alpha is not clamped below {OPAQUE - 2 * step:.4g}."
+    value, name = named_between(top - step, min(top + step, 1))
+    prober.options["alpha_max"] = value
+    return f"Alpha is clamped at {name}."
+
+
+def find_stop(prober: Prober) -> str:
+    """What is left of the light behind 160 layers."""
+    left = 1 - prober.cover([CENTER] * 160, np.linspace(3, 5, 160), 40.0, 0.1)[24, 32]
+    if left < max(2 * prober.seen, 2e-7):
+        prober.options["t_min"] = 0.0 if prober.seen < 1e-6 else oracle.STOP
+        return f"A pixel does not stop while its transmittance is above {max(left, prober.seen):.1g}."
+    value, name = named_between(0.9 * left, left)
+    prober.options["t_min"] = value
+    return f"A pixel stops where its transmittance would fall below {name}."
+
+
+def find_near(prober: Prober) -> str:
+    """Which of nine depths are drawn."""
+    depths = np.array([0.002, 0.007, 0.015, 0.05, 0.07, 0.15, 0.3, 0.7, 1.5])
+    pixels = np.stack([np.linspace(4.5, 60.5, 9), np.full(9, 24.5)], 1)
+    cover = prober.cover(pixels, depths, 1.5, 0.9)
+    drawn = cover[24, pixels[:, 0].astype(int)] > 0.3
+    if drawn.all():
+        prober.options["near"] = 1e-6
+        return f"There is no near plane, down to {depths[0]}."
+    if not drawn.any():
+        return "Nothing nearer than 1.5 is drawn."
+    low, high = depths[~drawn].max(), depths[drawn].min()
+    value, name = named_between(low, high)
+    prober.options["near"] = value
+    return f"Gaussians nearer than about {name} are left out (between {low:g} and {high:g})."
+
+
+def find_rotation(prober: Prober) -> str:
+    """In which order the numbers of a rotation are read."""
+    color = np.array([0.9, 0.6, 0.3])
+    arrays = balls(probe_camera(), [CENTER], 3.0, 5.0, 0.8, color) | {"scales": np.array([[0.6, 0.15, 0.05]])}
+    quat = np.array([0.8, 0.1, 0.3, 0.5]) / np.linalg.norm([0.8, 0.1, 0.3, 0.5])
+    image = prober.picture(arrays | {"quats": quat[None]})
+    arrays |= {"sh_dc": (prober.blended(color)[None, None] - 0.5) / SH_C0}
+    orders = {"w, x, y, z": quat, "x, y, z, w": quat[[3, 0, 1, 2]], "w, x, y, z, inverse": quat * [1, -1, -1, -1]}
+    candidates = {name: prober.exact(arrays | {"quats": order[None]}).image.numpy() for name, order in orders.items()}
+    found = prober.nearest(image, candidates)
+    known = f"Rotations are read as {found}."
+    return "A needle does not look as in any known order of a rotation's numbers." if found == "other" else known
+
+
+def find_harmonics(prober: Prober) -> str:
+    """Each coefficient above degree 0 in a Gaussian of its own, seen from a direction where none is zero."""
+    if prober.degree == 0:
+        return "It claims no harmonics above degree 0."
+    count = (prober.degree + 1) ** 2
+    camera = make_camera(65, 49, FOCAL, seed=5, center=(0.0, 0.0, 0.0))
+    places = np.stack(np.meshgrid(np.arange(4) * 14 + 11.5, np.arange(4) * 11 + 7.5), -1).reshape(-1, 2)[:count]
+    arrays = balls(camera, places, np.linspace(3, 4, count), 1.5, 0.9, 0.5)
+    rest = np.zeros((count, count - 1, 3))
+    rest[np.arange(1, count), np.arange(count - 1)] = 0.8
+    image = prober.picture(arrays | {"sh_rest": rest}, camera=camera)
+    blank = prober.picture(arrays | {"sh_rest": 0 * rest}, camera=camera)
+    rows, columns = places[:, 1].astype(int), places[:, 0].astype(int)
+    basis = oracle.sh_basis(torch.tensor(arrays["means"] / np.linalg.norm(arrays["means"], axis=1)[:, None]), 3).numpy()
+    span = prober.blended(0.5) - prober.behind
+    alpha = np.maximum((blank - prober.behind)[rows, columns] / span, 0.1)
+    color = prober.behind + (image - prober.behind)[rows, columns] / alpha
+    found = ((srgb(color) if prober.decoded else color).mean(1) - 0.5) / 0.8
+    wrong = []
+    for k in range(1, count):
+        if abs(found[k] - basis[k, k]) < 0.02:
+            continue
+        near = {sign * j: abs(found[k] - sign * basis[k, j]) for j in range(1, count) for sign in (1, -1)}
+        best = min(near, key=near.__getitem__)
+        best = -k if near[-k] < 0.02 else best
+        what = "has the other sign" if best == -k else f"is taken for {'-' * (best < 0)}{abs(best)}"
+        wrong.append(f"{k} {'is not seen' if abs(found[k]) < 0.004 else what if near[best] < 0.02 else 'is another'}")
+    if wrong:
+        return f"Harmonics differ: coefficient {'; '.join(wrong)}."
+    return f"Harmonics up to degree {prober.degree} have the usual signs and order."
+
+
+def find_sort(prober: Prober) -> str:
+    """What decides which of two Gaussians is in front."""
+
+    def front(first, second, camera) -> int:
+        """Which of two is in front, 0 or 1; -1: neither."""
+        given = arrays | {"sh_dc": (prober.blended(colors)[:, None] - 0.5) / SH_C0}
+        one, two = (prober.exact({k: a[[i]] for k, a in given.items()}, camera, oracle.BLACK) for i in (first, second))
+        image = prober.picture({name: array[[first, second]] for name, array in arrays.items()}, camera=camera)
+        over = lambda a, b: (a.image + (1 - a.alpha[..., None]) * b.image).numpy()  # noqa: E731
+        left = ((1 - one.alpha) * (1 - two.alpha))[..., None].numpy() * prober.behind
+        found = prober.nearest(image, {"0": over(one, two) + left, "1": over(two, one) + left})
+        return -1 if found == "other" else int(found)
+
+    colors = np.array([[0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
+    arrays = balls(probe_camera(), [CENTER, CENTER], [3.0, 4.0], 8.0, 0.7, colors)
+    both = front(0, 1, probe_camera()), front(1, 0, probe_camera())
+    if both != (0, 1):
+        return {
+            (0, 0): "Gaussians are not sorted: the first in the file is in front.",
+            (1, 1): "Gaussians are not sorted: the last in the file is in front.",
+            (1, 0): "The order is reversed: the farther Gaussian is in front.",
+        }.get(both, "Two Gaussians behind each other do not look as in either order.")
+    wide = make_camera(65, 49, 30.0, seed=None)
+    arrays = balls(wide, [[60.5, 24.5], [24.5, 24.5]], [3.0, 3.3], [9.0, 12.0], 0.7, colors)
+    key = front(0, 1, wide), front(1, 0, wide)
+    return {
+        (0, 1): "Gaussians are sorted by depth along the axis.",
+        (1, 0): "Gaussians are sorted by distance from the camera.",
+    }.get(key, "Gaussians are sorted by depth, and by neither the axis nor the distance alone.")
+
+
+def find_pixels(prober: Prober) -> str:
+    """Where three small Gaussians are seen."""
+    places = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]])
+    cover = np.clip(prober.cover(places, [3.0, 3.5, 4.0], 2.0, 0.9), 0, None)
+    y, x = np.mgrid[:49, :65] + 0.5
+    offsets = []
+    for place in places:
+        share = cover * (np.abs(x - np.floor(place[0]) - 0.5) < 9) * (np.abs(y - np.floor(place[1]) - 0.5) < 9)
+        offsets.append([(share * x).sum() / share.sum() - place[0], (share * y).sum() / share.sum() - place[1]])
+    shift, spread = np.mean(offsets, 0), np.abs(np.array(offsets)).max()
+    limit = 0.01 if prober.seen < 1e-6 else 0.05
+    prober.shift = shift if spread > limit else prober.shift
+    if spread < limit:
+        return f"The camera matches within {spread:.1g} px: centers of pixels are at +0.5."
+    return f"Places are off by up to {spread:.2g} px, on average by ({shift[0]:.2f}, {shift[1]:.2f})."
+
+
+#: In an order in which later ones may use what earlier ones found.
+FINDERS = {
+    "background": find_background,
+    "camera": find_pixels,
+    "color space": find_color_space,
+    "low-pass": find_low_pass,
+    "cut": find_cut,
+    "extent": find_extent,
+    "clamp": find_clamp,
+    "stop": find_stop,
+    "near plane": find_near,
+    "rotation": find_rotation,
+    "harmonics": find_harmonics,
+    "order": find_sort,
+}
+
+
+def find_rules(draw: Callable[[Workload], tuple[np.ndarray, bool]], degree: int = 3) -> Prober:
+    """All rules of a renderer: ``sentences`` by name, ``options`` for the oracle."""
+    prober = Prober(draw, degree)
+    for name, find in FINDERS.items():
+        try:
+            prober.sentences[name] = find(prober)
+        except RendererFailed as error:
+            prober.sentences[name] = f"Not found: it {error}."
+    return prober
