@@ -24,6 +24,7 @@ FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox
 CACHE = Path.home() / ".cache" / "warp_splat" / "web"  # where npm puts what it is asked for
 #: A viewer's page has ``show``; our own has buttons, which would be in the picture.
 SHOW = """async (camera) => {
+  while (!window.show && !window.warpSplat) await new Promise((resolve) => setTimeout(resolve, 20));
   if (!window.show) for (const part of document.querySelectorAll("div, button")) part.style.display = "none";
   await (window.show ?? window.warpSplat.setCamera)(camera);
 }"""
@@ -31,7 +32,11 @@ OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "LINEAR": False, "BACKGROUN
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Says nothing."""
+    """Says nothing, and lets nothing be kept: the next scene has the same name, maybe within the same second."""
+
+    def end_headers(self):
+        self.send_header("Cache-Control", "no-store")
+        super().end_headers()
 
     def log_message(self, *_):
         pass
@@ -63,7 +68,6 @@ def _screenshot(packages: tuple[str, ...], name: str, camera, write) -> object:
     write(folder)
     page.set_viewport_size({"width": camera.width, "height": camera.height})
     page.goto(f"{address}/{name}.html")
-    page.wait_for_function("!!(window.show || window.warpSplat)")
     page.evaluate(SHOW, camera_entry(camera))
     page.screenshot(path=folder / "screen.png")
     return load_png(folder / "screen.png")
