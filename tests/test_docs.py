@@ -113,7 +113,7 @@ def test_flags_exist(page):
 
 @functools.cache
 def benchmark_flags():
-    scripts = [*(ROOT / "benchmarks").glob("*.py"), *DOCS.glob("*.py")]
+    scripts = [path for folder in ("assets", "benchmarks", "docs") for path in (ROOT / folder).glob("*.py")]
     return {
         flag
         for script in scripts
