@@ -20,7 +20,7 @@ from trainings import Pretended
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
-from warp_splat.runtime.distributed import ALONE, join
+from warp_splat.runtime.distributed import ALONE, Processes, join
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -209,8 +209,8 @@ def test_each_view_once_before_any_comes_again(scene):
     """And never twice in a step, where one deck ends and the next begins."""
     count, views = 4, len(scene.train)
     assert views % count != 0
-    trainers = [Trainer(scene, TrainConfig(device="cpu"), Pretended(rank, count)) for rank in range(count)]
-    steps = [[trainer.deck.deal(trainer.processes).name for trainer in trainers] for _ in range(3 * views)]
+    trainer = Trainer(scene, TrainConfig(device="cpu"), Pretended(0, count))
+    steps = [[view.name for view in trainer.deck.deal(count)] for _ in range(3 * views)]
     assert all(len(set(step)) == count for step in steps)
     dealt = [name for step in steps for name in step]
     seen = [dealt[: views * n].count(view.name) for n in (1, 5, 12) for view in scene.train]
@@ -220,6 +220,20 @@ def test_each_view_once_before_any_comes_again(scene):
 def test_more_processes_than_views(scene):
     with pytest.raises(InputError, match=r"--nproc-per-node.*50 training views, got 51"):
         Trainer(scene, TrainConfig(device="cpu"), Pretended(0, 51))
+
+
+def test_several_views_a_step_in_one_process_are_the_mean_of_their_gradients(scene):
+    """Bit for bit those of as many trainers with one view each, summed in the order of the views."""
+    config = TrainConfig(device="cpu", random_background=True, parts="floaters", sh_interval=1)
+    trainers = [Trainer(scene, config, Pretended(rank, 4)) for rank in range(4)]
+    alone = Trainer(scene, config, Processes(images=4))
+    for iteration in (4, 8):
+        parts, loss = gradients_of_ranks(scene, trainers, iteration), alone.differentiate(iteration)
+        for name, found in {"loss": loss, **{key: leaf.grad for key, leaf in alone.model.parameters.items()}}.items():
+            expected = (((parts[0][name] + parts[1][name]) + parts[2][name]) + parts[3][name]) / 4
+            assert torch.equal(found, expected), (iteration, name)
+        assert torch.equal(alone._radii, torch.stack([trainer._radii for trainer in trainers]).amax(0))
+        alone.optimizer.zero_grad()
 
 
 def test_schedules_count_images(scene):

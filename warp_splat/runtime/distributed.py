@@ -1,6 +1,6 @@
 """Processes that train one model together, as ``torchrun`` starts them: what they exchange, and how they end.
 
-Data parallelism: each process holds the whole model and differentiates another view. The mean of the gradients makes
+Data parallelism: each process holds the whole model and differentiates other views. The mean of the gradients makes
 the same step everywhere. Nothing else is sent. The models stay the same bytes, because every decision is made from
 numbers that are the same. :meth:`Processes.check_identical` proves it.
 """
@@ -30,7 +30,8 @@ class Processes:
 
     Attributes:
         rank: number of this process; 0 prints, evaluates and saves.
-        count: of all processes; images in a step, by which an iteration number grows. Of one, nothing is exchanged.
+        count: of all processes. Of one, nothing is exchanged.
+        images: in a step, by which an iteration number grows.
         local_count: of those on this machine.
         lost: whether another process went away. Then this one saves the model, even if its rank is not 0.
 
@@ -40,21 +41,23 @@ class Processes:
 
     lost = False
 
-    def __init__(self, rank: int = 0, count: int = 1, local_count: int = 1):
-        self.rank, self.count, self.local_count = rank, count, local_count
+    def __init__(self, rank: int = 0, count: int = 1, local_count: int = 1, images: int = 0):
+        self.rank, self.count, self.local_count, self.images = rank, count, local_count, images or count
 
     def reaches(self, iteration: int, marks: Iterable[int]) -> bool:
         """Whether one of ``marks`` is among the iterations of the step that ends with ``iteration``."""
-        return any(0 <= iteration - mark < self.count for mark in marks)
+        return any(0 <= iteration - mark < self.images for mark in marks)
 
     def average(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Replace the tensors by their means over the processes."""
+        """Replace the tensors, sums over this process's images, by their means over all images of the step."""
         if self.count == 1:
+            for tensor in tensors if self.images > 1 else ():
+                tensor.div_(self.images)
             return
         with stage("all-reduce"):
             flat = torch.cat([tensor.reshape(-1) for tensor in tensors])  # one exchange: each waits for all processes
             self.sum(flat)
-            flat /= self.count
+            flat /= self.images
             for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
                 tensor.copy_(mean.view(tensor.shape))
 
@@ -121,17 +124,19 @@ ALONE = Processes()
 
 
 @contextmanager
-def join(device: str) -> Iterator[Processes]:
+def join(device: str, images: int = 0) -> Iterator[Processes]:
     """The processes that ``torchrun`` started, for as long as the block runs; without it, this one alone.
 
     Args:
         device: "auto", "cpu" or "cuda"; on GPUs, each process of a machine takes another one.
+        images: of a step; 0: one for each process.
 
     Raises:
-        InputError: if a machine has fewer GPUs than processes, or the processes do not find each other.
+        InputError: if a machine has fewer GPUs than processes, or the processes do not find each other, or cannot
+            take equally many images.
     """
     if os.environ.get("WORLD_SIZE", "1") == "1":
-        yield ALONE
+        yield Processes(images=images) if images > 1 else ALONE
         return
     try:
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
@@ -141,6 +146,8 @@ def join(device: str) -> Iterator[Processes]:
             f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
             f"({error}); start several processes with torchrun, or unset it."
         ) from error
+    if images % count:
+        raise InputError(f"--views {images}: expected a multiple of {count} processes; give each as many.")
     # torch loads this later anyhow. Its functions would then keep the group of that moment as a default argument.
     # Nothing would end that group or its gloo threads, which abort a process that shuts down around them.
     import torch.distributed.nn  # noqa: PLC0415 - only of use here
@@ -161,6 +168,6 @@ def join(device: str) -> Iterator[Processes]:
             f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges ({str(error).splitlines()[0]})."
         ) from error
     try:
-        yield Processes(rank, count, local_count)
+        yield Processes(rank, count, local_count, images)
     finally:
         dist.destroy_process_group()

@@ -42,7 +42,7 @@ def train(config: TrainConfig) -> int:
             saved, has not the hash that ``verify`` asks for.
     """
     check_train(config)
-    with join(config.machine.device) as processes:
+    with join(config.machine.device, config.learn.views) as processes:
         if config.report.viewer and processes.count > 1:
             raise InputError("--viewer: expected one process, since others would wait for it; leave it out.")
         return _train(config, processes)

@@ -82,7 +82,7 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
     for row in measured:
         say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")
-    cost = Cost.of([row._replace(seconds=row.seconds / processes.count) for row in measured])  # of one image
+    cost = Cost.of([row._replace(seconds=row.seconds / processes.images) for row in measured])  # of one image
     plan = plan_for(config, cost, 60.0 * minutes, task)
     say(f"Plan for {minutes:g} minutes ({seconds_of(plan, cost, task):.0f} s by these figures): {as_flags(plan)}")
     if trial.growth.grows(config.learn.iterations):

@@ -35,12 +35,12 @@ KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
     """Train until the last step, or until Ctrl-C has put a signal into ``interrupted``."""
     report, processes = trainer.config.report, trainer.processes
-    deadline = Deadline(trainer.config.learn, trainer.photographs.full_size_from, processes.count)
+    deadline = Deadline(trainer.config.learn, trainer.photographs.full_size_from, processes.images)
     unprofiled = None  # iteration and seconds before the last --profile steps
     trainer.check_identical(run.iteration)
     with _progress_bar(trainer, run) as bar, timers.profile(report.profile > 0) as stages:
         while run.iteration < trainer.config.learn.end:
-            iteration = run.iteration + processes.count
+            iteration = run.iteration + processes.images
             if unprofiled is None and iteration > trainer.config.learn.end - report.profile:
                 stages.clear()
                 unprofiled = run.iteration, run.seconds
@@ -53,7 +53,7 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: Trai
             run.seconds += done - start
             run.spent += done - start
             stop = _do_what_is_due(trainer, run, interrupted, bar)
-            bar.update(processes.count)
+            bar.update(processes.images)
             if stop:
                 break
             run.spent += time.perf_counter() - done
@@ -66,7 +66,7 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: Trai
                 viewer.between_steps(interrupted)
     run.dropped = trainer.all_dropped()
     if report.profile and unprofiled:
-        steps = (run.iteration - unprofiled[0]) // processes.count
+        steps = (run.iteration - unprofiled[0]) // processes.images
         times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
         step = 1e3 * (run.seconds - unprofiled[1]) / steps
         run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
@@ -119,8 +119,9 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         "seconds": run.seconds,
     }
     run.history.append(record)
-    first = run.iteration - (len(values) - 1) * trainer.processes.count
-    points = [(first + place * trainer.processes.count, "train/loss", loss) for place, loss in enumerate(values)]
+    images = trainer.processes.images
+    first = run.iteration - (len(values) - 1) * images
+    points = [(first + place * images, "train/loss", loss) for place, loss in enumerate(values)]
     shown = {f"{split}/psnr_on_the_way": record["psnr"], "gaussians": record["gaussians"], "seconds": record["seconds"]}
     run.events.write(points + [(run.iteration, name, value) for name, value in shown.items()])
     text = f"loss {record['loss']:.4f}, {split} PSNR {record['psnr']:.2f}, {record['gaussians']} Gaussians"

@@ -72,7 +72,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         source = scene_for(source, processes.count, **options)
     config = config.changed(
         quiet=quiet,
-        iterations=iterations + -(iterations - done) % processes.count,  # whole steps
+        iterations=iterations + -(iterations - done) % processes.images,  # whole steps
         model_path=processes.first(str(folder)),
         device=device.type,
         portable=PORTABLE,  # which the variable of the environment may have set

@@ -53,6 +53,7 @@ class LearnOptions:
     iterations: int = flag(
         30_000, "images to train on, one in a step of each process; schedules count images", least=1, schedule=True
     )
+    views: int = learning(0, "images in a step, shared by all processes; 0: one for each process")
     minutes: float = flag(0.0, "instead of --iterations: plan a training that ends after so long, from its first step")
 
     lambda_dssim: float = learning(0.2, "share of 1 - SSIM in the loss", most=1)

@@ -11,7 +11,6 @@ from torch.nn import functional
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.runtime.distributed import Processes
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import View
 from warp_splat.training.options import LearnOptions, TrainConfig
@@ -76,21 +75,21 @@ class Photographs:
 
 
 class Deck:
-    """Views in random order, each once before any comes again; all processes deal alike, each takes its own."""
+    """Views in random order, each once before any comes again; all processes deal alike."""
 
     def __init__(self, views: Sequence[View], seed: int):
         self.views, self.left, self.random = views, list[View](), random.Random(seed)
 
-    def deal(self, processes: Processes) -> View:
-        """The view of this process in the next step."""
+    def deal(self, count: int) -> list[View]:
+        """The views of the next step."""
         dealt: list[View] = []
-        while len(dealt) < processes.count:
+        while len(dealt) < count:
             if not self.left:
                 self.left = list(self.views)
             index = self.random.randrange(len(self.left))
             if self.left[index] not in dealt:  # a new deck holds those of this step again
                 dealt.append(self.left.pop(index))
-        return dealt[processes.rank]
+        return dealt
 
     def state(self) -> dict[str, list[int]]:
         """What :meth:`restore` needs, as values of JSON."""

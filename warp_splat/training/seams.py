@@ -87,6 +87,7 @@ class Step(NamedTuple):
 
     iteration: int  # the last of this step
     view: View
+    place: int = 0  # among the views of this step
 
 
 class Change(NamedTuple):

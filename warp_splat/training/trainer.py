@@ -56,10 +56,11 @@ class Trainer:
     """
 
     def __init__(self, scene: Scene, config: TrainConfig, processes: Processes = ALONE):
-        if processes.count > len(scene.train):
+        if processes.images > len(scene.train):
+            flags = "--views" if config.learn.views else "--nproc-per-node"
             raise InputError(
-                f"--nproc-per-node: expected at most one process for each of {len(scene.train)} training views, got "
-                f"{processes.count}; start fewer."
+                f"{flags}: expected at most an image a step for each of {len(scene.train)} training views, got "
+                f"{processes.images}; take fewer."
             )
         if config.data.loss_space != "srgb" and not scene.linear:
             raise InputError(
@@ -80,7 +81,7 @@ class Trainer:
         setting = Setting(scene, self.model, self.background, processes, seed, limit, config.learn.iterations)
         self.parts = [PARTS[name].load()(config.plugins[name], setting) for name in config.used_parts]
         groups = [group for parameters in having(self.parts, "parameters") for group in parameters()]
-        self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.count, groups)
+        self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.images, groups)
         self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
         self.told = [sentence for told in having([self.growth], "told") for sentence in told()]
         self.dropped: Counter = Counter()  # of NOT_FINITE, on the device; prunings that would have emptied the scene
@@ -90,19 +91,31 @@ class Trainer:
         self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
         self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
-        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # in the last view
+        self._radii = torch.zeros(
+            len(self.model), dtype=torch.int32, device=self.device
+        )  # largest in the last step
 
     def differentiate(self, iteration: int) -> torch.Tensor:
-        """Gradients of the loss of one view; returns the loss, a scalar. Means over the processes, if there are more.
+        """Gradients of the loss of a step's views; returns the loss, a scalar. Means over all views of all processes.
 
-        Iterations count images from 1; with n processes a step is n of them, and ``iteration`` the last one's.
+        Iterations count images from 1; with n views a step is n of them, and ``iteration`` the last one's.
 
         The reference evaluates and saves between this and :meth:`update`: a set that was densified a moment ago is
         unsettled and renders several dB worse.
         """
-        learn = self.config.learn
         self._set_iteration(iteration)
-        step = Step(iteration, self.deck.deal(self.processes))
+        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)
+        steps = [Step(iteration, view, place) for place, view in enumerate(self.deck.deal(self.processes.images))]
+        first, *others = map(self._differentiate, steps[self.processes.rank :: self.processes.count])
+        loss = sum(others, first)
+        if self.config.learn.optimizer_type == "sparse_adam":
+            self.processes.maximum(self._radii)
+        self.processes.average([*self.model.gradients(self.degree), *self.optimizer.part_gradients(), loss])
+        return loss
+
+    def _differentiate(self, step: Step) -> torch.Tensor:
+        """Add the gradients of one view; returns its loss."""
+        learn, iteration = self.config.learn, step.iteration
         camera, photograph = self.photographs.at_size(step.view, iteration)
         options = self._through("asks", self.options, step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
@@ -122,11 +135,8 @@ class Trainer:
                 observe(out, step)
         dropped = (out.dropped.pixel_count, out.dropped.gaussian_count, out.invalid_count)
         self.dropped.update(dict(zip(NOT_FINITE, dropped, strict=True)))
-        self._radii, loss = out.radii, loss.detach()
-        if learn.optimizer_type == "sparse_adam":
-            self.processes.maximum(self._radii)
-        self.processes.average([*self.model.gradients(self.degree), *self.optimizer.part_gradients(), loss])
-        return loss
+        self._radii = torch.maximum(self._radii, out.radii)
+        return loss.detach()
 
     def _through(self, method: str, value: T, *arguments: Any) -> T:
         """What the parts and then the growth make of ``value``, one after another."""

@@ -44,14 +44,14 @@ class Budget(Reference):
 
     def update(self, iteration: int) -> Change | None:
         """Split and prune if it is time; None if the set did not change."""
-        options, step = self.options, self.processes.count
+        options, step = self.options, self.processes.images
         if not options.densify_from_iter < iteration < self.end or iteration % options.densification_interval >= step:
             return None
         return self._grow(self._due(iteration))
 
     def _due(self, iteration: int) -> int:
         """Gaussians that there are to be after the densification of this step."""
-        options, step = self.options, self.processes.count
+        options, step = self.options, self.processes.images
         following = (iteration // options.densification_interval + 1) * options.densification_interval
         if -(-following // step) * step >= self.end:  # this is the last one
             return self.setting.max_gaussians

@@ -66,7 +66,7 @@ class Mcmc:
 
     def update(self, iteration: int) -> Change | None:
         """Send dead Gaussians to live ones and add some, if it is time."""
-        options, step = self.options, self.processes.count
+        options, step = self.options, self.processes.images
         within = options.densify_from_iter < iteration < options.densify_until_iter
         if not within or iteration % options.densification_interval >= step:
             return None

@@ -71,7 +71,7 @@ class Reference:
 
     def update(self, iteration: int) -> Change | None:
         """Densify, prune and reset opacities if it is time; None if the set did not change."""
-        options, change, step = self.options, None, self.processes.count  # iterations in a step
+        options, change, step = self.options, None, self.processes.images  # iterations in a step
         if iteration >= options.densify_until_iter:
             return None
         if iteration > options.densify_from_iter and iteration % options.densification_interval < step:

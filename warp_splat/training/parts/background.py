@@ -20,6 +20,7 @@ class RandomBackground:
         self.setting = setting
         self.random = torch.Generator().manual_seed(setting.seed)
         self.color = setting.background
+        self.drawn = -1, torch.empty(0, 3)  # the step, and a color for each of its views
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
@@ -28,10 +29,10 @@ class RandomBackground:
         return Verdict(clear > 0, f"{clear} of {len(scene.train)} photographs are transparent somewhere")
 
     def background(self, color: torch.Tensor, step: Step) -> torch.Tensor:
-        """Draw one for each process; this one's."""
-        processes = self.setting.processes
-        drawn = torch.rand(processes.count, 3, generator=self.random)
-        self.color = drawn[processes.rank].to(color.device)
+        """Draw one for each view of a step; this one's."""
+        if step.iteration != self.drawn[0]:
+            self.drawn = step.iteration, torch.rand(self.setting.processes.images, 3, generator=self.random)
+        self.color = self.drawn[1][step.place].to(color.device)
         return self.color
 
     def photograph(self, photograph: Photograph, step: Step) -> Photograph:
