@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.splats import SplatArrays, SplatFile
 
-ENDINGS = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb", ".gltf")
+ENDINGS = (".ply", ".compressed.ply", ".splat", ".spz", ".sog", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 
 
 def some_splats(count=50, coefficients=16, seed=0):

@@ -12,6 +12,7 @@ from warp_splat.formats.sog import load_sog, save_sog
 from warp_splat.formats.splat32 import load_splat, save_splat
 from warp_splat.formats.splats import SplatFile, check_shapes, finite_rows
 from warp_splat.formats.spz import load_spz, save_spz
+from warp_splat.formats.usd import load_usd, save_usd
 from warp_splat.text import Report
 
 
@@ -32,6 +33,7 @@ FORMATS = {
     ".sog": Format(load_sog, save_sog, along_curve=True, empty=False),
     ".glb": Format(load_gltf, save_gltf, empty=False),
     ".gltf": Format(load_gltf, save_gltf, empty=False),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), Format(load_usd, save_usd)),
 }
 
 

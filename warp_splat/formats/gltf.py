@@ -17,9 +17,9 @@ from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.coordinates import kept
-from warp_splat.formats.gltf_container import CHUNK, HEADER, Document, decompose
+from warp_splat.formats.gltf_container import CHUNK, HEADER, Document
 from warp_splat.formats.reading import Unexpected, entries_of, reading
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, decompose, frame, joined, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -100,7 +100,7 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         report(f"{path}: {note}.")
     antialiased = all(_render_mode(piece) == "mip" for piece, _ in placed)
     extras = document.json.get("extras")
-    return SplatFile(_joined(parts), antialiased, kept(extras.get(COORDINATES)) if isinstance(extras, dict) else None)
+    return SplatFile(joined(parts), antialiased, kept(extras.get(COORDINATES)) if isinstance(extras, dict) else None)
 
 
 def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:
@@ -208,10 +208,3 @@ def _read_primitive(document: Document, primitive: dict, report: Report) -> Spla
 def _render_mode(primitive: dict) -> object:
     extras = primitive["extensions"][NAME].get("extras")
     return extras.get(RENDER_MODE) if isinstance(extras, dict) else None
-
-
-def _joined(parts: list[SplatArrays]) -> SplatArrays:
-    """One set of Gaussians; those of a lower SH degree get zeros."""
-    most = max(part.sh.shape[1] for part in parts)
-    padded = [part._replace(sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))) for part in parts]
-    return SplatArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))

@@ -6,7 +6,6 @@ hold. No other files are opened than buffers in the folder of the .gltf file or 
 Own code, plain JSON and NumPy: the libraries for glTF build objects from the JSON without checking it.
 """
 
-import math
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +21,6 @@ JSON_BYTES = 2**22  # a thousand times that of a file of Gaussians, and a hundre
 MOST_BUFFERS = 256  # files to look for; the Gaussians of a scene are in one or a few
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-EVEN = 1e-4  # by how much the axes of a node may differ in length, or lean
 
 
 class Buffer(NamedTuple):
@@ -167,21 +165,6 @@ class Document:
             raise Unexpected("no JSON" if text is None else f"JSON of {text.length} bytes, more than {JSON_BYTES}")
         source.seek(text.start)
         return source.read(text.length), chunks.get(b"BIN\0")
-
-
-def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
-
-    Raises:
-        Unexpected: if it stretches or shears, which would need other Gaussians.
-    """
-    linear = matrix[:3, :3]
-    scale = float(np.linalg.norm(linear)) / math.sqrt(3)
-    turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
-    if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
-        raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")
-    u, _, v = np.linalg.svd(turn)
-    return u @ v, matrix[:3, 3], scale
 
 
 def _matrix(node: dict) -> np.ndarray:

@@ -4,16 +4,20 @@ The frame is that of the scene's files, as trained (COLMAP: x right, y down, z f
 turn the Gaussians on writing and back on reading (:func:`turned`).
 """
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.formats.reading import Unexpected
 from warp_splat.formats.stored import sigmoid
 from warp_splat.text import Report
 
 COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
 AXIS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+EVEN = 1e-4  # by how much the axes of a transform may differ in length, or lean
 
 
 class SplatArrays(NamedTuple):
@@ -99,6 +103,28 @@ def turned(
             scales=(splats.scales + np.log(scale)).astype(np.float32),
             quats=splats.quats @ product.round(12).astype(np.float32).T,
         )
+
+
+def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
+
+    Raises:
+        Unexpected: if it stretches or shears, which would need other Gaussians.
+    """
+    linear = matrix[:3, :3]
+    scale = float(np.linalg.norm(linear)) / math.sqrt(3)
+    turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
+    if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
+        raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")
+    u, _, v = np.linalg.svd(turn)
+    return u @ v, matrix[:3, 3], scale
+
+
+def joined(parts: Sequence[SplatArrays]) -> SplatArrays:
+    """One set of Gaussians; those of a lower SH degree get zeros."""
+    most = max(part.sh.shape[1] for part in parts)
+    padded = [part._replace(sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))) for part in parts]
+    return SplatArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
 
 
 def _turn_harmonics(turn: np.ndarray, coefficients: int) -> np.ndarray:
