@@ -24,7 +24,7 @@ COLUMNS = {
     **{"of the .ply": "1/{share:.1f}", "renders to its": "{close}", "test PSNR dB": "{quality:.2f}"},
     **{"write s": "{write:.1f}", "read s": "{read:.1f}"},
 }
-LEFT_OUT = {".gltf"}  # holds what a .glb does
+LEFT_OUT = {".gltf", ".usd", ".usda", ".usdz"}  # hold what a .glb and a .usdc do
 
 
 def measure(scene_path: Path, model: Path, folder: Path) -> list[dict]:

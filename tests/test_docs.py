@@ -67,6 +67,9 @@ PROOFS = {
     "`.glb`, `.gltf`": """
         test_exchange.py::test_gltf_holds_what_the_extension_says
         test_exchange.py::test_gltf_nodes_move_turn_and_scale""",
+    "`.usd`, `.usda`, `.usdc`, `.usdz`": """
+        test_usd.py::test_a_stage_holds_what_the_schema_says_and_comes_back
+        test_usd.py::test_fields_are_joined_as_their_parents_place_them""",
 }
 
 

@@ -38,7 +38,7 @@ COMMANDS = {
     "convert": (
         ConvertConfig,
         "formats.convert.convert",
-        "convert Gaussians between .ply, .splat, .spz, .sog, glTF",
+        "convert Gaussians between .ply, .splat, .spz, .sog, glTF, USD",
     ),
     "simplify": (SimplifyConfig, "pruning.simplify.simplify", "leave out what a finished model does not need"),
     "clean": (CleanConfig, "pruning.clean.clean", "leave out what hangs right before few cameras"),

@@ -187,7 +187,7 @@ class InspectConfig:
 
 @dataclass
 class ConvertConfig:
-    """A model and a file of Gaussians: .ply, .splat, .spz, .sog, .glb or .gltf."""
+    """A model and a file of Gaussians: .ply, .splat, .spz, .sog, .glb, .gltf or .usd."""
 
     source: str = argument("the file to read, or the folder of a trained model")
     target: str = argument("the file to write; its ending says in which format")
