@@ -19,7 +19,7 @@ from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document
 from warp_splat.formats.reading import Unexpected, entries_of, reading
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, decompose, frame, joined, turned
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -100,7 +100,9 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         report(f"{path}: {note}.")
     antialiased = all(_render_mode(piece) == "mip" for piece, _ in placed)
     extras = document.json.get("extras")
-    return SplatFile(joined(parts), antialiased, kept(extras.get(COORDINATES)) if isinstance(extras, dict) else None)
+    return SplatFile(
+        concatenated(parts), antialiased, kept(extras.get(COORDINATES)) if isinstance(extras, dict) else None
+    )
 
 
 def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:

@@ -120,7 +120,7 @@ def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     return u @ v, matrix[:3, 3], scale
 
 
-def joined(parts: Sequence[SplatArrays]) -> SplatArrays:
+def concatenated(parts: Sequence[SplatArrays]) -> SplatArrays:
     """One set of Gaussians; those of a lower SH degree get zeros."""
     most = max(part.sh.shape[1] for part in parts)
     padded = [part._replace(sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))) for part in parts]

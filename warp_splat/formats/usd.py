@@ -20,7 +20,7 @@ from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.gltf import COORDINATES, RENDER_MODE
 from warp_splat.formats.reading import Unexpected, reading
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, decompose, frame, joined, turned
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -120,7 +120,7 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
         coordinates = kept(json.loads(told))
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    return SplatFile(joined(parts), antialiased, coordinates)
+    return SplatFile(concatenated(parts), antialiased, coordinates)
 
 
 def _read_prim(prim, now, report: Report) -> SplatArrays:

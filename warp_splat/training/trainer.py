@@ -91,9 +91,7 @@ class Trainer:
         self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
         self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
-        self._radii = torch.zeros(
-            len(self.model), dtype=torch.int32, device=self.device
-        )  # largest in the last step
+        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # largest in the last step
 
     def differentiate(self, iteration: int) -> torch.Tensor:
         """Gradients of the loss of a step's views; returns the loss, a scalar. Means over all views of all processes.
