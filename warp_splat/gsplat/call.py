@@ -7,9 +7,8 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.gsplat.arguments import Request, check_request
-from warp_splat.gsplat.harmonics_torch import colors_of
 from warp_splat.gsplat.pixels import draw
-from warp_splat.gsplat.seen import Seen, see
+from warp_splat.gsplat.seen import Seen, colors_of, see
 from warp_splat.raster.data import Bins
 
 

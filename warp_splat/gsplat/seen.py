@@ -9,9 +9,8 @@ import torch
 
 from warp_splat.config import ALPHA_MIN, FRUSTUM_MARGIN
 from warp_splat.gsplat.arguments import Request
-from warp_splat.gsplat.shutters import moved
-from warp_splat.gsplat.sigma_points import TINY, pixels_at, see_points
-from warp_splat.gsplat.turns import rows_turned
+from warp_splat.gsplat.helpers import spherical_harmonics
+from warp_splat.gsplat.sigma_points import TINY, moved, pixels_at, rows_turned, see_points
 from warp_splat.raster.beside import rotations
 
 
@@ -76,6 +75,18 @@ def see(request: Request) -> Seen:
         radii,
         drawn,
     )
+
+
+def colors_of(request: Request, seen: Seen) -> torch.Tensor:
+    """Colors [S, C or 1, N, D]: as given, or of the harmonics (Kerbl et al. 2023), from 0."""
+    if request.sh_degree is None or request.render_mode in ("D", "ED"):
+        return request.colors
+    centers = torch.linalg.inv(request.viewmats)[..., :3, 3]
+    if request.viewmats_rs is not None:
+        centers = 0.5 * (centers + torch.linalg.inv(request.viewmats_rs)[..., :3, 3])
+    rays = request.means[:, None] - centers[:, :, None]
+    colors = spherical_harmonics(request.sh_degree, rays, request.colors) + 0.5
+    return torch.where(seen.drawn[..., None], colors.clamp_min(0.0), 0.0)
 
 
 def _axes(request: Request) -> torch.Tensor:
