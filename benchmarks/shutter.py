@@ -20,7 +20,7 @@ from common import interleaved, parse, write_table
 from warp_splat import Camera, Lens, RasterOptions, Shutter, rasterize
 from warp_splat.evaluation.report import new_panels, save_figure
 from warp_splat.kernels.project.rolling import STEPS, make_expose
-from warp_splat.raster import moving
+from warp_splat.raster import camera_parameters
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 
@@ -48,7 +48,7 @@ def ways(camera: Camera) -> dict[str, tuple[Camera, int]]:
 
 def with_steps(steps: int):
     """The renderer with so many steps."""
-    return patch.object(moving, "make_expose", functools.partial(make_expose, steps=steps))
+    return patch.object(camera_parameters, "make_expose", functools.partial(make_expose, steps=steps))
 
 
 def row_by_row(scene: list[torch.Tensor], camera: Camera) -> torch.Tensor:

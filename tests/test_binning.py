@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from warp_splat import Camera, InputError, RasterOptions
-from warp_splat.raster import api, bin, depth_order
+from warp_splat.raster import api, bin
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Bins, Gaussians, Room
 from warp_splat.raster.drivers import CPU, CUDA, using
@@ -130,19 +130,19 @@ def crowded(count, width):
 
 def test_depths_are_sorted_in_bands(monkeypatch, threads):
     """Whatever their sign and size, ties by index; and the depths stay as they are."""
-    monkeypatch.setattr(depth_order, "SMALLEST_BAND", 1000)
+    monkeypatch.setattr(bin, "SMALLEST_BAND", 1000)
     random = np.random.default_rng(0)
     depths = (random.choice([-1.0, 1.0], 7003) * 10.0 ** random.uniform(-30, 30, 7003)).astype(np.float32)
     depths[random.integers(0, 7003, 3000)] = 2.5
     before = depths.copy()
     for count in (1, 2, 5):
         threads(count)
-        assert (depth_order.order_by_depth(depths) == np.argsort(depths, kind="stable")).all()
+        assert (bin.order_by_depth(depths) == np.argsort(depths, kind="stable")).all()
         assert (depths == before).all()
 
 
 def test_the_number_of_threads_changes_nothing(monkeypatch, threads):
-    monkeypatch.setattr(depth_order, "SMALLEST_BAND", 1000)
+    monkeypatch.setattr(bin, "SMALLEST_BAND", 1000)
     (camera, projected), results = project(5000), []
     for count in (1, 2, 3):
         threads(count)

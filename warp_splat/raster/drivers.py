@@ -9,6 +9,7 @@ kernel that writes every T, and ``generated`` (for the comparison) reads a copy 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -19,19 +20,22 @@ from warp_splat.config import TILE, RasterOptions
 from warp_splat.kernels.cpu import adjoint as lanes_adjoint
 from warp_splat.kernels.cpu import blend as lanes_blend
 from warp_splat.kernels.cpu import channels as lanes_channels
+from warp_splat.kernels.cpu import gather as lanes_gather
 from warp_splat.kernels.cpu import strongest as lanes_strongest
 from warp_splat.kernels.cpu import taped as lanes_taped
 from warp_splat.kernels.cuda import adjoint as blocks_adjoint
 from warp_splat.kernels.cuda import blend as blocks_blend
 from warp_splat.kernels.cuda import channels as blocks_channels
+from warp_splat.kernels.cuda import gather as blocks_gather
 from warp_splat.kernels.cuda import strongest as blocks_strongest
 from warp_splat.kernels.cuda import taped as blocks_taped
+from warp_splat.kernels.cuda.warps import WARP
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant, Splat2D
 from warp_splat.kernels.structs import BinsView
-from warp_splat.raster import bin, gathering
+from warp_splat.raster import bin
 from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
-from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, view
+from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, pack_struct, view
 
 THREADS = TILE * TILE
 
@@ -189,8 +193,44 @@ def _launch_blocks(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list, *
     launch_blocks(kernel, len(bins.ranges), inputs, outputs, bins.instances.device, **adjoint)
 
 
+def gather_by_splat(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
+    """Sums of each Gaussian's slots, the rows of gradients of its tile instances, on the CPU; zero where culled.
+
+    Always in the same order and without atomics: the same bits for any number of threads. Written into ``grads``
+    [N, width] each, column after column. Without, gradients of means2d, conics, opacities, colors and depths. Splats
+    come in the order of the Gaussians. Tried:
+
+    - 36 instead of 23 ms at 1M Gaussians: torch's ``embedding_bag``, some thousands at a time, their columns by numpy
+    - 2 x the time: a kernel that does not ask for memory before
+    """
+    grads, width = grads or bins.new_gradients(slots), slots.shape[1]
+    columns = [grad.data_ptr() + 4 * column for grad in grads for column in range(grad.shape[1])][:width]
+    addresses, widths = torch.tensor(columns), tuple(grad.shape[1] for grad in grads)
+    kernel = lanes_gather.make_gather(widths if sum(widths) == width else widths[:-1])
+    inputs = [bins.gaussian_count, bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32)]
+    inputs += [view(slots, wp.types.vector(length=width, dtype=float)), 0.0]
+    launch(kernel, len(bins.place_begins) + 1, inputs, [view(addresses, wp.uint64)])
+    return [grad.squeeze(1) for grad in grads]
+
+
+def gather_by_warp(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
+    """:func:`gather_by_splat` on a GPU, where splats are all Gaussians, nearest first."""
+    grads, views = grads or bins.new_gradients(slots), blocks_gather.GradientsView
+    ends = accumulate(grad.shape[1] for grad in grads)
+    tables = [grad for grad, end in zip(grads, ends, strict=True) if end <= slots.shape[1]]  # no depths, maybe
+    filled = [*tables, *[slots.new_empty(0, 0)] * (len(views.vars) - len(tables))]
+    tables_out = pack_struct(views, **dict(zip(views.vars, filled, strict=True)))
+    inputs = [bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32), view(slots, wp.float32)]
+    kernel, warps = (
+        blocks_gather.make_gather(tuple(table.shape[1] for table in tables)),
+        -(-len(bins.gaussians) // WARP),
+    )
+    launch_blocks(kernel, warps, inputs, [tables_out], slots.device)
+    return [grad.squeeze(1) for grad in grads]
+
+
 CPU = Driver(
-    *(LANES, True, bin.bin_by_counting, gathering.gather_by_splat, _launch_slices),
+    *(LANES, True, bin.bin_by_counting, gather_by_splat, _launch_slices),
     TileKernels(lanes_blend.make_blend, lanes_blend.make_upstream, lanes_adjoint.make_reverse, lanes_taped.make_walk),
     TileLayout(
         (lanes_blend.BLOCKS, LANES),
@@ -206,7 +246,7 @@ CPU = Driver(
     ),
 )
 CUDA = Driver(
-    *(1, False, bin.bin_by_sorting, gathering.gather_by_warp, _launch_blocks),
+    *(1, False, bin.bin_by_sorting, gather_by_warp, _launch_blocks),
     TileKernels(
         blocks_blend.make_blend_block,
         blocks_adjoint.make_upstream_block,

@@ -25,13 +25,17 @@ from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import (
     CameraParameters,
     coefficients_gradient,
+    exposed_by,
     intrinsics_gradient,
+    motion_gradient,
+    motion_of,
     pose_gradient,
+    pose_gradients,
     twist_gradient,
+    with_motion,
 )
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.raster.moving import exposed_by, motion_gradient, motion_of, pose_gradients, with_motion
 from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
@@ -141,7 +145,7 @@ def _launch_geometry(
 
     Returns:
         The gradients, of each group, of what all Gaussians share: of a shutter's motion with the quaternions
-        (:func:`.moving.motion_gradient`), or of the formula's coefficients [N / lanes, K]; else nothing.
+        (:func:`.camera_parameters.motion_gradient`), or of the formula's coefficients [N / lanes, K]; else nothing.
     """
     lanes, count, motion, shared_grads = it.driver.lanes, len(outputs[-1]), motion_of(it.camera), []
     number, integer, row2, row3, row4 = TYPES[lanes]
