@@ -16,11 +16,10 @@ from common import TRAINED, parse, write_table
 
 from warp_splat import Camera, CameraParameters
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
-from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
-from warp_splat.rendering.command import load_trained_scene, options_of
+from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
 
 FREE = {"pose": 0, "and fx, fy": 2, "and cx, cy": 4}  # intrinsics that are free
@@ -71,16 +70,16 @@ def follow(draw, view, extent: float, free: int, seed: int) -> list[list[float]]
 
 def follow_all(model: Path) -> dict[tuple[str, str, str], list[list[float]]]:
     """By scene, photograph and what is free: the middle one of those for training; its pose of those held out."""
-    _, gaussians, trained = open_model(model)
-    scene = load_trained_scene(str(model), "", trained, lambda line: None)
-    activated = Gaussians(*(tensor.detach() for tensor in GaussianModel.from_splats(gaussians.splats).activated()))
-    options, background = options_of(trained), torch.zeros(3)
+    finished = Finished(model)
+    scene, splats = finished.load_scene("", lambda line: None), finished.file.splats
+    activated = Gaussians(*(tensor.detach() for tensor in GaussianModel.from_splats(splats).activated()))
+    options, background = finished.options, torch.zeros(3)
     found = {}
     for split, views, names in (("", scene.train, FREE), (", held out", scene.test, list(FREE)[:1])):
         view = views[len(views) // 2]
         for name in names:
             draw = lambda camera: render(activated, camera, background, options).image  # noqa: E731
-            key = (Path(str(trained["source_path"])).name, view.name + split, name)
+            key = (Path(str(finished.trained["source_path"])).name, view.name + split, name)
             found[key] = follow(draw, view, scene.extent, FREE[name], seed=0)
             print(*key, found[key][-1], flush=True)
     return found

@@ -14,9 +14,8 @@ from common import TRAINED, option, parse, write_table
 
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import FORMATS, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.command import load_trained_scene, make_picture, options_of, with_refined_cameras
+from warp_splat.rendering.finished import Finished, make_picture
 from warp_splat.runtime import launch
 
 COLUMNS = {
@@ -29,9 +28,8 @@ LEFT_OUT = {".gltf", ".usd", ".usda", ".usdz"}  # hold what a .glb and a .usdc d
 
 def measure(scene_path: Path, model: Path, folder: Path) -> list[dict]:
     """A record for each format, the .ply first."""
-    iteration, file, trained = open_model(model)
-    scene = load_trained_scene(str(model), str(scene_path), trained, lambda _: None)
-    scene = with_refined_cameras(scene, str(model), iteration)
+    finished = Finished(model)
+    scene, file = finished.refined(finished.load_scene(str(scene_path), lambda _: None)), finished.file
     first, first_bytes, records = None, 0, []
     for ending in (ending for ending in FORMATS if ending not in LEFT_OUT):
         path, start = folder / f"a{ending}", time.perf_counter()
@@ -39,7 +37,7 @@ def measure(scene_path: Path, model: Path, folder: Path) -> list[dict]:
         written = time.perf_counter()
         splats = load_gaussians(path).splats
         read, size = time.perf_counter(), path.stat().st_size
-        picture = make_picture(GaussianModel.from_splats(splats), False, options_of(trained))
+        picture = make_picture(GaussianModel.from_splats(splats), False, finished.options)
         renders = [picture(view.camera) for view in scene.test]
         if first is None:
             first, first_bytes = np.concatenate(renders), size

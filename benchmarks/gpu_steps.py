@@ -14,7 +14,7 @@ from warp_splat.errors import InputError
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 from warp_splat.rendering.camera_paths import ORBIT_SIZE
-from warp_splat.rendering.command import make_picture
+from warp_splat.rendering.finished import make_picture
 from warp_splat.runtime import timers
 
 STAGES = (

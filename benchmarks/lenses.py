@@ -24,10 +24,9 @@ from scene_geometry import still_life
 from scene_trace import GRID, LAMP, LAMP_HALF, Scene, Tracer, develop, trace
 
 from warp_splat.camera import Camera
-from warp_splat.formats import model_folder
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
-from warp_splat.rendering.command import make_picture, options_of
+from warp_splat.rendering.finished import Finished, make_picture
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
@@ -88,9 +87,9 @@ def write_scene(folder: Path) -> None:
 
 def own_psnr(folder: Path, model: Path) -> float:
     """Of a model, on the lens's own pixels of the views held out [dB], the mean."""
-    _, file, trained = model_folder.open_model(model)
+    finished = Finished(model)
     scene = load_scene(folder, eval=True, lens="native", report=str)
-    draw = make_picture(GaussianModel.from_splats(file.splats), False, options_of(trained))
+    draw = make_picture(GaussianModel.from_splats(finished.file.splats), False, finished.options)
     errors = [np.mean((draw(view.camera) / 255.0 - view.image / 255.0) ** 2) for view in scene.test]
     return float(np.mean(-10 * np.log10(errors)))
 

@@ -17,7 +17,7 @@ from warp_splat.export_html.pack import shown
 from warp_splat.formats import model_folder
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.command import make_picture, options_of
+from warp_splat.rendering.finished import Finished, make_picture
 from warp_splat.runtime import launch
 
 SHARES = {"1/2": 1 / 2, "1/5": 1 / 5, "1/10": 1 / 10}
@@ -27,12 +27,12 @@ HEADERS = ("model", "Gaussians", "share", "merged dB", "largest dB", "merging s"
 
 def rows_of(model: Path) -> list[tuple]:
     """A row for each share."""
-    _, (splats, _), trained = model_folder.open_model(model)
+    finished = Finished(model)
     cameras = [camera for _, camera in model_folder.read_cameras(model)]
-    splats, rows = shown(splats), []
+    splats, rows = shown(finished.file.splats), []
 
     def pictures(chosen: SplatArrays) -> list[np.ndarray]:
-        picture = make_picture(GaussianModel.from_splats(chosen), False, options_of(trained))
+        picture = make_picture(GaussianModel.from_splats(chosen), False, finished.options)
         return [picture(camera) for camera in cameras[:VIEWS]]
 
     everything = pictures(splats)

@@ -16,7 +16,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import focus_orbit
-from warp_splat.rendering.command import make_picture
+from warp_splat.rendering.finished import make_picture
 from warp_splat.runtime import launch, pool
 from warp_splat.scene import load_scene
 from warp_splat.text import format_table

@@ -8,7 +8,7 @@ from pathlib import Path
 from common import TRAINED, parse, write_table
 
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.finished import Opened, open_finished, written_bytes
+from warp_splat.pruning.finished import Opened, written_bytes
 from warp_splat.pruning.simplify import squared_error
 from warp_splat.pruning.thinning import fewer_harmonics, tuned
 
@@ -19,7 +19,7 @@ HEADERS = ("scene", "kept", "harmonics", "Gaussians", "test PSNR dB", "change dB
 
 def rows_of(model: Path) -> list[tuple]:
     """The model, and what is left of it."""
-    opened = open_finished(str(model), "", -1, "cpu", 0)
+    opened = Opened(str(model), "")
     whole = opened.file.splats
     before = opened.psnr(whole, opened.scene.test)
     rows = [row_of(opened, "1", "all", whole, before)]

@@ -8,13 +8,12 @@ from matplotlib.collections import EllipseCollection
 
 from warp_splat.config import ALPHA_MAX, ALPHA_MIN, T_MIN, TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, GREEN, INK, new_figure, plain_axes, save_figure
-from warp_splat.formats.model_folder import open_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import rasterize
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
-from warp_splat.rendering.command import load_trained_scene
+from warp_splat.rendering.finished import Finished
 from warp_splat.training.loss import image_loss
 
 OUTLINES = 1500  # ellipses that are drawn
@@ -23,10 +22,10 @@ FEW = 60  # entries of a list
 
 def draw(model: str, images: Path) -> list[Path]:
     """Write renderer.jpg and renderer_pixel.png for the first held-out view of ``model``."""
-    _, gaussians, trained = open_model(model)
-    scene = load_trained_scene(model, "", trained, lambda line: None)
+    finished = Finished(model)
+    scene = finished.load_scene("", lambda line: None)
     view = scene.evaluated[1][0]
-    activated = GaussianModel.from_splats(gaussians.splats).activated()
+    activated = GaussianModel.from_splats(finished.file.splats).activated()
     activated = Gaussians(*(tensor.detach() for tensor in activated))
     means, quats, scales, opacities, *sh = activated
     arguments = (means.requires_grad_(), quats, scales, opacities, sh, view.camera)

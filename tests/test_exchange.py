@@ -29,7 +29,7 @@ from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.command import make_picture
+from warp_splat.rendering.finished import make_picture
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward

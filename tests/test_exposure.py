@@ -22,8 +22,7 @@ from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.rendering.command import make_renderer
-from warp_splat.rendering.photographed import as_photographed
+from warp_splat.rendering.finished import as_photographed, make_renderer
 from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
 from warp_splat.scene.neighbors import guessed

@@ -31,7 +31,7 @@ from warp_splat.formats.png import load_png
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import orbit_cameras
-from warp_splat.rendering.command import make_picture
+from warp_splat.rendering.finished import make_picture
 from warp_splat.scene.types import View
 
 EVIL = "</script><script>window.evil = 1</script><img src=x onerror='window.evil = 1'>\u2028.jpg"

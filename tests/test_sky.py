@@ -20,7 +20,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.raster.behind import put_behind
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.rendering.command import make_picture
+from warp_splat.rendering.finished import make_picture
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
 from warp_splat.training.options import TrainConfig

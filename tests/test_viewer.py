@@ -21,7 +21,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.command import make_renderer
+from warp_splat.rendering.finished import make_renderer
 from warp_splat.training.live import TrainingViewer
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import Run, finish

@@ -19,7 +19,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.command import make_renderer
+from warp_splat.rendering.finished import make_renderer
 from warp_splat.scene import load_scene
 from warp_splat.viewer.browser_camera import framed
 

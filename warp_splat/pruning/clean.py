@@ -19,7 +19,7 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
 from warp_splat.flags import check_numbers
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.finished import Opened, open_finished, output_of, print_quality, write
+from warp_splat.pruning.finished import Opened, output_of, print_quality, write
 from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, rows_of, tuned
 
@@ -34,7 +34,7 @@ def clean(config: CleanConfig) -> int:
     """
     check_numbers(config)
     output = output_of(config.model, config.output, "cleaned.ply")
-    opened = open_finished(config.model, config.source_path, config.iteration, config.device, config.threads)
+    opened = Opened(config.model, config.source_path, config.iteration, config.device, config.threads)
     file, before = opened.file, opened.file.splats
     found = floaters(before, opened.setting, config.views, config.near)
     if found.all():
@@ -81,7 +81,7 @@ def floaters(splats: SplatArrays, setting: ViewSetting, views: float, near: floa
 def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None:
     """A sheet of the views that changed most, before and after."""
     views = [*opened.scene.test, *opened.scene.train]
-    pictures = [opened.picture(splats) for splats in (before, after)]
+    pictures = [opened.picture_of(splats) for splats in (before, after)]
     pairs = [[picture(view.camera, view.name) for picture in pictures] for view in views]
     changes = [np.abs(one.astype(int) - other).mean() for one, other in pairs]
     sections: dict[str, list] = {"before": [], "after": []}

@@ -3,44 +3,49 @@
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
-from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, read_environment
+from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.command import backdrop, load_trained_scene, make_picture, options_of, with_refined_cameras
+from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
-from warp_splat.scene.types import Scene, View
+from warp_splat.scene.types import View
 
 
-class Opened(NamedTuple):
-    """A model, and the scene it was trained on."""
+class Opened(Finished):
+    """A model with the scene it was trained on.
 
-    file: SplatFile
-    trained: dict  # options of its training
-    scene: Scene
-    setting: ViewSetting  # of the training views
-    harmonics: np.ndarray | None  # behind the Gaussians, [16, 3]
-    exposures: Exposures | None  # of its photographs
+    Attributes:
+        scene: its own.
+        setting: its training views, and how they are rendered.
 
-    def picture(self, splats: SplatArrays) -> Callable[..., np.ndarray]:
+    Raises:
+        InputError: if either cannot be read, or the device cannot be used.
+    """
+
+    def __init__(self, path: str, source_path: str, iteration: int = -1, device: str = "cpu", threads: int = 0):
+        used = settle_device(launch.prepare(device, threads), device)
+        super().__init__(path, iteration)
+        require_some(self)
+        self.scene = self.refined(self.load_scene(source_path, print))
+        if self.harmonics is not None:
+            print(f"What {path} has learned behind its Gaussians stays as it is; a file of Gaussians does not have it.")
+        self.setting = ViewSetting(self.scene.train, self.options, self.background(used))
+
+    def picture_of(self, splats: SplatArrays) -> Callable[..., np.ndarray]:
         """A function from a camera, and whose photograph's exposure it has, to what ``splats`` look like: uint8."""
-        model = GaussianModel.from_splats(splats).to(self.setting.background.device)
-        options, linear = self.setting.options, self.scene.linear
-        white = bool(self.trained.get("white_background"))
-        return make_picture(model, white, options, linear, self.harmonics, self.exposures)
+        return self.picture(GaussianModel.from_splats(splats).to(self.setting.background.device), self.scene)
 
     def psnr(self, splats: SplatArrays, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders."""
-        picture = self.picture(splats)
+        picture = self.picture_of(splats)
         return float(np.mean([psnr(picture(view.camera, view.name), view.picture, view.mask) for view in views]))
 
     def quality(self, splats: SplatArrays) -> dict[str, float]:
@@ -49,30 +54,10 @@ class Opened(NamedTuple):
         return {name: self.psnr(splats, some) for name, some in views.items() if some}
 
 
-def open_file(model: str, iteration: int) -> tuple[int, SplatFile, dict]:
-    """As :func:`open_model`. Raises InputError if there are no Gaussians in it."""
-    iteration, file, trained = open_model(model, iteration)
-    if not len(file.splats.means):
-        raise InputError(f"{model}: expected Gaussians to choose from, found none.")
-    return iteration, file, trained
-
-
-def open_finished(model: str, source_path: str, iteration: int, device: str, threads: int) -> Opened:
-    """The model with its scene.
-
-    Raises:
-        InputError: if either cannot be read, or the device cannot be used.
-    """
-    used = settle_device(launch.prepare(device, threads), device)
-    iteration, file, trained = open_file(model, iteration)
-    scene = load_trained_scene(model, source_path, trained, print)
-    scene = with_refined_cameras(scene, model, iteration)
-    harmonics = read_environment(model, iteration)
-    if harmonics is not None:
-        print(f"What {model} has learned behind its Gaussians stays as it is; a file of Gaussians does not have it.")
-    background = backdrop(bool(trained.get("white_background")), harmonics, used)
-    setting = ViewSetting(scene.train, options_of(trained), background)
-    return Opened(file, trained, scene, setting, harmonics, read_exposures(model, iteration))
+def require_some(finished: Finished) -> None:
+    """Raise InputError if there are no Gaussians in a model."""
+    if not len(finished.file.splats.means):
+        raise InputError(f"{finished.path}: expected Gaussians to choose from, found none.")
 
 
 def output_of(model: str, output: str, name: str) -> Path:

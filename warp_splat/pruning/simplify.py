@@ -15,8 +15,9 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_csv
 from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
-from warp_splat.pruning.finished import Opened, open_file, open_finished, output_of, print_quality, write, written_bytes
+from warp_splat.pruning.finished import Opened, output_of, print_quality, require_some, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, rows_of, tuned
+from warp_splat.rendering.finished import Finished
 from warp_splat.text import format_table
 
 LEVELS = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # shares of the Gaussians that the table and the plot show
@@ -35,7 +36,7 @@ def simplify(config: SimplifyConfig) -> int:
     output = output_of(config.model, config.output, "simplified.ply")
     if is_file_of_gaussians(config.model) and not config.source_path:
         return _unseen(config, output)
-    opened = open_finished(config.model, config.source_path, config.iteration, config.device, config.threads)
+    opened = Opened(config.model, config.source_path, config.iteration, config.device, config.threads)
     thinning, file = Thinning(opened.file.splats, opened.setting), opened.file
     _curve(opened, thinning, output)
 
@@ -125,7 +126,7 @@ def _narrowed(low: int, high: int, is_low: Callable[[int], bool]) -> tuple[int, 
 
 def squared_error(opened: Opened, splats: SplatArrays) -> float:
     """Of the training views, summed over pixels and channels, colors 0..1."""
-    picture, error = opened.picture(splats), 0.0
+    picture, error = opened.picture_of(splats), 0.0
     for view in opened.scene.train:
         squared = (picture(view.camera, view.name) / 255.0 - view.picture / 255.0) ** 2
         error += float(squared.sum() if view.mask is None else squared[view.mask > 0].sum())
@@ -137,7 +138,7 @@ def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
     rows, (name, views) = [], opened.scene.evaluated
     for share in LEVELS:
         splats = thinning.to(max(1, round(share * len(opened.file.splats.means))))
-        picture, start = opened.picture(splats), time.perf_counter()
+        picture, start = opened.picture_of(splats), time.perf_counter()
         renders = [picture(view.camera, view.name) for view in views]
         seconds = time.perf_counter() - start
         pairs = zip(renders, views, strict=True)
@@ -166,7 +167,9 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     if config.max_loss or config.steps:
         raise InputError("--max_loss, --steps: expected photographs to compare with; name the scene with -s.")
     print(UNSEEN)
-    _, file, _ = open_file(config.model, config.iteration)
+    finished = Finished(config.model, config.iteration)
+    require_some(finished)
+    file = finished.file
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: rows_of(file.splats, np.sort(order[:count]))  # noqa: E731
     count = _count(config, len(order), lambda count: written_bytes(output, file._replace(splats=keep(count))))

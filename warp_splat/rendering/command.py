@@ -1,8 +1,7 @@
 """Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed."""
 
-import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,27 +10,22 @@ import torch
 from tqdm import tqdm
 
 from warp_splat.camera import Camera
-from warp_splat.color import to_bytes
-from warp_splat.config import PROJECTIONS, RasterOptions, RenderConfig
+from warp_splat.config import RenderConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
-from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.png import save_png, save_video
-from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
 from warp_splat.rendering.certificates import write_bounds
-from warp_splat.rendering.photographed import as_photographed
+from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
-from warp_splat.scene import load_scene
 from warp_splat.scene.types import Scene, View
 
 OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}
@@ -48,8 +42,8 @@ def render_model(config: RenderConfig) -> int:
     _check(config)
     metrics, absent = choose_metrics(config.lpips_weights)
     device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
-    folder, iteration, gaussians, trained = _open(config)
-    model = GaussianModel.from_splats(gaussians.splats).arranged()
+    folder, finished = _open(config)
+    model, iteration = GaussianModel.from_splats(finished.file.splats).arranged(), finished.iteration
     if (config.orbit or config.video) and not len(model):
         raise InputError(
             f"{config.model_path}: expected at least one Gaussian to film, found none; name another model."
@@ -57,21 +51,17 @@ def render_model(config: RenderConfig) -> int:
     output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
     if output:  # before frames are drawn for it
         model_folder.check_place(Path(output).parent if Path(output).suffix.lower() == ".mp4" else Path(output))
-    scene = None
+    given = scene = None
     if _needs_scene(config):
-        scene = load_trained_scene(config.model_path, config.source_path, trained, say)
-        scene = with_refined_cameras(scene, config.model_path, iteration)
-        if model_folder.read_refined(config.model_path, iteration):
+        given = finished.load_scene(config.source_path, say)
+        scene = finished.refined(given)
+        if scene is not given:
             say(f"The cameras are those of the model, which were refined in iteration {iteration}.")
-    options, linear = options_of(trained), is_linear(scene, trained)
-    options = replace(options, of=config.of, tolerance=config.tolerance or None)
+    options = replace(finished.options, of=config.of, tolerance=config.tolerance or None)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
-        white = bool(trained.get("white_background"))
-        harmonics = model_folder.read_environment(config.model_path, iteration)
-        exposures = read_exposures(config.model_path, iteration)
-        picture = make_picture(model.to(device), white, options, linear, harmonics, exposures)
-        certified = make_renderer(model, white, replace(options, bound=True), harmonics)
+        picture = finished.picture(model.to(device), scene, options)
+        certified = finished.renderer(model, replace(options, bound=True))
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -85,8 +75,8 @@ def render_model(config: RenderConfig) -> int:
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}
                 where = None
-                if model_folder.read_refined(folder, iteration):
-                    where = where_taken(model.activated(), backdrop(white, harmonics, device), options, scene.extent)
+                if scene is not given:
+                    where = where_taken(model.activated(), finished.background(device), options, scene.extent)
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
@@ -129,8 +119,8 @@ def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene |
     return memory_explained(device, model, sizes, f"render a model {' or '.join(fewer)}{elsewhere}")
 
 
-def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
-    """The folder for the images, the iteration, the Gaussians and the options of the training.
+def _open(config: RenderConfig) -> tuple[Path, Finished]:
+    """The folder for the images, and the model.
 
     A file of Gaussians has no folder and no training: its images go beside it, every 8th view is held out.
     """
@@ -140,109 +130,7 @@ def _open(config: RenderConfig) -> tuple[Path, int, SplatFile, dict]:
     is_file = model_folder.is_file_of_gaussians(path)
     if is_file and not config.source_path and _needs_scene(config):
         raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
-    return Path(f"{path}.renders") if is_file else path, *model_folder.open_model(path, config.iteration)
-
-
-def options_of(trained: dict) -> RasterOptions:
-    """How a model is rendered that was trained with these options."""
-    return RasterOptions(
-        antialiasing=bool(trained.get("antialiasing")),
-        projection=str(trained["projection"]) if trained.get("projection") in PROJECTIONS else "affine",
-    )
-
-
-def is_linear(scene: Scene | None, trained: dict) -> bool:
-    """Whether the colors of a model are in linear light: those of its scene, or else what its training says."""
-    return scene.linear if scene else bool(trained.get("linear_light"))
-
-
-def load_trained_scene(model_path: str, source_path: str, trained: dict, say: Callable[[str], object]) -> Scene:
-    """The scene that a model was trained on, as it was loaded then.
-
-    Args:
-        model_path: the model, for messages.
-        source_path: where the scene is now; empty: where it was.
-        trained: options of the training.
-        say: receives what there is to say.
-
-    Raises:
-        InputError: as :func:`load_scene`, or if it is not known which scene that is.
-    """
-    trained_on = str(trained.get("source_path", ""))
-    source = source_path or trained_on
-    if not source:
-        raise InputError(f"{model_path}: it does not say what it was trained on; name the scene with -s.")
-    if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):
-        say(f"The scene is {source}; the model was trained on {trained_on}.")
-    resolution = trained.get("resolution", -1)
-    if not isinstance(resolution, int):
-        raise InputError(f"{model_path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
-    flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
-    names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
-    return load_scene(source, **names, resolution=resolution, **flags, report=say)
-
-
-def with_refined_cameras(scene: Scene, model_path: str, iteration: int) -> Scene:
-    """The scene with the cameras that were learned with the Gaussians of an iteration; itself, if they were not.
-
-    Raises:
-        InputError: if the scene has changed since the training.
-    """
-    cameras = model_folder.read_refined(model_path, iteration)
-    if not cameras:
-        return scene
-    train, test = ([_refined(view, cameras, model_path) for view in views] for views in (scene.train, scene.test))
-    return replace(scene, train=train, test=test)
-
-
-def _refined(view: View, cameras: Mapping[str, Camera], model_path: str) -> View:
-    """The view with its camera of ``cameras``. Raises InputError if it has none of its size."""
-    camera, given = cameras.get(view.name), view.original
-    if camera is None or (camera.width, camera.height) != (given.width, given.height):
-        found = "none" if camera is None else f"one for {camera.width}x{camera.height} px"
-        raise InputError(
-            f"{model_path}: expected a refined camera for {view.name}, {given.width}x{given.height} px, found {found}; "
-            "the scene has changed since the training, name the one of then with -s."
-        )
-    return replace(view, camera=camera.resized(view.camera.width, view.camera.height), original=camera)
-
-
-def backdrop(white_background: bool, harmonics: np.ndarray | None, device: torch.device) -> torch.Tensor:
-    """What lies behind Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
-    if harmonics is None:
-        return torch.full((3,), float(white_background), device=device)
-    return torch.from_numpy(harmonics).to(device)
-
-
-def make_picture(
-    model: GaussianModel,
-    white_background: bool,
-    options: RasterOptions,
-    linear: bool = False,
-    harmonics: np.ndarray | None = None,
-    exposures: Exposures | None = None,
-) -> Callable[..., np.ndarray]:
-    """A function from a camera, and whose photograph's exposure it has, to the model's image, [H, W, 3] uint8.
-
-    ``linear``: its colors are in linear light.
-    """
-    draw = make_renderer(model, white_background, options, harmonics)
-    return lambda camera, name="": to_bytes(as_photographed(draw(camera).image, exposures, name), linear)
-
-
-def make_renderer(
-    model: GaussianModel, white_background: bool, options: RasterOptions, harmonics: np.ndarray | None = None
-) -> Callable[..., RenderOutput]:
-    """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients."""
-    background = backdrop(white_background, harmonics, model.device)
-    with torch.no_grad():
-        gaussians = model.activated()
-
-    @torch.no_grad()
-    def draw(camera: Camera, depth: bool = False) -> RenderOutput:
-        return render_gaussians(gaussians, camera, background, replace(options, depth=depth))
-
-    return draw
+    return Path(f"{path}.renders") if is_file else path, Finished(path, config.iteration)
 
 
 def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import torch
 from tqdm import tqdm
 
-from warp_splat.rendering.photographed import as_photographed
+from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime import timers
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.scene.types import View

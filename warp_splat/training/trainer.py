@@ -22,7 +22,7 @@ from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Room
-from warp_splat.rendering.photographed import as_photographed
+from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load

@@ -5,12 +5,9 @@ from dataclasses import replace
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
-from warp_splat.formats.exposures import read_exposures
-from warp_splat.formats.model_folder import open_model, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.command import is_linear, load_trained_scene, make_renderer, options_of, with_refined_cameras
-from warp_splat.rendering.photographed import as_photographed
+from warp_splat.rendering.finished import Finished, as_photographed
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
@@ -33,24 +30,21 @@ def view_model(config: ViewConfig) -> int:
     check_numbers(config)
     free_port(config.port)  # before the scene is loaded
     device = settle_device(launch.prepare(config.device, config.threads), config.device)
-    iteration, gaussians, trained = open_model(config.model, config.iteration)
-    model = GaussianModel.from_splats(gaussians.splats).arranged().to(device)
-    print(f"{len(model)} Gaussians from {config.model}, iteration {iteration}")
-    scene = _find_scene(config, trained, iteration)
-    harmonics = read_environment(config.model, iteration)
-    draw = make_renderer(model, bool(trained.get("white_background")), options_of(trained), harmonics)
-    exposures = read_exposures(config.model, iteration)
+    finished = Finished(config.model, config.iteration)
+    model = GaussianModel.from_splats(finished.file.splats).arranged().to(device)
+    print(f"{len(model)} Gaussians from {config.model}, iteration {finished.iteration}")
+    scene = _find_scene(finished, config.source_path)
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
         memory_explained(device, model, [LARGEST], advice),
         Viewer(
-            draw,
+            finished.renderer(model),
             lambda: model.parameters["means"],
             scene,
             config.port,
-            is_linear(scene, trained),
-            lambda image, view: as_photographed(image, exposures, view.name.removesuffix(AS_GIVEN)),
+            finished.is_linear(scene),
+            lambda image, view: as_photographed(image, finished.exposures, view.name.removesuffix(AS_GIVEN)),
         ) as viewer,
     ):
         with interruptible() as interrupted:
@@ -61,20 +55,20 @@ def view_model(config: ViewConfig) -> int:
     return 0
 
 
-def _find_scene(config: ViewConfig, trained: dict, iteration: int) -> Scene | None:
+def _find_scene(finished: Finished, source_path: str) -> Scene | None:
     """The scene of the model; None if it is not known or has gone, since one can look around without it.
 
     Where cameras were refined, each photograph is there twice: seen by its camera as it is now, and as it was given.
     """
     try:
-        given = load_trained_scene(config.model, config.source_path, trained, print)
-        scene = with_refined_cameras(given, config.model, iteration)
+        given = finished.load_scene(source_path, print)
+        scene = finished.refined(given)
         if scene is given:
             return scene
         views = [replace(view, name=f"{view.name}{AS_GIVEN}") for view in (*given.train, *given.test)]
         return replace(scene, test=[*scene.test, *views])
     except InputError as error:
-        if config.source_path:
+        if source_path:
             raise
         print(f"Without photographs: {error}")
         return None

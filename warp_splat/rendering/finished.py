@@ -1,0 +1,168 @@
+"""A finished model and how its pictures are made: what render, view, simplify and clean have in common."""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warp_splat.camera import Camera
+from warp_splat.color import to_bytes
+from warp_splat.config import PROJECTIONS, RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.formats.exposures import Exposures, read_exposures
+from warp_splat.formats.model_folder import open_model, read_environment, read_refined
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.api import RenderOutput
+from warp_splat.raster.api import render as render_gaussians
+from warp_splat.raster.expose import expose
+from warp_splat.scene import load_scene
+from warp_splat.scene.types import Scene, View
+
+
+class Finished:
+    """A trained model, or a file of Gaussians, as far as it lies beside each other.
+
+    Args:
+        path: the folder, or the file.
+        iteration: which saved model; -1: the last.
+
+    Attributes:
+        iteration: that was found; of a file, 0.
+        file: the Gaussians.
+        trained: options of the training; of a file, that every 8th view was held out.
+        harmonics: what lies behind the Gaussians, [16, 3], or None.
+        exposures: of the photographs, or None.
+
+    Raises:
+        InputError: if there is no such model, or it cannot be read.
+    """
+
+    def __init__(self, path: str | Path, iteration: int = -1):
+        self.path = str(path)
+        self.iteration, self.file, self.trained = open_model(path, iteration)
+        self.harmonics = read_environment(path, self.iteration)
+        self.exposures = read_exposures(path, self.iteration)
+
+    @property
+    def options(self) -> RasterOptions:
+        """How it is rendered."""
+        projection = self.trained.get("projection")
+        return RasterOptions(
+            antialiasing=bool(self.trained.get("antialiasing")),
+            projection=str(projection) if projection in PROJECTIONS else "affine",
+        )
+
+    def is_linear(self, scene: Scene | None) -> bool:
+        """Whether its colors are in linear light: those of its scene, or else what its training says."""
+        return scene.linear if scene else bool(self.trained.get("linear_light"))
+
+    def background(self, device: torch.device) -> torch.Tensor:
+        """What lies behind the Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
+        return backdrop(bool(self.trained.get("white_background")), self.harmonics, device)
+
+    def renderer(self, model: GaussianModel, options: RasterOptions | None = None) -> Callable[..., RenderOutput]:
+        """:func:`make_renderer` of its Gaussians, or some of them."""
+        white = bool(self.trained.get("white_background"))
+        return make_renderer(model, white, options or self.options, self.harmonics)
+
+    def picture(
+        self, model: GaussianModel, scene: Scene | None, options: RasterOptions | None = None
+    ) -> Callable[..., np.ndarray]:
+        """:func:`make_picture` likewise; ``scene``: that of the model, if it is known."""
+        white, linear = bool(self.trained.get("white_background")), self.is_linear(scene)
+        return make_picture(model, white, options or self.options, linear, self.harmonics, self.exposures)
+
+    def load_scene(self, source_path: str, say: Callable[[str], object]) -> Scene:
+        """The scene that it was trained on, as it was loaded then.
+
+        Args:
+            source_path: where the scene is now; empty: where it was.
+            say: receives what there is to say.
+
+        Raises:
+            InputError: as :func:`warp_splat.load_scene`, or if it is not known which scene that is.
+        """
+        trained, trained_on = self.trained, str(self.trained.get("source_path", ""))
+        source = source_path or trained_on
+        if not source:
+            raise InputError(f"{self.path}: it does not say what it was trained on; name the scene with -s.")
+        if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):
+            say(f"The scene is {source}; the model was trained on {trained_on}.")
+        resolution = trained.get("resolution", -1)
+        if not isinstance(resolution, int):
+            raise InputError(f"{self.path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
+        flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
+        names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
+        return load_scene(source, **names, resolution=resolution, **flags, report=say)
+
+    def refined(self, scene: Scene) -> Scene:
+        """The scene with the cameras that were learned with the Gaussians; itself, if they were not.
+
+        Raises:
+            InputError: if the scene has changed since the training.
+        """
+        cameras = read_refined(self.path, self.iteration)
+        if not cameras:
+            return scene
+        train, test = ([self._refined(view, cameras) for view in views] for views in (scene.train, scene.test))
+        return replace(scene, train=train, test=test)
+
+    def _refined(self, view: View, cameras: Mapping[str, Camera]) -> View:
+        """The view with its camera of ``cameras``. Raises InputError if it has none of its size."""
+        camera, given = cameras.get(view.name), view.original
+        if camera is None or (camera.width, camera.height) != (given.width, given.height):
+            found = "none" if camera is None else f"one for {camera.width}x{camera.height} px"
+            raise InputError(
+                f"{self.path}: expected a refined camera for {view.name}, {given.width}x{given.height} px, found "
+                f"{found}; the scene has changed since the training, name the one of then with -s."
+            )
+        return replace(view, camera=camera.resized(view.camera.width, view.camera.height), original=camera)
+
+
+def backdrop(white_background: bool, harmonics: np.ndarray | None, device: torch.device) -> torch.Tensor:
+    """What lies behind Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
+    if harmonics is None:
+        return torch.full((3,), float(white_background), device=device)
+    return torch.from_numpy(harmonics).to(device)
+
+
+def make_picture(
+    model: GaussianModel,
+    white_background: bool,
+    options: RasterOptions,
+    linear: bool = False,
+    harmonics: np.ndarray | None = None,
+    exposures: Exposures | None = None,
+) -> Callable[..., np.ndarray]:
+    """A function from a camera, and whose photograph's exposure it has, to the model's image, [H, W, 3] uint8.
+
+    ``linear``: its colors are in linear light.
+    """
+    draw = make_renderer(model, white_background, options, harmonics)
+    return lambda camera, name="": to_bytes(as_photographed(draw(camera).image, exposures, name), linear)
+
+
+def make_renderer(
+    model: GaussianModel, white_background: bool, options: RasterOptions, harmonics: np.ndarray | None = None
+) -> Callable[..., RenderOutput]:
+    """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients."""
+    background = backdrop(white_background, harmonics, model.device)
+    with torch.no_grad():
+        gaussians = model.activated()
+
+    @torch.no_grad()
+    def draw(camera: Camera, depth: bool = False) -> RenderOutput:
+        return render_gaussians(gaussians, camera, background, replace(options, depth=depth))
+
+    return draw
+
+
+def as_photographed(image: torch.Tensor, exposures: Exposures | None, name: str) -> torch.Tensor:
+    """The image [H, W, 3] as the photograph of this name shows it; as it is, if that one is not known."""
+    if exposures is None or name not in exposures.maps:
+        return image
+    numbers, falloff = (torch.from_numpy(n).to(image.device) for n in (exposures.maps[name], exposures.falloff))
+    return expose(image, exposures.kind, numbers, falloff if falloff.any() else None, exposures.pivot)
