@@ -24,35 +24,23 @@ _HOMES = {
     "rasterize_views": "raster.api",
     "set_threads": "runtime.pool",
 }
-__all__ = [
-    "Camera",
-    "CameraParameters",
-    "Falloff",
-    "InputError",
-    "Lens",
-    "RasterOptions",
-    "RenderOutput",
-    "Shutter",
-    "check_gradients",
-    "get_threads",
-    "load_scene",
-    "rasterize",
-    "rasterize_views",
-    "set_threads",
-]
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 if TYPE_CHECKING:
-    from warp_splat.camera import Camera
-    from warp_splat.config import RasterOptions
-    from warp_splat.errors import InputError
-    from warp_splat.kernels.falloff import Falloff
-    from warp_splat.lenses import Lens
-    from warp_splat.lenses.shutter import Shutter
-    from warp_splat.raster.api import RenderOutput, rasterize, rasterize_views
-    from warp_splat.raster.camera_parameters import CameraParameters
-    from warp_splat.raster.gradcheck import check_gradients
-    from warp_splat.runtime.pool import get_threads, set_threads
-    from warp_splat.scene import load_scene
+    from warp_splat.camera import Camera as Camera
+    from warp_splat.config import RasterOptions as RasterOptions
+    from warp_splat.errors import InputError as InputError
+    from warp_splat.kernels.falloff import Falloff as Falloff
+    from warp_splat.lenses import Lens as Lens
+    from warp_splat.lenses.shutter import Shutter as Shutter
+    from warp_splat.raster.api import RenderOutput as RenderOutput
+    from warp_splat.raster.api import rasterize as rasterize
+    from warp_splat.raster.api import rasterize_views as rasterize_views
+    from warp_splat.raster.camera_parameters import CameraParameters as CameraParameters
+    from warp_splat.raster.gradcheck import check_gradients as check_gradients
+    from warp_splat.runtime.pool import get_threads as get_threads
+    from warp_splat.runtime.pool import set_threads as set_threads
+    from warp_splat.scene import load_scene as load_scene
 
 
 def __getattr__(name: str):
