@@ -27,7 +27,6 @@ from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_bl
 from warp_splat.kernels.cuda.blend import make_blend_block
 from warp_splat.kernels.cuda.comparison import compare_block
 from warp_splat.kernels.cuda.gather import make_gather
-from warp_splat.kernels.cuda.strongest import make_strongest
 from warp_splat.kernels.cuda.taped import make_walk_block
 from warp_splat.kernels.environment import make_adj_put_behind, make_put_behind
 from warp_splat.kernels.falloff import reach_of
@@ -97,12 +96,12 @@ def modules() -> dict[str, wp.Module]:
             found[f"{mode}{suffix}"] = make_walk_block(mode, variant).module
     plain = BlendVariant()
     found["gather, channels"] = make_gather((*WIDTHS[:3], CHANNEL_WIDTHS[-1])).module
-    found["channels"] = channels.make_blend_channels(plain).module
+    found["channels"] = channels.make_beside(plain).module
     for mode in ADJOINTS[:2]:
         found[f"{mode}, channels"] = channels.make_adj_channels(mode, plain).module
     found["weights"] = channels.make_adj_channels("manual", plain, STRONGEST_MOST).module
     found["magnitudes"] = channels.make_adj_channels("absolute", plain).module
-    found["strongest"] = make_strongest(plain, STRONGEST_MOST).module
+    found["strongest"] = channels.make_beside(plain, STRONGEST_MOST).module
     return found
 
 

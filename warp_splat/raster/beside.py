@@ -4,6 +4,7 @@ The color is blended first. These kernels repeat its weights, from what it has f
 cost nothing where they are not asked for. Channels go in groups, so that memory does not grow with their number.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -83,11 +84,7 @@ def find_strongest(splats: Splats2D, blending: Blending) -> Strongest:
         torch.empty(*shape, most, device=device),
     )
     median = torch.empty(shape, dtype=torch.int32, device=device)
-    kernel = blending.driver.channels.strongest(variant_of(options), most)
-    _, count = blending.view_walk()
-    inputs = [bins.view(), alphas_of(options), count, view(blending.steps, wp.int32)]
-    outputs = [view(ranks, wp.int32), view(weights, wp.float32), view(median, wp.int32)]
-    blending.driver.launch_tiles(kernel, bins, inputs, outputs)
+    _launch(blending, weights, weights.new_empty(0, 0), strongest=(ranks, median))
     gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
     if most:
         weights = Weights.apply(splats.means2d, splats.conics, splats.opacities, weights, ranks, blending)
@@ -95,6 +92,24 @@ def find_strongest(splats: Splats2D, blending: Blending) -> Strongest:
     depths = torch.cat([splats.depths, splats.depths.new_zeros(1)])[:, None]
     median_depth = torch.nn.functional.embedding(middle % len(depths), depths)
     return Strongest(gaussians, weights, median_depth.view(shape))
+
+
+def _launch(
+    blending: Blending,
+    pixels: torch.Tensor,
+    rows: torch.Tensor,
+    begin: int = 0,
+    group: int = 0,
+    strongest: tuple[torch.Tensor, torch.Tensor] | None = None,
+) -> None:
+    """Fill ``pixels`` [H, W, C] with a group of channels; or, with ``strongest``, ranks and median, with weights."""
+    new, (_, count) = partial(torch.empty, dtype=torch.int32, device=pixels.device), blending.view_walk()
+    ranks, median = strongest or (new(0, 0, 0), new(0, 0))
+    kernel = blending.driver.channels.beside(variant_of(blending.options), ranks.shape[2] if strongest else None)
+    inputs = [blending.bins.view(), alphas_of(blending.options), count, view(blending.steps, wp.int32)]
+    inputs += [view(rows, wp.float32), begin, group]
+    outputs = [view(pixels, wp.float32), view(ranks, wp.int32), view(median, wp.int32)]
+    blending.driver.launch_tiles(kernel, blending.bins, inputs, outputs)
 
 
 def _gaussians_of(bins: Bins, camera: Camera, ranks: torch.Tensor) -> torch.Tensor:
@@ -140,15 +155,10 @@ class Channels(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, means2d, conics, opacities, features, blending):
-        bins, camera, driver = blending.bins, blending.camera, blending.driver
-        features = features.contiguous()
+        camera, driver, features = blending.camera, blending.driver, features.contiguous()
         image = features.new_empty(camera.height, camera.width, features.shape[1])
-        kernel, steps = driver.channels.blend(variant_of(blending.options)), blending.steps
-        _, count = blending.view_walk()
-        for begin, rows in _groups(bins, features, driver):
-            inputs = [bins.view(), alphas_of(blending.options), count, view(steps, wp.int32), view(rows, wp.float32)]
-            group = min(features.shape[1] - begin, driver.channels.at_once)
-            driver.launch_tiles(kernel, bins, [*inputs, begin, group], [view(image, wp.float32)])
+        for begin, rows in _groups(blending.bins, features, driver):
+            _launch(blending, image, rows, begin, min(features.shape[1] - begin, driver.channels.at_once))
         ctx.save_for_backward(features)
         ctx.blending = blending
         return image

@@ -21,13 +21,11 @@ from warp_splat.kernels.cpu import adjoint as lanes_adjoint
 from warp_splat.kernels.cpu import blend as lanes_blend
 from warp_splat.kernels.cpu import channels as lanes_channels
 from warp_splat.kernels.cpu import gather as lanes_gather
-from warp_splat.kernels.cpu import strongest as lanes_strongest
 from warp_splat.kernels.cpu import taped as lanes_taped
 from warp_splat.kernels.cuda import adjoint as blocks_adjoint
 from warp_splat.kernels.cuda import blend as blocks_blend
 from warp_splat.kernels.cuda import channels as blocks_channels
 from warp_splat.kernels.cuda import gather as blocks_gather
-from warp_splat.kernels.cuda import strongest as blocks_strongest
 from warp_splat.kernels.cuda import taped as blocks_taped
 from warp_splat.kernels.cuda.warps import WARP
 from warp_splat.kernels.simd import LANES, vec16
@@ -44,9 +42,8 @@ class ChannelKernels(NamedTuple):
     """What blends any number of channels, beside the color."""
 
     at_once: int  # channels of a group
-    blend: Callable[[BlendVariant], wp.Kernel]
+    beside: Callable[..., wp.Kernel]  # of a variant: channels; and of a number: so many of the strongest Gaussians
     adjoint: Callable[..., wp.Kernel]
-    strongest: Callable[[BlendVariant, int], wp.Kernel]
 
 
 class TileKernels(NamedTuple):
@@ -238,12 +235,7 @@ CPU = Driver(
         *(vec16, lambda channels: (lanes_blend.BLOCKS * channels, LANES)),
         lambda columns: wp.types.vector(length=columns, dtype=float),
     ),
-    ChannelKernels(
-        lanes_channels.AT_ONCE,
-        lanes_channels.make_blend_channels,
-        lanes_channels.make_adj_channels,
-        lanes_strongest.make_strongest,
-    ),
+    ChannelKernels(lanes_channels.AT_ONCE, lanes_channels.make_beside, lanes_channels.make_adj_channels),
 )
 CUDA = Driver(
     *(1, False, bin.bin_by_sorting, gather_by_warp, _launch_blocks),
@@ -259,12 +251,7 @@ CUDA = Driver(
         *(wp.vec4, lambda _channels: (THREADS, 4)),
         lambda _columns: wp.float32,
     ),
-    ChannelKernels(
-        blocks_channels.AT_ONCE,
-        blocks_channels.make_blend_channels,
-        blocks_channels.make_adj_channels,
-        blocks_strongest.make_strongest,
-    ),
+    ChannelKernels(blocks_channels.AT_ONCE, blocks_channels.make_beside, blocks_channels.make_adj_channels),
 )
 #: By torch's name of the device.
 DRIVERS = {"cpu": CPU, "cuda": CUDA}

@@ -1,4 +1,4 @@
-"""Any number of channels on the CPU, blended and differentiated beside the color, some at a time.
+"""What is blended beside the color on the CPU: any number of channels, some at a time, or the strongest Gaussians.
 
 The blend of the color has found where each pixel stops, and its transmittance there. So these loops decide nothing:
 forward they repeat the weights, backward they recover T as ``manual`` and ``stepwise`` do. Their sums stay in the first
@@ -15,7 +15,7 @@ from warp_splat.kernels.cpu.adjoint import folded
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, corner, walk
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
-from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16
+from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import make_reverse_step, opaque
@@ -65,10 +65,15 @@ def row_of_splat(rows: wp.array2d[float], splat: int):
 
 
 @functools.cache
-def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
-    """The sums of weights times channels; nothing stands behind them."""
-    fall_at, WIDTH, way = make_falloff(variant.falloff).value, AT_ONCE, 1
-    T, WALKED, SUMS, STATE = 0, BLOCKS, 2 * BLOCKS, (2 + AT_ONCE) * BLOCKS
+def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
+    """The sums of weights times channels; nothing stands behind them.
+
+    With ``most``, instead the weights of so many strongest Gaussians, their places in the tile's list, and that of the
+    Gaussian at which half of the light is gone.
+    """
+    fall_at, way, WIDTH, MOST = make_falloff(variant.falloff).value, 1, AT_ONCE, most or 0
+    T, WALKED, SUMS, MEDIAN, WEIGHT, RANK = (place * BLOCKS for place in (0, 1, 2, 2, 3, 3 + MOST))
+    STATE = RANK + MOST * BLOCKS if most is not None else SUMS + WIDTH * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
 
     def begin(k, here, out, bins, rows):
@@ -76,31 +81,48 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
 
     def step(k, splat, dx, dy, block, here, mine, out, s, alphas, channels):
         fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+        t = s[T + block]
         alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
-        w = times(alpha, s[T + block])
-        if some(w):
-            s[T + block] = fma(-alpha, s[T + block], s[T + block])
-            row = SUMS + block * WIDTH
-            channel = int(0)
-            while channel < channels:
-                s[row + channel] = fma(w, mine[channel], s[row + channel])
-                channel += 1
+        w = times(alpha, t)
+        if wp.static(most is None):
+            if some(w):
+                s[T + block] = fma(-alpha, t, t)
+                row = SUMS + block * WIDTH
+                channel = int(0)
+                while channel < channels:
+                    s[row + channel] = fma(w, mine[channel], s[row + channel])
+                    channel += 1
+        else:
+            behind = fma(-alpha, t, t)
+            s[T + block] = behind
+            known = s[MEDIAN + block]
+            s[MEDIAN + block] = where_less(vec16(0.5), t, where_less(vec16(0.5), behind, known, here), known)
+            place = here
+            for j in range(MOST):  # each as strong as it is pushes the weaker ones down
+                best = s[WEIGHT + j * BLOCKS + block]
+                rank = s[RANK + j * BLOCKS + block]
+                s[WEIGHT + j * BLOCKS + block] = wp.max(w, best)
+                s[RANK + j * BLOCKS + block] = where_less(best, w, place, rank)
+                place = where_less(best, w, rank, place)
+                w = wp.min(w, best)
 
     def finish(k, splat, ahead, out):
         return False
 
     @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
-    def blend_channels(
+    def beside(
         first: int,
         bins: BinsView,
         alphas: wp.vec2,
         count: wp.array2d[vec16],  # [T, BLOCKS]
         steps: wp.array[int],  # [T]
-        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats
+        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats; of weights nothing
         begin: int,  # of the group
         channels: int,  # of the group
         # out
-        pixels_out: wp.array3d[float],  # [H, W, C]
+        pixels_out: wp.array3d[float],  # [H, W, C] channels, or weights [H, W, most]
+        ranks_out: wp.array3d[int],  # [H, W, most] the strongest first, of equal ones the nearest; -1: no more
+        median_out: wp.array2d[int],  # [H, W] -1: half of the light comes through
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
@@ -108,25 +130,35 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
         room = mat_room()
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
+        for row in range(SUMS, s.shape[0]):
+            s[row] = vec16(0.0)
         for block in range(BLOCKS):
             s[T + block] = vec16(1.0)
             s[WALKED + block] = count[tile, block]
-        for row in range(SUMS, s.shape[0]):
-            s[row] = vec16(0.0)
+            if wp.static(most is not None):
+                s[MEDIAN + block] = vec16(-1.0)
+            for j in range(MOST):
+                s[RANK + j * BLOCKS + block] = vec16(-1.0)
         length = steps[tile]
         walk(bins, near, start, length, way, x0, y0, pixels_out, begin, step, finish)
-        numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
+        numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=((STATE - SUMS) * LANES,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
             x, y = pixel_of(tile, bins.tiles_x, pixel)
             if y < pixels_out.shape[0] and x < pixels_out.shape[1]:
-                place = (pixel // LANES) * WIDTH * LANES + pixel % LANES
-                for channel in range(channels):
-                    pixels_out[y, x, begin + channel] = numbers[place]
-                    place += LANES
+                if wp.static(most is None):
+                    place = (pixel // LANES) * WIDTH * LANES + pixel % LANES
+                    for channel in range(channels):
+                        pixels_out[y, x, begin + channel] = numbers[place]
+                        place += LANES
+                else:
+                    median_out[y, x] = int(numbers[pixel])
+                for j in range(MOST):
+                    pixels_out[y, x, j] = numbers[(WEIGHT - SUMS + j * BLOCKS) * LANES + pixel]
+                    ranks_out[y, x, j] = int(numbers[(RANK - SUMS + j * BLOCKS) * LANES + pixel])
             pixel += 1
 
-    return blend_channels
+    return beside
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""Any number of channels on CUDA, beside the color: as :mod:`warp_splat.kernels.cpu.channels`, a thread per pixel.
+"""What is blended beside the color on CUDA: as :mod:`warp_splat.kernels.cpu.channels`, a thread per pixel.
 
 A Gaussian's channels are read from global memory, by all threads of the block at once.
 """
@@ -20,21 +20,24 @@ from warp_splat.kernels.structs import BinsView
 
 
 @functools.cache
-def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
-    """The sums of weights times channels; nothing stands behind them."""
-    fall_at, WIDTH = make_falloff(variant.falloff).value, AT_ONCE
+def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
+    """The sums of weights times channels; or, with ``most``, the weights of so many strongest Gaussians."""
+    fall_at, WIDTH, MOST = make_falloff(variant.falloff).value, AT_ONCE, most or 0
+    vec_most = wp.types.vector(length=max(MOST, 1), dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
-    def blend_channels(
+    def beside(
         bins: BinsView,
         alphas: wp.vec2,
         count: wp.array2d[int],  # [T, THREADS]
         steps: wp.array[int],  # [T]
-        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats
+        rows: wp.array2d[float],  # [V, AT_ONCE] of the splats; of weights nothing
         begin: int,  # of the group
         channels: int,  # of the group
         # out
-        pixels_out: wp.array3d[float],  # [H, W, C]
+        pixels_out: wp.array3d[float],  # [H, W, C] channels, or weights [H, W, most]
+        ranks_out: wp.array3d[int],  # [H, W, most] the strongest first, of equal ones the nearest; -1: no more
+        median_out: wp.array2d[int],  # [H, W] -1: half of the light comes through
     ):
         tile, thread = wp.tid()
         column = (tile % bins.tiles_x) * TILE + thread % TILE
@@ -45,6 +48,9 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
         walked = float(count[tile, thread])
         t = float(1.0)
         sums = vec_channels(0.0)
+        median = int(-1)
+        weights = vec_most(0.0)
+        ranks = vec_most(-1.0)
         for batch in range((steps[tile] + THREADS - 1) // THREADS):
             first = batch * THREADS
             mine = vec10(0.0)
@@ -53,22 +59,43 @@ def make_blend_channels(variant: BlendVariant) -> wp.Kernel:
                 splat = bins.instances[start + first + thread]
                 mine = staged_of(bins.splats[splat])
             staged = wp.tile(mine, preserve_type=True)
-            splats = wp.tile(splat)
+            if wp.static(most is None):
+                splats = wp.tile(splat)
             for j in range(wp.min(THREADS, steps[tile] - first)):
                 g = staged[j]
-                splat = splats[j]
+                here = float(first + j)
                 fall = fall_at(exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY]))
-                alpha = opaque(fall * g[OPACITY], alphas, float(first + j), walked)
+                alpha = opaque(fall * g[OPACITY], alphas, here, walked)
                 w = alpha * t
-                t = fma(-alpha, t, t)
-                for channel in range(WIDTH):
-                    sums[channel] += w * rows[splat, channel]
+                behind = fma(-alpha, t, t)
+                if wp.static(most is None):
+                    splat = splats[j]
+                    for channel in range(WIDTH):
+                        sums[channel] += w * rows[splat, channel]
+                else:
+                    if t > 0.5 and behind <= 0.5:
+                        median = first + j
+                t = behind
+                for place in range(MOST):  # each as strong as it is pushes the weaker ones down
+                    best = weights[place]
+                    rank = ranks[place]
+                    if best < w:
+                        weights[place] = w
+                        ranks[place] = here
+                        w = best
+                        here = rank
         if line < pixels_out.shape[0] and column < pixels_out.shape[1]:
-            for channel in range(WIDTH):
-                if channel < channels:
-                    pixels_out[line, column, begin + channel] = sums[channel]
+            if wp.static(most is None):
+                for channel in range(WIDTH):
+                    if channel < channels:
+                        pixels_out[line, column, begin + channel] = sums[channel]
+            else:
+                median_out[line, column] = median
+            for place in range(MOST):
+                pixels_out[line, column, place] = weights[place]
+                ranks_out[line, column, place] = int(ranks[place])
 
-    return blend_channels
+    return beside
 
 
 @functools.cache
