@@ -8,7 +8,7 @@ from pathlib import Path
 from common import TRAINED, parse, write_table
 
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.finished import Opened, written_bytes
+from warp_splat.pruning.opened import Opened, written_bytes
 from warp_splat.pruning.simplify import squared_error
 from warp_splat.pruning.thinning import fewer_harmonics, tuned
 

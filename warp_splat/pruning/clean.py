@@ -19,7 +19,7 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
 from warp_splat.flags import check_numbers
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.finished import Opened, output_of, print_quality, write
+from warp_splat.pruning.opened import Opened, output_of, print_quality, write
 from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, rows_of, tuned
 

@@ -15,7 +15,7 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_csv
 from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
-from warp_splat.pruning.finished import Opened, output_of, print_quality, require_some, write, written_bytes
+from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, rows_of, tuned
 from warp_splat.rendering.finished import Finished
 from warp_splat.text import format_table

@@ -1,4 +1,4 @@
-"""What simplify and clean begin and end with: a model and its scene opened, a file written, in numbers."""
+"""What simplify and clean begin and end with: a model opened with its scene, a file written, in numbers."""
 
 import tempfile
 from collections.abc import Callable
