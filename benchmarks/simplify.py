@@ -7,6 +7,7 @@ from pathlib import Path
 
 from common import TRAINED, parse, write_table
 
+from warp_splat.config import FinishedModel
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.pruning.opened import Opened, written_bytes
 from warp_splat.pruning.simplify import squared_error
@@ -19,7 +20,7 @@ HEADERS = ("scene", "kept", "harmonics", "Gaussians", "test PSNR dB", "change dB
 
 def rows_of(model: Path) -> list[tuple]:
     """The model, and what is left of it."""
-    opened = Opened(str(model), "")
+    opened = Opened(FinishedModel(model=str(model), device="cpu"))
     whole = opened.file.splats
     before = opened.psnr(whole, opened.scene.test)
     rows = [row_of(opened, "1", "all", whole, before)]

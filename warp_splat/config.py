@@ -105,7 +105,24 @@ class RasterOptions:
 
 
 @dataclass
-class RenderConfig:
+class OnDevice:
+    """Where it is computed."""
+
+    device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
+    threads: int = machinery(0, "CPU threads; 0: all cores (results do not depend on it)")
+
+
+@dataclass
+class FinishedModel(OnDevice):
+    """A model, and the scene that it was trained on."""
+
+    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
+    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
+    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
+
+
+@dataclass
+class RenderConfig(OnDevice):
     """Rendering options; the reference's render.py where it has them."""
 
     model_path: str = flag("", "folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)", "-m")
@@ -136,20 +153,12 @@ class RenderConfig:
 
     lpips_weights: str = reporting("", LPIPS_HELP)
 
-    device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    threads: int = machinery(0, "CPU threads; 0: all cores (results do not depend on it)")
-
 
 @dataclass
-class ViewConfig:
+class ViewConfig(FinishedModel):
     """A model to look at in a browser."""
 
-    model: str = argument("folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
-    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
-    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
     port: int = flag(PORT, PORT_HELP, least=1, most=LAST_PORT)
-    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    threads: int = flag(0, "CPU threads; 0: all cores")
 
 
 @dataclass
@@ -194,34 +203,24 @@ class ConvertConfig:
 
 
 @dataclass
-class SimplifyConfig:
+class SimplifyConfig(FinishedModel):
     """A model to make smaller."""
 
-    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
-    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
     keep: float = flag(0.0, "the share of the Gaussians to keep", most=1)
     max_loss: float = flag(0.0, "or: keep as few as cost at most this much PSNR of the training views, in dB")
     size: str = flag("", "or: keep as many as fit into a file of this size, such as 10MB")
     steps: int = flag(0, "steps of training that make up for what was left out (300 are enough)")
     output: str = flag("", "the file to write, of any format; default: simplified.ply in the model's folder", "-o")
-    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
-    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    threads: int = flag(0, "CPU threads; 0: all cores")
 
 
 @dataclass
-class CleanConfig:
+class CleanConfig(FinishedModel):
     """A model to rid of floaters."""
 
-    model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
-    source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
     views: float = flag(3.0, "a floater is carried by fewer training views than this")
     near: float = flag(0.5, "and nearer to them than this share of the depth of half of what they show")
     steps: int = flag(0, "steps of training after leaving them out, with a price on opacity (--parts floaters)")
     output: str = flag("", "the file to write, of any format; default: cleaned.ply in the model's folder", "-o")
-    iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
-    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    threads: int = flag(0, "CPU threads; 0: all cores")
 
 
 @dataclass
@@ -234,7 +233,7 @@ class ExportHtmlConfig:
 
 
 @dataclass
-class CompareConfig:
+class CompareConfig(OnDevice):
     """Options of the comparison; without ``--stability``, ``--volume``, ``--cameras``: adjoints, knobs, training."""
 
     scene: str = flag("", "scene (COLMAP, nerf-synthetic, transforms.json) to measure on, besides our own", "-s")
@@ -244,8 +243,6 @@ class CompareConfig:
     volume: bool = flag(False, "the physics underneath instead: quadratures, and what splatting approximates")
     cameras: bool = flag(False, "lenses instead: what projections through them cost, against rays in float64")
     full: bool = flag(False, "train by the whole schedule instead of 300 steps")
-    device: str = flag("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
-    threads: int = flag(0, "CPU threads; 0: all cores")
 
 
 @dataclass

@@ -33,7 +33,8 @@ learning = partial(flag, group="how they learn")
 growing = partial(flag, group="how many they become")
 reporting = partial(flag, group="what is kept and told")
 film = partial(flag, group="frames of a video")
-machinery = partial(flag, group="where it is computed")
+LAST = "where it is computed"
+machinery = partial(flag, group=LAST)
 
 
 def flags_of(config_type: Any) -> list[Field]:
@@ -41,7 +42,7 @@ def flags_of(config_type: Any) -> list[Field]:
     groups = config_type.groups() if hasattr(config_type, "groups") else [config_type]
     found = [item for group in groups for item in fields(group)]
     headings = list(dict.fromkeys([None, "", *(item.metadata["group"] for item in found)]))
-    return sorted(found, key=lambda item: headings.index(item.metadata["group"]))
+    return sorted(found, key=lambda item: (item.metadata["group"] == LAST, headings.index(item.metadata["group"])))
 
 
 def default_of(item: Field) -> Any:

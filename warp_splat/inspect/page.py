@@ -5,7 +5,9 @@ import io
 import math
 from collections.abc import Iterable
 from html import escape
+from importlib import resources
 from pathlib import Path
+from string import Template
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,15 +24,6 @@ DOTS = 1500  # points drawn on a photograph
 MOST = 3.0  # px; larger errors have the same color
 MAPPED = 5000  # points drawn on the map
 PAGE_DPI = 110
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-table { border-collapse: collapse; width: 100%; }
-td { border-bottom: 1px solid #d9d9d9; padding: .35rem .6rem; vertical-align: top; white-space: nowrap; }
-td:first-child { font-weight: 600; }
-td:last-child { white-space: normal; overflow-wrap: anywhere; }
-.ok { color: #009e73; } .note { color: #0072b2; } .warning { color: #b35900; } .error { color: #c00000; }
-img { max-width: 100%; } figure { margin: 2rem 0; } figcaption { font-weight: 600; margin-bottom: .4rem; }
-"""
 
 
 def write_page(
@@ -50,12 +43,8 @@ def write_page(
         f'<figure><figcaption>{escape(caption)}</figcaption><img src="{address}" alt="{escape(caption)}"></figure>'
         for caption, address in pictures
     )
-    write_text(
-        path,
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f"<style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1><p>{escape(verdict)}</p>\n"
-        f"<table>\n{rows}\n</table>\n{figures}\n</body></html>\n",
-    )
+    page = Template(resources.files("warp_splat.inspect").joinpath("page.html").read_text(encoding="utf-8"))
+    write_text(path, page.substitute(title=escape(title), verdict=escape(verdict), rows=rows, figures=figures))
 
 
 def draw_pictures(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:

@@ -34,7 +34,7 @@ def clean(config: CleanConfig) -> int:
     """
     check_numbers(config)
     output = output_of(config.model, config.output, "cleaned.ply")
-    opened = Opened(config.model, config.source_path, config.iteration, config.device, config.threads)
+    opened = Opened(config)
     file, before = opened.file, opened.file.splats
     found = floaters(before, opened.setting, config.views, config.near)
     if found.all():

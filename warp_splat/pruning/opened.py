@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_splat.config import FinishedModel
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
@@ -30,13 +31,13 @@ class Opened(Finished):
         InputError: if either cannot be read, or the device cannot be used.
     """
 
-    def __init__(self, path: str, source_path: str, iteration: int = -1, device: str = "cpu", threads: int = 0):
-        used = settle_device(launch.prepare(device, threads), device)
-        super().__init__(path, iteration)
+    def __init__(self, config: FinishedModel):
+        used = settle_device(launch.prepare(config.device, config.threads), config.device)
+        super().__init__(config.model, config.iteration)
         require_some(self)
-        self.scene = self.refined(self.load_scene(source_path, print))
+        self.scene = self.refined(self.load_scene(config.source_path, print))
         if self.harmonics is not None:
-            print(f"What {path} has learned behind its Gaussians stays as it is; a file of Gaussians does not have it.")
+            print(f"What {self.path} has learned behind its Gaussians stays. A file of Gaussians does not have it.")
         self.setting = ViewSetting(self.scene.train, self.options, self.background(used))
 
     def picture_of(self, splats: SplatArrays) -> Callable[..., np.ndarray]:

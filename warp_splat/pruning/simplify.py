@@ -36,7 +36,7 @@ def simplify(config: SimplifyConfig) -> int:
     output = output_of(config.model, config.output, "simplified.ply")
     if is_file_of_gaussians(config.model) and not config.source_path:
         return _unseen(config, output)
-    opened = Opened(config.model, config.source_path, config.iteration, config.device, config.threads)
+    opened = Opened(config)
     thinning, file = Thinning(opened.file.splats, opened.setting), opened.file
     _curve(opened, thinning, output)
 
