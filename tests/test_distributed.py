@@ -20,7 +20,7 @@ from trainings import Pretended
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import load_ply
-from warp_splat.runtime.distributed import ALONE, Processes, join
+from warp_splat.runtime.distributed import ALONE, GroupError, Processes, join
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -261,3 +261,38 @@ def test_without_torchrun_a_process_is_alone(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(InputError, match=r"WORLD_SIZE.*RANK.*torchrun"), join("cpu"):
         pass
+
+
+def test_errors_of_nccl_are_raised_where_they_happen(monkeypatch):
+    """Set before the group is made; without it a thread of NCCL's ends the process, and nobody saves."""
+    for name, value in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("LOCAL_WORLD_SIZE", "2")):
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("TORCH_NCCL_BLOCKING_WAIT", "")
+    monkeypatch.delenv("TORCH_NCCL_BLOCKING_WAIT")
+    for name, value in (("is_available", True), ("device_count", 2), ("set_device", None)):
+        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    monkeypatch.setattr(torch.distributed, "is_nccl_available", lambda: True)
+
+    def meet(backend, timeout):
+        raise RuntimeError(f"{backend} {os.environ['TORCH_NCCL_BLOCKING_WAIT']}")
+
+    monkeypatch.setattr(torch.distributed, "init_process_group", meet)
+    with pytest.raises(InputError, match="cuda:nccl 1"), join("cuda"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("ncclRemoteError: A call failed possibly due to a network error or a remote process exiting", "has ended"),
+        ("Watchdog caught collective operation timeout", "was silent"),
+    ],
+)
+def test_what_nccl_says_is_told_as_what_gloo_says(said, told):
+    def collective(tensor, operation):
+        raise torch.distributed.DistBackendError(said)
+
+    processes = Processes(0, 2)
+    with pytest.raises(GroupError, match=told):
+        processes._exchange(collective, torch.zeros(1), None)
+    assert processes.lost

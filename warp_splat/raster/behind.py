@@ -33,11 +33,11 @@ def put_behind(
             of its base.
     """
     base, pose = (camera.base, camera.camera) if isinstance(camera, CameraParameters) else (camera, camera)
-    rays, seen = _rays(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base.lens)
-    if seen is not None:
-        alpha = alpha.masked_fill(~torch.from_numpy(seen).to(alpha.device), 1.0)
+    rays, blind = _rays(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base.lens, image.device)
+    if blind is not None:
+        alpha = alpha.masked_fill(blind, 1.0)
     with stage("environment"):
-        return _PutBehind.apply(image, alpha, harmonics, pose.rotation, torch.from_numpy(rays).to(image.device))
+        return _PutBehind.apply(image, alpha, harmonics, pose.rotation, rays)
 
 
 def load_kernels(device: torch.device) -> None:
@@ -49,15 +49,16 @@ def load_kernels(device: torch.device) -> None:
 
 @functools.lru_cache(maxsize=KEPT)
 def _rays(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see something, [H, W], if not all."""
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None, device: torch.device
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see nothing, [H, W], if any."""
     x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
     places = np.stack(np.broadcast_arrays(x, y[:, None]), -1).reshape(-1, 2)
     rays = lens.undistorted(places) if lens else np.concatenate([places, np.ones((len(places), 1))], 1)
-    seen = np.isfinite(rays).all(1)
-    rays[~seen] = (0.0, 0.0, 1.0)
-    return rays.astype(np.float32), None if seen.all() else seen.reshape(height, width)
+    blind = ~np.isfinite(rays).all(1)
+    rays[blind] = (0.0, 0.0, 1.0)
+    found = torch.from_numpy(rays.astype(np.float32)).to(device)
+    return found, torch.from_numpy(blind.reshape(height, width)).to(device) if blind.any() else None
 
 
 class _PutBehind(torch.autograd.Function):

@@ -1,5 +1,7 @@
 """A camera that is learned, or moves while its rows are read: what the projection is told, and its gradients."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +22,7 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import PINHOLE
 from warp_splat.lenses.shutter import Shutter, cross, rotated, series
 from warp_splat.raster.data import Gaussians, Splats2D
-from warp_splat.runtime.launch import launch_in_lanes
+from warp_splat.runtime.launch import launch_in_lanes, send
 from warp_splat.runtime.sums import in_pairs
 
 LONGEST = 2.0 * math.pi  # rotation vector; a longer one says what a shorter one does
@@ -42,10 +44,15 @@ class CameraParameters:
         last_twist: likewise where the last row of a rolling shutter stands; ``twist`` is then of the first.
         coefficients: those of ``base.lens``, [K], in its order; they have no unit. None: they are not learned.
 
+    Attributes:
+        here: the same with tensors of the host, if somebody knows the numbers: then nobody waits for a GPU's.
+
     Raises:
         InputError: if ``base`` is no camera, a tensor has not its shape or holds no real numbers, a camera without a
             rolling shutter is given a last twist, or one with it, or without a lens, coefficients.
     """
+
+    here: CameraParameters | None = None
 
     def __init__(
         self,
@@ -81,6 +88,8 @@ class CameraParameters:
         Raises:
             InputError: if the numbers make none.
         """
+        if self.here is not None:
+            return self.here.camera
         fx, fy, cx, cy = _numbers(self.intrinsics)
         lens = self.base.lens
         if lens and self.coefficients is not None:
@@ -124,22 +133,35 @@ class Tangent(NamedTuple):
     shift: np.ndarray  # [3] of the world
 
 
-def pose_gradient(
-    camera: Camera, cam: CameraView, lanes: int, gaussians: Gaussians, adj: Gaussians, adj_placed: torch.Tensor
-) -> Tangent:
-    """Of the pose; ``adj_placed`` is the part of ``adj.means`` that did not come through colors."""
+def pose_sums(
+    cam: CameraView, lanes: int, gaussians: Gaussians, adj: Gaussians, adj_placed: torch.Tensor
+) -> torch.Tensor:
+    """What :func:`twist_gradient` needs; ``adj_placed``: the part of ``adj.means`` that came not through colors."""
     inputs = [cam, gaussians.means, gaussians.quats, adj.means, adj_placed, adj.quats]
-    sums = _sums(make_adj_pose, lanes, 6, gaussians.means, inputs)
+    return _sums(make_adj_pose, lanes, 6, gaussians.means, inputs)
+
+
+def twist_gradient(
+    camera: Camera, learned: CameraParameters, motion: np.ndarray, which: int, sums: np.ndarray
+) -> np.ndarray:
+    """Of the first or the last twist [6], from the sums over all Gaussians [6] and the gradient of the motion."""
     turn, shift = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
-    return Tangent(*(part[0] + part[1] + part[2] for part in (turn, shift)))
-
-
-def twist_gradient(pose: Tangent, twist: torch.Tensor) -> torch.Tensor:
-    """Of the twist, like it."""
-    now = _numbers(twist)
+    middle = Tangent(*(part[0] + part[1] + part[2] for part in (turn, shift)))
+    pose = pose_gradients(camera.shutter, middle, motion)[which]
+    now = _numbers((learned.twist, learned.last_twist)[which])
     turn = pose.turn - cross(now[3:], pose.shift)
     turn = rotated(turn, -now[:3], 2)  # by the left Jacobian of the rotation, transposed
-    return torch.tensor(np.concatenate([turn, pose.shift])).to(twist)
+    return np.concatenate([turn, pose.shift])
+
+
+def of_sums(
+    linear: Callable[[np.ndarray], np.ndarray], sums: torch.Tensor, peeks: bool, like: torch.Tensor
+) -> torch.Tensor:
+    """A function of ``sums`` [K], like ``like``. By its matrix, if the host cannot look at them without waiting."""
+    if peeks:
+        return torch.tensor(linear(sums.cpu().numpy())).to(like)
+    matrix = np.stack([linear(row) for row in np.eye(len(sums))], 1)
+    return (send(torch.from_numpy(matrix), sums.device) * sums).sum(1).to(like)
 
 
 def intrinsics_gradient(
@@ -151,13 +173,14 @@ def intrinsics_gradient(
     splats: Splats2D,
     adj: Splats2D,
     time: np.ndarray,
+    peeks: bool,
 ) -> torch.Tensor:
     """Of the intrinsics, like them; ``time`` [2]: what they get through the time of a row."""
     inputs = [cam, opacities, splats.means2d, splats.conics, splats.opacities]
     inputs += [adj.means2d, adj.conics, adj.opacities]
     sums = _sums(make_adj_intrinsics, lanes, 4, opacities, inputs)
-    sums = sums / [camera.fx, camera.fy, 1.0, 1.0]
-    return torch.tensor(sums + np.array([0.0, time[0], 0.0, time[1]]) / camera.height).to(intrinsics)
+    by_time = np.array([0.0, time[0], 0.0, time[1]]) / camera.height
+    return of_sums(lambda sums: sums / [camera.fx, camera.fy, 1.0, 1.0] + by_time, sums, peeks, intrinsics)
 
 
 def coefficients_gradient(lens: Lens, found: list[torch.Tensor], coefficients: torch.Tensor) -> torch.Tensor:
@@ -178,10 +201,10 @@ def _prepared(lens: Lens) -> np.ndarray:
     return np.stack(columns, 1)
 
 
-def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> np.ndarray:
+def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> torch.Tensor:
     """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
     sums = launch_in_lanes(make, lanes, len(like), inputs, [], like.device, sums=(columns, wp.float32))
-    return in_pairs(sums).cpu().numpy()
+    return in_pairs(sums)
 
 
 def _numbers(tensor: torch.Tensor) -> np.ndarray:

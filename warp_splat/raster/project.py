@@ -3,6 +3,7 @@
 import importlib
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,8 +30,8 @@ from warp_splat.raster.camera_parameters import (
     intrinsics_gradient,
     motion_gradient,
     motion_of,
-    pose_gradient,
-    pose_gradients,
+    of_sums,
+    pose_sums,
     twist_gradient,
     with_motion,
 )
@@ -101,6 +102,7 @@ class Projecting(NamedTuple):
     bend: wp.Kernel | None  # whose adjoint takes the place of the kernel's where a lens is learned
     driver: Driver
     dropped: Dropped
+    here: CameraParameters | None  # those that are learned, on the host if somebody knows them there
 
 
 def project(
@@ -111,17 +113,17 @@ def project(
     dropped: Dropped | None = None,
 ) -> Splats2D:
     """What ``camera`` sees of ``gaussians``; ``dropped`` counts the gradients that the adjoint refuses to spread."""
-    learned, limits, bend = (None, None, None, None), camera, None
+    learned, limits, bend, here = (None, None, None, None), camera, None, None
     driver, reach_of = driver or driver_of(gaussians.means.device), falloff_of(options).reach_of
     if isinstance(camera, CameraParameters):
         learned = (camera.twist, camera.intrinsics, camera.last_twist, camera.coefficients)
-        limits, camera = camera.base, camera.camera
+        here, limits, camera = camera.here or camera, camera.base, camera.camera
         if learned[-1] is not None and learned[-1].requires_grad:
             bend = make_project(projection_of(options, camera.lens, learned=True), reach_of, driver.lanes, None)
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     projection = projection_of(options, camera.lens)
     kernel = make_project(projection, reach_of, driver.lanes, exposed_by(camera, options, driver.lanes))
-    it = Projecting(camera, cam, kernel, bend, driver, dropped or Dropped())
+    it = Projecting(camera, cam, kernel, bend, driver, dropped or Dropped(), here)
     return Splats2D(*Project.apply(*gaussians, *learned, it))
 
 
@@ -249,16 +251,17 @@ class Project(torch.autograd.Function):
             adj_inputs = _shapes(adj._replace(means=adj_placed))
             found = _launch_geometry(it, _shapes(given), outputs, adj_inputs, adj_outputs)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
+            peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
             adj_motion = motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
                 adj_means += adj_placed
-                pose = pose_gradient(it.camera, it.cam, lanes, given, adj, adj_placed)
-                first, last = pose_gradients(it.camera.shutter, pose, adj_motion)
-                adj_twist = twist_gradient(first, twist) if wants_twist else None
-                adj_last = twist_gradient(last, last_twist) if wants_last else None
+                sums = pose_sums(it.cam, lanes, given, adj, adj_placed)
+                by_twist = partial(twist_gradient, it.camera, it.here, adj_motion)
+                adj_twist = of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
+                adj_last = of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
             if wants_intrinsics:
                 adj_intrinsics = intrinsics_gradient(
-                    it.camera, it.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3]
+                    it.camera, it.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3], peeks
                 )
             if it.bend:
                 adj_coefficients = coefficients_gradient(it.camera.lens, found, coefficients)

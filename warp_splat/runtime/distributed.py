@@ -161,6 +161,9 @@ def join(device: str, images: int = 0) -> Iterator[Processes]:
             )
         torch.cuda.set_device(local_rank)
         backend = "cpu:gloo,cuda:nccl" if dist.is_nccl_available() else backend
+        # Else a thread of NCCL's ends the process when an exchange fails, and the model is lost. So the host waits for
+        # each exchange, which raises: nothing is learned from a sum that never came, and who is left can save.
+        os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")
     try:
         dist.init_process_group(backend, timeout=PATIENCE)
     except (RuntimeError, ValueError) as error:

@@ -24,6 +24,9 @@ from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_threads
 
+#: Else Warp leaves assembling to newer drivers; benchmarks/cubins.py looks at what its own assembler makes.
+wp.config.cuda_output = wp.config.cuda_output or "cubin"
+
 
 def prepare(device: str, threads: int) -> torch.device:
     """Set up the process for a run: Warp's messages, torch's threads, number of threads (0: all cores), memory.
@@ -172,6 +175,11 @@ def _in_lanes(table: Any, types: Types, count: int, rows: slice) -> Any:
         by_width = {1: narrow, 2: types.row2, 3: types.row3, 4: types.row4}
         return arrays_of([by_width[table.numel() // count]], [table[rows]])[0]
     return table(types, rows) if callable(table) else table
+
+
+def send(values: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """``values`` of the host on ``device``, without waiting until a GPU takes them."""
+    return (values.pin_memory() if device.type == "cuda" else values).to(device, non_blocking=True)
 
 
 def read_later(values: torch.Tensor) -> Callable[[], list]:

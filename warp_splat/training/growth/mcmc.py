@@ -15,6 +15,7 @@ from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import activate, logarithm
 from warp_splat.raster.api import RenderOutput
+from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.training.growth import ReferenceOptions, check_budget
 from warp_splat.training.growth.reference import LEVELS, PRUNE_OPACITY, normals, rotate, survivors
@@ -54,13 +55,18 @@ class Mcmc:
         """Move the means of faint Gaussians at random, by their covariances (equation 9)."""
         raw = self.model.parameters
         scales, opacities = activate(raw["scales"].detach(), raw["opacities"].detach())
-        faint = (opacities < STILL).nonzero()[:, 0]
-        scales, quats = scales[faint], raw["quats"].detach()[faint]
-        gate = activate(scales, SHARPNESS * (PRUNE_OPACITY - opacities[faint]))[1]
-        drawn = torch.randint(LEVELS, (len(faint), 3), generator=self.random)  # on the host: the same on any device
+        if driver_of(scales.device).peeks:
+            faint = (opacities < STILL).nonzero()[:, 0]
+            drawn = normals()[torch.randint(LEVELS, (len(faint), 3), generator=self.random)]
+        else:  # the host would wait for their number: a GPU draws for all, and their gates tell them apart
+            faint, seed = slice(None), int(torch.randint(2**62, (), generator=self.random))
+            random = torch.Generator(scales.device).manual_seed(seed)
+            drawn = torch.randn(scales.shape, generator=random, device=scales.device)
+        scales, quats, opacities = scales[faint], raw["quats"].detach()[faint], opacities[faint]
+        gate = activate(scales, SHARPNESS * (PRUNE_OPACITY - opacities))[1] * (opacities < STILL)
         rate = self.optimizer.tables["means"].rate
         # the covariance R S S R' times a normal vector is R S S times another
-        moved = rotate(quats, scales * scales * normals()[drawn].to(scales)) * (NOISE * rate * gate)[:, None]
+        moved = rotate(quats, scales * scales * drawn) * (NOISE * rate * gate)[:, None]
         means = raw["means"].detach()
         means[faint] = means[faint] + moved.nan_to_num(0.0, 0.0, 0.0)
 

@@ -3,6 +3,7 @@
 import torch
 
 from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.runtime.launch import send
 from warp_splat.scene.types import Scene
 from warp_splat.training.parts import BackgroundOptions
 from warp_splat.training.photographs import Photograph
@@ -32,7 +33,7 @@ class RandomBackground:
         """Draw one for each view of a step; this one's."""
         if step.iteration != self.drawn[0]:
             self.drawn = step.iteration, torch.rand(self.setting.processes.images, 3, generator=self.random)
-        self.color = self.drawn[1][step.place].to(color.device)
+        self.color = send(self.drawn[1][step.place], color.device)
         return self.color
 
     def photograph(self, photograph: Photograph, step: Step) -> Photograph:

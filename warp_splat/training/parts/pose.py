@@ -9,7 +9,7 @@ motions are taken out of the poses after every step, to first order: the set as 
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -18,6 +18,8 @@ from warp_splat.camera import Camera
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.camera_parameters import CameraParameters
+from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.launch import read_later, send
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.scene.types import Scene, Sightings, View, visible
 from warp_splat.training.optimizer import power
@@ -49,15 +51,23 @@ class Pose:
         self.moves = new(len(scene.train), 6, device=self.device, requires_grad=True)
         #: Shares of fx, fy, width and height; with "focal" one of both focal lengths.
         self.stretches = new(len(self.lenses), numbers, device=self.device, requires_grad=True)
+        self.late = self.coming = self._read_later()
 
     def _choose_numbers(self, lower: np.ndarray) -> None:
         """What the numbers of each photograph stand for: those that ``lower`` [V, 6, 6] makes of a twist."""
         extent, cameras = self.scene.extent, [view.camera for view in self.scene.train]
         self.lower = lower
         #: Of each photograph and of each of its numbers: the twist, [V, 6, 6].
-        self.ways = torch.from_numpy(inverses(lower) * np.array([1.0] * 3 + [extent] * 3)).to(self.device)
+        self.ways_here = torch.from_numpy(inverses(lower) * np.array([1.0] * 3 + [extent] * 3))
+        self.ways = self.ways_here.to(self.device)
         whole = [in_order(lower * motion[:, :, None]) for motion in gauge(cameras, extent)]
         self.gauge = orthonormal(np.stack(whole).reshape(len(whole), -1))
+        self.motions = torch.from_numpy(np.stack(self.gauge)).to(self.device)
+
+    def _read_later(self) -> Callable[[], list] | None:
+        """The numbers, for the host of a GPU: it uses them two steps late, when they have come without waiting."""
+        numbers = [self.moves.detach().flatten(), self.stretches.detach().flatten()]
+        return None if driver_of(self.device).peeks else read_later(torch.cat(numbers))
 
     def state(self) -> dict[str, torch.Tensor]:
         """What the numbers stand for: points and sizes of photographs may be others after a resume."""
@@ -67,6 +77,7 @@ class Pose:
         """Go on with the same numbers."""
         if NUMBERS in checkpoint.arrays:  # not, if training went without this part so far
             self._choose_numbers(checkpoint.array(NUMBERS, self.lower.shape, np.float64))
+            self.late = self.coming = self._read_later()
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
@@ -99,25 +110,32 @@ class Pose:
 
     def camera(self, camera: Camera, step: Step) -> CameraParameters:
         """Where the photograph's camera has come to."""
-        return self._learned(camera, step.view)
+        found = self._learned(camera, step.view, self.ways, self.moves, self.stretches)
+        if self.late is not None:
+            moves, stretches = torch.tensor(self.late()).split([self.moves.numel(), self.stretches.numel()])
+            numbers = moves.view_as(self.moves), stretches.view_as(self.stretches)
+            found.here = self._learned(camera, step.view, self.ways_here, *numbers)
+        return found
 
     def refined(self, camera: Camera, view: View) -> Camera:
         """As it stands now; of a photograph that is held out, the lens alone."""
         with torch.no_grad():
-            return self._learned(camera, view).camera
+            return self._learned(camera, view, self.ways, self.moves, self.stretches).camera
 
-    def _learned(self, camera: Camera, view: View) -> CameraParameters:
+    def _learned(
+        self, camera: Camera, view: View, ways: torch.Tensor, moves: torch.Tensor, stretches: torch.Tensor
+    ) -> CameraParameters:
         twist = torch.zeros(6)
         if view in self.places:
             place = self.places[view]
-            twist = in_pairs(self.ways[place] * self.moves[place].double()[:, None])
+            twist = in_pairs(ways[place] * moves[place].double()[:, None])
         free = self.options.pose_intrinsics == "all"
         units = [camera.fx, camera.fy, free * camera.width, free * camera.height]
         given = [camera.fx, camera.fy, camera.cx, camera.cy]
         lens, units = torch.tensor([given, units], dtype=torch.float64)
         if self.options.pose_intrinsics and intrinsics_of(view) in self.lenses:
-            stretch = self.stretches[self.lenses[intrinsics_of(view)]].double()
-            lens = lens.to(stretch.device) + units.to(stretch.device) * stretch
+            stretch = stretches[self.lenses[intrinsics_of(view)]].double()
+            lens = send(lens, stretch.device) + send(units, stretch.device) * stretch
         return CameraParameters(camera, twist, lens)
 
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
@@ -127,6 +145,12 @@ class Pose:
 
     def after_step(self, iteration: int) -> None:
         """Take out what moves the set as a whole."""
+        if self.late is not None:
+            moved = self.moves.detach().double().flatten()
+            moved = moved - ((self.motions * moved).sum(1, keepdim=True) * self.motions).sum(0)
+            self.moves.detach().copy_(moved.view(-1, 6))
+            self.late, self.coming = self.coming, self._read_later()
+            return
         moved = self.moves.detach().double().cpu().numpy().ravel()
         for motion in self.gauge:
             moved = moved - dot(moved, motion) * motion
