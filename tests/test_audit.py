@@ -5,21 +5,24 @@ import os
 import sys
 from pathlib import Path
 
+import audit_targets
 import numpy as np
 import pytest
 import torch
 import wrong_renderer
 
 from warp_splat.audit.judged import measure
-from warp_splat.audit.renderer import Renderer
+from warp_splat.audit.renderer import Answer, Renderer, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.audit.targets import TARGETS, own
 from warp_splat.cli import main
+from warp_splat.errors import InputError
 from warp_splat.formats.ply import load_ply
 from warp_splat.formats.png import load_png
 
 USUAL = {"blur": 0.3, "antialiasing": False, "alpha_min": 1 / 255, "alpha_max": 0.99, "t_min": 1e-4, "near": 0.2}
+USUAL["projection"] = "affine"
 
 
 def rules_of(eight_bit=False, **broken):
@@ -27,7 +30,8 @@ def rules_of(eight_bit=False, **broken):
         *geometry, dc, rest = workload.gaussians
         given = (*geometry, torch.cat([dc, rest], 1), workload.camera, workload.background)
         image = wrong_renderer.draw(wrong_renderer.Wrong(**broken), *given).float().double().numpy()
-        return (np.round(image.clip(0, 1) * 255) / 255, True) if eight_bit else (image, False)
+        image = np.round(image.clip(0, 1) * 255) / 255 if eight_bit else image
+        return Answer(image, eight_bit, None, True)
 
     return find_rules(draw)
 
@@ -39,7 +43,7 @@ def right():
 
 def test_a_right_renderer_has_the_usual_rules(right):
     assert right.options == pytest.approx(USUAL)
-    assert "matches" in right.sentences["camera"] and "axis" in right.sentences["order"]
+    assert "+0.5" in right.sentences["camera"] and "axis" in right.sentences["order"]
     assert "usual" in right.sentences["harmonics"] and "no antialiasing" in right.sentences["antialiasing"]
 
 
@@ -71,6 +75,7 @@ BROKEN = [
     ({"background": "black"}, "background", "ignored; it is black", {}),
     ({"background": "white"}, "background", "ignored; it is white", {}),
     ({"shift": 0.5}, "camera", "on average by (0.50, 0.50)", {}),
+    ({"projection": "ellipsoid"}, "camera", "ellipsoids along rays", {"projection": "ellipsoid"}),
 ]
 
 
@@ -133,10 +138,28 @@ def test_a_program_is_audited_and_its_finding_made_small(tmp_path):
     assert not load_png(tmp_path / "out" / "found.png").any() and load_png(tmp_path / "out" / "expected.png").any()
 
 
+@pytest.mark.slow
+def test_a_program_may_write_an_exr(tmp_path):
+    """Floats come back as they are: above 1, and in more than 256 levels."""
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import sys\nimport numpy as np\nimport OpenImageIO as oiio\n"
+        "image = oiio.ImageBuf(oiio.ImageSpec(64, 48, 3, oiio.HALF))\n"
+        "image.set_pixels(oiio.ROI(), np.full((48, 64, 3), [1.5, 0.501, 0.25], np.float32))\n"
+        "image.write(sys.argv[1])\n"
+    )
+    drawn, camera = SCENES["one"][1]()
+    given = [drawn[name] for name in ("means", "quats", "scales", "opacities", "sh_dc")]
+    image = function_of(f"{sys.executable} {program} {{exr}}")(*given, camera, torch.zeros(3))
+    assert image.dtype == np.float32
+    np.testing.assert_allclose(image, np.broadcast_to([1.5, 0.501, 0.25], (48, 64, 3)), rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["nobody"], "MODULE:function, or one of"),
+        (["nobody"], "MODULE:function, a page that ends in .html, or one of"),
+        (["nothing.html"], "window.show"),
         (["no_module:draw"], "that can be imported"),
         (["x", "--command", "prog {ply}"], "{out}"),
         (["manual", "--case", "nothing"], "expected one of one, two"),
@@ -158,10 +181,18 @@ def test_tiny_rotations_are_not_lost_in_gsplats_function():
 
 
 def test_adapters_are_small():
-    folder = Path(sys.modules["warp_splat.audit.targets"].__file__).parent
-    assert {target.place.split(":")[0] for target in TARGETS.values()} <= {path.stem for path in folder.glob("*.py")}
-    for path in folder.iterdir():
-        assert path.is_dir() or len(path.read_text().splitlines()) <= 100, path
+    folder = Path(audit_targets.__file__).parent
+    for path in [*folder.iterdir(), *Path(own.__file__).parent.glob("*.py")]:
+        assert path.is_dir() or len(path.read_text().splitlines()) <= 80, path
+
+
+@pytest.mark.parametrize("name", [*TARGETS, *audit_targets.OTHERS])
+def test_every_target_of_a_table_can_be_called_or_is_absent(name):
+    """Absent: whoever asks for it is told so in a sentence."""
+    try:
+        assert callable(function_of({**TARGETS, **audit_targets.OTHERS}[name].place))
+    except InputError as error:
+        assert name not in TARGETS and "No module named" in str(error)
 
 
 def test_harmonics_are_cut_where_a_renderer_claims_none():

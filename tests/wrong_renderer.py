@@ -28,6 +28,7 @@ class Wrong:
     space: str = "as is"
     background: str = "asked"
     shift: float = 0.0
+    projection: str = "affine"
 
 
 def draw(rules, means, quats, scales, opacities, sh, camera, background):
@@ -41,6 +42,7 @@ def draw(rules, means, quats, scales, opacities, sh, camera, background):
     if rules.swapped and max(rules.swapped) < sh.shape[1]:
         sh[:, list(rules.swapped)] = sh[:, list(rules.swapped)[::-1]]
     view = {"antialiasing": rules.antialiasing, "near": rules.near, "blur": rules.blur}
+    view["projection"] = rules.projection
     splats = oracle.exact_splats(means, quats, scales, opacities, sh, camera, **view)
     key = {
         "depth": splats.z,

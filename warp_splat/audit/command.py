@@ -17,7 +17,7 @@ from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.audit.targets import TARGETS, NamedRenderer
-from warp_splat.audit.targets.program import draw_by_program, stored, write_files
+from warp_splat.audit.targets.program import stored, write_files
 from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
@@ -38,7 +38,7 @@ def audit(config: AuditConfig) -> int:
         InputError: for a target, scene or command that there is not.
     """
     target = target_of(config)
-    renderer = Renderer(target.place, config.program, config.limit)
+    renderer = Renderer(target.place, config.limit)
     if config.case and config.case not in SCENES:
         raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
     try:
@@ -53,36 +53,30 @@ def audit(config: AuditConfig) -> int:
 
 def target_of(config: AuditConfig) -> NamedRenderer:
     """Where the target is called, and what it claims: by its name, its place, or its command."""
-    if config.program:
-        draw_by_program(config.program)
-        return NamedRenderer("", "", config.program, config.degree, "{background}" in config.program)
-    if config.target in TARGETS:
+    if config.target in TARGETS and not config.program:
         found = TARGETS[config.target]
-        place = found.place if "." in found.place else f"warp_splat.audit.targets.{found.place}"
-        return found._replace(place=place, degree=min(found.degree, config.degree))
-    if ":" not in config.target:
-        raise InputError(f"{config.target}: expected MODULE:function, or one of {', '.join(TARGETS)}.")
-    function_of(config.target)
-    return NamedRenderer(config.target, config.target.split(".")[0].split(":")[0], degree=config.degree)
+        return found._replace(degree=min(found.degree, config.degree))
+    if not config.program and ":" not in config.target and not config.target.endswith(".html"):
+        raise InputError(
+            f"{config.target}: expected MODULE:function, a page that ends in .html, or one of {', '.join(TARGETS)}."
+        )
+    function_of(config.program or config.target)
+    package = "" if config.program else config.target.split(".")[0].split(":")[0]
+    return NamedRenderer(config.program or config.target, package, config.program, config.degree)
 
 
 def run_audit(
     renderer: Renderer, target: NamedRenderer, name: str, scenes: tuple[str, ...] = tuple(SCENES)
 ) -> tuple[dict[str, Any], list[SceneRow]]:
     """What was found of rules and settings, and a row for each scene; prints both."""
-
-    def draw(workload):
-        answer = renderer.draw(workload)
-        return answer.image, answer.eight_bit
-
-    rules = find_rules(draw, target.degree)
+    rules = find_rules(renderer.draw, target.degree)
     facts = {"target": name, "package": target.package, "version": target.version, "settings": target.settings}
     facts |= {"date": date.today().isoformat(), "machine": machine(), "degree": target.degree}
     facts |= {"rules": rules.sentences, "options": rules.options}
     print(f"{name} ({target.package} {target.version}; {target.settings})")
     for rule, sentence in rules.sentences.items():
         print(f"  {rule:13s} {sentence}")
-    rows = list(measure(renderer, rules.options, target.degree, target.background, scenes))
+    rows = list(measure(renderer, rules.options, target.degree, rules.background, scenes))
     columns = {"scene": "{scene}", "largest": "{largest:.1g}", "mean": "{mean:.1g}", "off": "{off:.1%}"}
     columns |= {"by its rules": "{own:.1%}", "gradients": worst_gradient, "verdict": "{verdict}"}
     print(table_of([row.record() for row in rows], columns))
@@ -125,7 +119,7 @@ def side_by_side(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 def _write_case(renderer: Renderer, target: NamedRenderer, name: str, out: Path) -> int:
     """The smallest scene that shows what a renderer does to ``name``: files, what was expected, what came."""
-    background = (0.25, 0.5, 0.75) if target.background else (0.0, 0.0, 0.0)
+    background = find_rules(renderer.draw, target.degree, ("background",)).background
     workload = on_all_pixels(name, SCENES[name][1](), background, target.degree)
     try:
         workload, answer = smallest(renderer, workload)

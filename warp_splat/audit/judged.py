@@ -67,12 +67,12 @@ def exact_image(workload: Workload) -> np.ndarray:
 
 
 def measure(
-    renderer: Renderer, options: dict[str, Any], degree: int = 3, background: bool = True, scenes=tuple(SCENES)
+    renderer: Renderer, options: dict[str, Any], degree: int = 3, background=(0.25, 0.5, 0.75), scenes=tuple(SCENES)
 ) -> Iterator[SceneRow]:
     """A row for each scene; ``options`` of the oracle are the renderer's own rules."""
     failures = 0
     for scene in scenes:
-        workload, truth = _truth(scene, (0.25, 0.5, 0.75) if background else (0.0, 0.0, 0.0), degree)
+        workload, truth = _truth(scene, background, degree)
         shape = (workload.camera.height, workload.camera.width)
         if failures >= HOPELESS:
             yield SceneRow(scene, SCENES[scene][0], f"not tried after {HOPELESS} failures in a row", "error")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warp_splat.audit.renderer import Answer
 from warp_splat.audit.small_scenes import balls, on_all_pixels
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import make_camera, tensors
@@ -21,6 +22,7 @@ from warp_splat.compare.workloads import Workload
 GREEN, FOCAL = np.array([0.0, 1.0, 0.0]), 60.0
 CENTER = np.array([32.5, 24.5])  # px, the middle of a pixel and of the picture
 SEEN = {True: 0.6 / 255, False: 1e-9}  # of a cover, by whether pictures have 8 bits
+COMPANY = 16  # Gaussians behind the camera: some viewers draw nothing of a scene that has only one or two
 OPAQUE = 0.9995  # what lets through more than most stops
 ASKED = (0.25, 0.5, 0.75)
 #: Values that renderers are known to have; a measured interval that holds one is named by it.
@@ -54,11 +56,12 @@ def named_between(low: float, high: float) -> tuple[float, str]:
 class Prober:
     """Draws probes and gathers what they say."""
 
-    draw: Callable[[Workload], tuple[np.ndarray, bool]]  # picture, and whether it has 8 bits
+    draw: Callable[[Workload], Answer]
     degree: int = 3
     sentences: dict[str, str] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)  # of the oracle, where they differ from the defaults
     behind: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    background: tuple[float, ...] = (0.0, 0.0, 0.0)  # what it can be asked for, or shows
     shift: np.ndarray = field(default_factory=lambda: np.zeros(2))  # px, of all places
     encoded: bool = False  # the picture
     decoded: bool = False  # colors, before they are blended
@@ -66,29 +69,43 @@ class Prober:
 
     def picture(self, arrays: dict[str, np.ndarray], background=(0.0, 0.0, 0.0), camera=None) -> np.ndarray:
         """[H, W, 3] in the space in which it was blended."""
-        workload = on_all_pixels("probe", (tensors(arrays), camera or probe_camera()), background, self.degree)
-        image, eight_bit = self.draw(workload)
-        self.seen = SEEN[eight_bit]
-        return decoded_srgb(image) if self.encoded else image
+        camera = camera or probe_camera()
+        company = balls(camera, [CENTER] * COMPANY, -0.5, 0.1, 0.01, 0.5)
+        rest = arrays["sh_rest"].shape[1]
+        company["sh_rest"] = np.zeros((COMPANY, rest, 3))
+        both = {name: np.concatenate([array, company[name]]) for name, array in arrays.items()}
+        answer = self.draw(on_all_pixels("probe", (tensors(both), camera), background, self.degree))
+        self.seen = SEEN[answer.eight_bit]
+        return decoded_srgb(answer.image) if self.encoded else answer.image
 
     def cover(self, pixels, depth, sigma, opacity) -> np.ndarray:
         """1 - T of green balls, [H, W]."""
-        image = self.picture(balls(probe_camera(), np.asarray(pixels) - self.shift, depth, sigma, opacity, GREEN))
+        return self.cover_of(balls(probe_camera(), np.asarray(pixels) - self.shift, depth, sigma, opacity, GREEN))
+
+    def cover_of(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
+        """1 - T of what is green, [H, W]."""
         span = GREEN - self.behind
-        return (image - self.behind) @ span / (span @ span)
+        return (self.picture(arrays) - self.behind) @ span / (span @ span)
 
     def blended(self, colors) -> np.ndarray:
         """What is blended of colors of the file."""
         return decoded_srgb(np.asarray(colors)) if self.decoded else np.asarray(colors)
 
-    def exact(self, arrays: dict[str, np.ndarray], camera=None, background=None) -> oracle.Render:
+    def exact(self, arrays: dict[str, np.ndarray], camera=None, background=None, **view) -> oracle.Render:
         """What float64 says of a probe, at the places where the renderer draws it."""
         camera = camera or probe_camera()
         moved = replace(camera, cx=camera.cx + self.shift[0], cy=camera.cy + self.shift[1])
         given = {name: torch.tensor(np.ascontiguousarray(array)) for name, array in arrays.items()}
         sh = torch.cat([given.pop("sh_dc"), given.pop("sh_rest")], 1)
         behind = tuple(self.behind if background is None else background)
-        return oracle.exact_render(**given, sh=sh, camera=moved, background=behind)
+        view = {"projection": self.options.get("projection", "affine")} | view
+        return oracle.exact_render(**given, sh=sh, camera=moved, background=behind, **view)
+
+    def alpha(self, sigma: float, opacity: float) -> np.ndarray:
+        """Of a ball in the middle, [H, W], without thresholds."""
+        thresholds = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0, "blur": self.options.get("blur", oracle.BLUR)}
+        ball = balls(probe_camera(), [CENTER - self.shift], 3.0, sigma, opacity, GREEN)
+        return self.exact(ball, **thresholds).alpha.numpy()
 
     def nearest(self, image: np.ndarray, candidates: dict[str, np.ndarray]) -> str:
         """The name of the candidate nearest to the picture; "other" if none is near."""
@@ -101,9 +118,3 @@ class Prober:
 def probe_camera():
     """On whose axis CENTER lies."""
     return make_camera(65, 49, FOCAL, seed=None)
-
-
-def radii_of_pixels() -> np.ndarray:
-    """Of each pixel's center from CENTER, [H, W] px."""
-    y, x = np.mgrid[:49, :65] + 0.5
-    return np.hypot(x - CENTER[0], y - CENTER[1])

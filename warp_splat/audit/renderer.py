@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from warp_splat.audit.targets.page import draw_by_page
 from warp_splat.audit.targets.program import draw_by_program
 from warp_splat.compare.workloads import Workload
 from warp_splat.errors import InputError
@@ -32,14 +33,14 @@ class Answer:
 
 
 class Renderer:
-    """Draws with ``MODULE:function`` or a program's command line; started again after each failure.
+    """Draws with ``MODULE:function``, a page or a program's command line; started again after each failure.
 
     The function takes means [N, 3], quats [N, 4] (w first), scales [N, 3], opacities [N], sh [N, K, 3] (float32,
     activated), a :class:`warp_splat.Camera` and the background [3]. It returns the picture [H, W, 3], float or uint8.
     """
 
-    def __init__(self, place: str, command: str = "", limit: float = 60.0):
-        self.place, self.command, self.limit = place, command, limit
+    def __init__(self, place: str, limit: float = 60.0):
+        self.place, self.limit = place, limit
         self.process: Any = None
 
     def draw(self, workload: Workload, upstream: torch.Tensor | None = None, runs: int = 1) -> Answer:
@@ -51,7 +52,7 @@ class Renderer:
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.connection, other = context.Pipe()
-            self.process = context.Process(target=_serve, args=(other, self.place, self.command), daemon=True)
+            self.process = context.Process(target=_serve, args=(other, self.place), daemon=True)
             self.process.start()
             other.close()
             self._receive(START_LIMIT)
@@ -89,7 +90,15 @@ class Renderer:
 
 
 def function_of(place: str):
-    """The function of ``MODULE:function``. Raises InputError if there is none."""
+    """What draws: the function of ``MODULE:function``, ``PAGE.html``, or a program's command line, which has braces.
+
+    Raises:
+        InputError: if there is none.
+    """
+    if "{" in place:
+        return draw_by_program(place)
+    if place.endswith(".html"):
+        return draw_by_page(place)
     module, _, name = place.partition(":")
     try:
         return getattr(importlib.import_module(module), name)
@@ -97,10 +106,10 @@ def function_of(place: str):
         raise InputError(f"{place}: expected MODULE:function that can be imported, found {error}.") from error
 
 
-def _serve(connection, place: str, command: str) -> None:
+def _serve(connection, place: str) -> None:
     """The loop of the process: Gaussians in, picture and gradients out, or a phrase that says what went wrong."""
     try:
-        render = draw_by_program(command) if command else function_of(place)
+        render = function_of(place)
         connection.send(())
     except Exception as error:
         connection.send(_phrase(error))

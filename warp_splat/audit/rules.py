@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
@@ -17,23 +17,26 @@ from warp_splat.audit.probes import (
     decoded_srgb,
     named_between,
     probe_camera,
-    radii_of_pixels,
     srgb,
 )
-from warp_splat.audit.renderer import RendererFailed
+from warp_splat.audit.renderer import Answer, RendererFailed
 from warp_splat.audit.small_scenes import balls
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.workloads import Workload
 from warp_splat.formats.stored import SH_C0
 
+#: Projections, and what is said of them.
+SHOWN_AS = {"affine": "linearized at their center", "ellipsoid": "seen as ellipsoids along rays"}
+
 
 def find_background(prober: Prober) -> str:
     """What is behind everything, asked for light blue and for black."""
     arrays = balls(probe_camera(), [CENTER], 3.0, 3.0, 0.9, GREEN)
     asked, black = (prober.picture(arrays, background)[0, 0] for background in (ASKED, (0.0, 0.0, 0.0)))
-    prober.behind = black
+    prober.behind, prober.background = black, tuple(np.round(black, 3).tolist())
     if min(np.abs(asked - each).max() for each in (ASKED, srgb(np.array(ASKED)))) < 0.01 and black.max() < 0.01:
+        prober.background = ASKED
         return "The background asked for is blended behind the Gaussians."
     shown = {"black": 0.0, "white": 1.0}
     name = next((name for name, value in shown.items() if np.abs(asked - value).max() < 0.01), np.round(asked, 3))
@@ -89,10 +92,10 @@ def find_low_pass(prober: Prober) -> str:
 
 def find_cut(prober: Prober) -> str:
     """With the extent: where stacks of faint balls end, once by alpha, once by standard deviations."""
-    edges, radii = [], radii_of_pixels()
+    edges = []
     for opacity in (0.05, 0.02):
         cover = prober.cover([CENTER] * 32, np.linspace(3, 3.5, 32), 8.0, opacity)
-        alpha = opacity * np.exp(-(radii**2) / (2 * (64 + prober.options.get("blur", oracle.BLUR))))
+        alpha = prober.alpha(8.0, opacity)
         drawn = cover > max(prober.seen, 1e-3 * alpha.max())
         gone = alpha[~drawn & (32 * alpha > 2 * max(prober.seen, 1e-3 * alpha.max()))]
         edges.append((gone.max(initial=0.0), alpha[drawn].min(initial=1.0)))
@@ -110,13 +113,13 @@ def find_cut(prober: Prober) -> str:
 
 def find_extent(prober: Prober) -> str:
     """Where a strong Gaussian ends although its alpha is not faint yet."""
-    variance, radii = 36 + prober.options.get("blur", oracle.BLUR), radii_of_pixels()
-    alpha = 0.95 * np.exp(-(radii**2) / (2 * variance))
+    alpha = prober.alpha(6.0, 0.95)
+    deviations = np.sqrt(-2 * np.log(alpha / 0.95).clip(max=0))
     drawn = prober.cover([CENTER], 3.0, 6.0, 0.95) > 0.3 * alpha
     missing = ~drawn & (alpha > 1.1 * max(prober.options.get("alpha_min", 0), 1.5 * prober.seen, 1e-6))
     if not missing.any():
         return "A Gaussian reaches as far as its alpha does."
-    first, last = radii[missing].min() / variance**0.5, radii[drawn].max() / variance**0.5
+    first, last = deviations[missing].min(), deviations[drawn].max()
     shape = "round" if last - first < 0.25 else f"not round: some pixels up to {last:.1f} are drawn"
     return f"A Gaussian ends {first:.1f} standard deviations from its center ({shape}), where alpha is still " \
            f"{alpha[missing].max():.1g}."  # fmt: skip
@@ -136,7 +139,7 @@ def find_clamp(prober: Prober) -> str:
 
 def find_stop(prober: Prober) -> str:
     """What is left of the light behind 160 layers."""
-    left = 1 - prober.cover([CENTER] * 160, np.linspace(3, 5, 160), 40.0, 0.1)[24, 32]
+    left = 1 - prober.cover([CENTER] * 160, np.linspace(3, 5, 160), 9.0, 0.1)[24, 32]
     if left < max(2 * prober.seen, 2e-7):
         prober.options["t_min"] = 0.0 if prober.seen < 1e-6 else oracle.STOP
         return f"A pixel does not stop while its transmittance is above {max(left, prober.seen):.1g}."
@@ -240,20 +243,24 @@ def find_sort(prober: Prober) -> str:
 
 
 def find_pixels(prober: Prober) -> str:
-    """Where three small Gaussians are seen."""
-    places = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]])
-    cover = np.clip(prober.cover(places, [3.0, 3.5, 4.0], 2.0, 0.9), 0, None)
-    y, x = np.mgrid[:49, :65] + 0.5
-    offsets = []
-    for place in places:
-        share = cover * (np.abs(x - np.floor(place[0]) - 0.5) < 9) * (np.abs(y - np.floor(place[1]) - 0.5) < 9)
-        offsets.append([(share * x).sum() / share.sum() - place[0], (share * y).sum() / share.sum() - place[1]])
-    shift, spread = np.mean(offsets, 0), np.abs(np.array(offsets)).max()
+    """Where three small Gaussians are seen: from where float64 has them, linearized or as ellipsoids."""
+    places, y, x = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]]), *np.mgrid[:49, :65] + 0.5
+
+    def centers(cover: np.ndarray) -> np.ndarray:
+        shares = [cover * (np.maximum(*np.abs([x - int(a) - 0.5, y - int(b) - 0.5])) < 9) for a, b in places]
+        return np.array([[(share * x).sum() / share.sum(), (share * y).sum() / share.sum()] for share in shares])
+
+    arrays = balls(probe_camera(), places, [3.0, 3.5, 4.0], 2.0, 0.9, GREEN)
+    seen = centers(prober.cover_of(arrays).clip(0))
+    offsets = {how: seen - centers(prober.exact(arrays, projection=how).alpha.numpy()) for how in SHOWN_AS}
+    how = min(offsets, key=lambda how: np.ptp(offsets[how], axis=0).max())
+    shift, spread = offsets[how].mean(0), np.abs(offsets[how]).max()
     limit = 0.01 if prober.seen < 1e-6 else 0.05
     prober.shift = shift if spread > limit else prober.shift
-    if spread < limit:
-        return f"The camera matches within {spread:.1g} px: centers of pixels are at +0.5."
-    return f"Places are off by up to {spread:.2g} px, on average by ({shift[0]:.2f}, {shift[1]:.2f})."
+    prober.options["projection"] = how
+    where = f"off by up to {spread:.2g} px, on average by ({shift[0]:.2f}, {shift[1]:.2f})"
+    where = f"as asked within {spread:.1g} px: centers of pixels are at +0.5" if spread < limit else where
+    return f"Gaussians are {SHOWN_AS[how]}; places are {where}."
 
 
 #: In an order in which later ones may use what earlier ones found.
@@ -273,12 +280,12 @@ FINDERS = {
 }
 
 
-def find_rules(draw: Callable[[Workload], tuple[np.ndarray, bool]], degree: int = 3) -> Prober:
-    """All rules of a renderer: ``sentences`` by name, ``options`` for the oracle."""
+def find_rules(draw: Callable[[Workload], Answer], degree: int = 3, names: Iterable[str] = tuple(FINDERS)) -> Prober:
+    """The rules of a renderer: ``sentences`` by name, ``options`` for the oracle."""
     prober = Prober(draw, degree)
-    for name, find in FINDERS.items():
+    for name in names:
         try:
-            prober.sentences[name] = find(prober)
+            prober.sentences[name] = FINDERS[name](prober)
         except RendererFailed as error:
             prober.sentences[name] = f"Not found: it {error}."
     return prober

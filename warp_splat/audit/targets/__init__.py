@@ -9,11 +9,10 @@ from typing import NamedTuple
 class NamedRenderer(NamedTuple):
     """How a renderer is called, and what it claims."""
 
-    place: str  # MODULE:function, of this folder unless it has dots
+    place: str  # MODULE:function, a page or a command line
     package: str = "warp-splat"  # whose version the table tells
     settings: str = ""
     degree: int = 3  # of harmonics, the highest that it claims
-    background: bool = True  # whether one can be asked for
 
     @property
     def version(self) -> str:
@@ -26,14 +25,13 @@ class NamedRenderer(NamedTuple):
             return "?"
 
 
+OWN = "warp_splat.audit.targets"
 TARGETS = {
-    "manual": NamedRenderer("own:manual", settings="adjoint by hand"),
-    "stepwise": NamedRenderer("own:stepwise", settings="adjoint stepwise"),
-    "reversible": NamedRenderer("own:reversible", settings="adjoint reversible"),
-    "stored": NamedRenderer("own:stored", settings="adjoint stored"),
-    "tape": NamedRenderer("own:on_tape", settings="on Warp's tape"),
-    "gsplat-function": NamedRenderer("own:as_gsplat", settings="warp_splat.gsplat.rasterization"),
-    "page": NamedRenderer("web:own_page", settings="export-html, WebGL in software", background=False),
-    "newton": NamedRenderer("simulators:newton", "newton", "SensorCamera as it is delivered", 0, False),
-    "spark": NamedRenderer("web:spark", "spark@2.2.0", "three.js 0.187.0, WebGL in software", background=False),
+    "manual": NamedRenderer(f"{OWN}.own:manual", settings="adjoint by hand"),
+    "stepwise": NamedRenderer(f"{OWN}.own:stepwise", settings="adjoint stepwise"),
+    "reversible": NamedRenderer(f"{OWN}.own:reversible", settings="adjoint reversible"),
+    "stored": NamedRenderer(f"{OWN}.own:stored", settings="adjoint stored"),
+    "tape": NamedRenderer(f"{OWN}.own:on_tape", settings="on Warp's tape"),
+    "gsplat-function": NamedRenderer(f"{OWN}.own:as_gsplat", settings="warp_splat.gsplat.rasterization"),
+    "page": NamedRenderer(f"{OWN}.page:as_page", settings="export-html, WebGL in software"),
 }

@@ -41,7 +41,7 @@ def draw_by_program(command: str):
     Raises:
         InputError: if the command names no output.
     """
-    if "{out}" not in command and "{exr}" not in command:
+    if not ("{out}" in command or "{exr}" in command):
         raise InputError(f"--command: expected {{ply}}, {{cameras}} and {{out}} (or {{exr}}) in it, found {command!r}.")
 
     def draw(means, quats, scales, opacities, sh, camera, background):

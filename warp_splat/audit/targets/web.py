@@ -1,41 +1,40 @@
-"""Viewers in a headless Chromium: a page of this folder for each, which shows a PLY file from a camera."""
+"""A headless Chromium, what it is served, and a picture of a page in it."""
 
 from __future__ import annotations
 
 import functools
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from importlib import resources
 from pathlib import Path
 
-from warp_splat.audit.targets.program import stored, write_files
 from warp_splat.errors import InputError
-from warp_splat.export_html.command import make_page
-from warp_splat.export_html.pack import shown
 from warp_splat.formats.model_folder import camera_entry
 from warp_splat.formats.png import load_png
 
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+#: Without those of the second line, it draws a frame a second.
+FLAGS = (
+    "--use-angle=swiftshader --enable-unsafe-swiftshader --no-sandbox --disable-frame-rate-limit --disable-gpu-vsync"
+)
 CACHE = Path.home() / ".cache" / "warp_splat" / "web"  # where npm puts what it is asked for
-#: A viewer's page has ``show``; our own has buttons, which would be in the picture.
-SHOW = """async (camera) => {
-  while (!window.show && !window.warpSplat) await new Promise((resolve) => setTimeout(resolve, 20));
-  if (!window.show) for (const part of document.querySelectorAll("div, button")) part.style.display = "none";
-  await (window.show ?? window.warpSplat.setCamera)(camera);
+PACKAGES = re.compile(r'<meta name="npm" content="([^"]*)"')
+SHOW = """async ([camera, file]) => {
+  while (!window.show) await new Promise((resolve) => setTimeout(resolve, 20));
+  return await window.show(camera, file);
 }"""
-OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "LINEAR": False, "BACKGROUND": 0.0}
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Says nothing, and lets nothing be kept: the next scene has the same name, maybe within the same second."""
+    """Says nothing, and lets no scene be kept: the next has the same name, maybe within the same second."""
 
     def end_headers(self):
-        self.send_header("Cache-Control", "no-store")
+        kept = self.path.startswith("/node_modules")
+        self.send_header("Cache-Control", "max-age=3600" if kept else "no-store")
         super().end_headers()
 
     def log_message(self, *_):
@@ -43,17 +42,13 @@ class _Handler(SimpleHTTPRequestHandler):
 
 
 @functools.cache
-def _browser(packages: tuple[str, ...]):
-    """A page of playwright's, the folder that is served, and its address; what the viewer needs is installed."""
+def _browser():
+    """A page of playwright's, the folder that is served, and its address."""
     try:
         from playwright.sync_api import sync_playwright  # noqa: PLC0415 - seldom there
     except ImportError as error:
         raise InputError("playwright: it drives the browser, and is not there; pip install playwright.") from error
     folder = Path(tempfile.mkdtemp())
-    missing = [name for name in packages if not (CACHE / "node_modules" / name.rsplit("@", 1)[0]).exists()]
-    if missing:
-        CACHE.mkdir(parents=True, exist_ok=True)
-        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(CACHE), *missing], check=True)
     (folder / "node_modules").symlink_to(CACHE / "node_modules")
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -62,38 +57,23 @@ def _browser(packages: tuple[str, ...]):
     return browser.new_page(), folder, f"http://127.0.0.1:{server.server_port}"
 
 
-def _screenshot(packages: tuple[str, ...], name: str, camera, write) -> object:
-    """What the page shows after ``write`` put its files into the folder, [H, W, 3] uint8."""
-    page, folder, address = _browser(packages)
+def screenshot(page: Path, camera, write=lambda folder: None, file: str = "scene.ply"):
+    """What ``page`` shows of the ``file`` that ``write`` puts into a folder, [H, W, 3] uint8; what ``show`` returns.
+
+    Raises:
+        InputError: if there is no playwright.
+    """
+    packages = " ".join(PACKAGES.findall(page.read_text(encoding="utf-8"))).split()
+    missing = [name for name in packages if not (CACHE / "node_modules" / name.rsplit("@", 1)[0]).exists()]
+    if missing:
+        CACHE.mkdir(parents=True, exist_ok=True)
+        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(CACHE), *missing], check=True)
+    tab, folder, address = _browser()
+    if not (folder / "page").exists():
+        (folder / "page").symlink_to(page.parent.resolve())
     write(folder)
-    page.set_viewport_size({"width": camera.width, "height": camera.height})
-    page.goto(f"{address}/{name}.html")
-    page.evaluate(SHOW, camera_entry(camera))
-    page.screenshot(path=folder / "screen.png")
-    return load_png(folder / "screen.png")
-
-
-def own_page(means, quats, scales, opacities, sh, camera, background):
-    """This package's exported page."""
-    splats = stored(means, quats, scales, opacities, sh).splats
-
-    def write(folder: Path) -> None:
-        text = make_page("audit", shown(splats), [("00000", camera)], OPTIONS)
-        (folder / "own.html").write_text(text, encoding="utf-8")
-
-    return _screenshot((), "own", camera, write)
-
-
-def _viewer(name: str, packages: tuple[str, ...], *given):
-    *gaussians, camera, _ = given
-
-    def write(folder: Path) -> None:
-        write_files(folder, stored(*gaussians), camera)
-        for file in (f"{name}.html", "camera.js"):
-            page = resources.files("warp_splat.audit.targets").joinpath(file)
-            (folder / file).write_bytes(page.read_bytes())
-
-    return _screenshot(packages, name, camera, write)
-
-
-spark = partial(_viewer, "spark", ("three@0.187.0", "@sparkjsdev/spark@2.2.0"))
+    tab.set_viewport_size({"width": camera.width, "height": camera.height})
+    tab.goto(f"{address}/page/{page.name}")
+    returned = tab.evaluate(SHOW, [camera_entry(camera), f"/{file}"])
+    tab.screenshot(path=folder / "screen.png")
+    return load_png(folder / "screen.png"), returned

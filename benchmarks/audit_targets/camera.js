@@ -1,0 +1,32 @@
+// A camera of cameras.json in OpenGL's axes: numbers of its pose and projection, column by column. What is nearer than
+// 0.2 is clipped, as by the reference.
+export const pose = ({ position, rotation }) =>
+  [0, 1, 2].flatMap((column) => [...rotation.map((row) => row[column] * (column ? -1 : 1)), 0]).concat(position, 1);
+
+export const projection = ({ width, height, fx, fy, cx, cy }, near = 0.2, far = 1e7) => [
+  2 * fx / width, 0, 0, 0,
+  0, 2 * fy / height, 0, 0,
+  1 - 2 * cx / width, 2 * cy / height - 1, -(far + near) / (far - near), -1,
+  0, 0, -2 * far * near / (far - near), 0];
+
+// The same as a camera of three.js, which may not work it out anew.
+export function placed(camera, entry) {
+  camera.matrixAutoUpdate = false;
+  camera.matrix.fromArray(pose(entry));
+  camera.matrix.decompose(camera.position, camera.quaternion, camera.scale);
+  camera.updateMatrixWorld(true);
+  camera.aspect = entry.width / entry.height;
+  camera.fov = (360 / Math.PI) * Math.atan(entry.height / (2 * entry.fy));
+  [camera.near, camera.far] = [0.2, 1e7];
+  camera.projectionMatrix.fromArray(projection(entry));
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  camera.updateProjectionMatrix = () => {};
+  return camera;
+}
+
+export const frames = async (count, draw) => {
+  for (let i = 0; i < count; i++) {
+    await new Promise((resolve) => setTimeout(() => requestAnimationFrame(resolve), 40));
+    await draw?.();
+  }
+};
