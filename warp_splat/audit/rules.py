@@ -235,6 +235,7 @@ def find_sort(prober: Prober) -> str:
         }.get(both, "Two Gaussians behind each other do not look as in either order.")
     wide = make_camera(65, 49, 30.0, seed=None)
     arrays = balls(wide, [[60.5, 24.5], [24.5, 24.5]], [3.0, 3.3], [9.0, 12.0], 0.7, colors)
+    arrays["scales"] = arrays["scales"] * [1.0, 1.0, 0.1]  # balls as large would reach behind the camera
     key = front(0, 1, wide), front(1, 0, wide)
     return {
         (0, 1): "Gaussians are sorted by depth along the axis.",
