@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.audit.targets.page import draw_by_page
+from warp_splat.audit.targets.pages import draw_by_page
 from warp_splat.audit.targets.program import draw_by_program
 from warp_splat.compare.workloads import Workload
 from warp_splat.errors import InputError

@@ -33,5 +33,5 @@ TARGETS = {
     "stored": NamedRenderer(f"{OWN}.own:stored", settings="adjoint stored"),
     "tape": NamedRenderer(f"{OWN}.own:on_tape", settings="on Warp's tape"),
     "gsplat-function": NamedRenderer(f"{OWN}.own:as_gsplat", settings="warp_splat.gsplat.rasterization"),
-    "page": NamedRenderer(f"{OWN}.page:as_page", settings="export-html, WebGL in software"),
+    "page": NamedRenderer(f"{OWN}.pages:as_page", settings="export-html, WebGL in software"),
 }
