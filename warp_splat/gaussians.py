@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
-from warp_splat.formats.curve import along_curve, arranged
+from warp_splat.formats.curve import ALONE, arranged, keys_of
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.kernels.activation import make_activate, make_adj_activate
@@ -19,6 +19,7 @@ from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import arrays_of, launch_in_lanes
+from warp_splat.runtime.rows import Rows
 
 INITIAL_OPACITY = 0.1
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
@@ -85,10 +86,14 @@ class GaussianModel:
         """A copy on ``device``."""
         return GaussianModel({name: tensor.to(device) for name, tensor in self.parameters.items()})
 
-    def arranged(self) -> GaussianModel:
-        """A copy whose Gaussians come in the order of :func:`along_curve`."""
-        order = along_curve(self.parameters["means"])
-        return GaussianModel({name: tensor[order] for name, tensor in self.parameters.items()})
+    def arranged(self, rows: Rows = ALONE) -> GaussianModel:
+        """A copy whose Gaussians come in the order along the curve; with ``rows``, equal shares of all of them."""
+        moved = self.arranging(rows, [len(self)])
+        return GaussianModel({name: moved(tensor.detach()) for name, tensor in self.parameters.items()})
+
+    def arranging(self, rows: Rows, sizes: Sequence[int]) -> Callable[[torch.Tensor], torch.Tensor]:
+        """A function that puts rows in that order; ``sizes``: of the pieces in which they come."""
+        return rows.sorting(keys_of(self.parameters["means"], rows), sizes)
 
     @classmethod
     def from_points(cls, points: np.ndarray, colors: np.ndarray, sh_degree: int) -> GaussianModel:

@@ -5,6 +5,7 @@ Values are stored before their activation: opacity as a logit, scales as natural
 length. ``f_rest`` is channel-major: all coefficients of red, then of green, then of blue; here they are [N, K, 3].
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.compressed_ply import is_compressed, read_compressed
 from warp_splat.formats.coordinates import comments_of, of_comments
-from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_tables
+from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_parts, write_tables
 from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 from warp_splat.text import Report
@@ -41,15 +42,25 @@ def save_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
     Raises:
         InputError: if a shape disagrees with the others; if the file cannot be written.
     """
-    check_shapes(file.splats)
-    means, sh, opacities, scales, quats = file.splats
+    comments = [ANTIALIASED] * file.antialiased + comments_of(file.coordinates)
+    write_tables(path, {"vertex": _table_of(file.splats)}, comments)
+
+
+def save_ply_parts(path: str | Path, count: int, parts: Iterable[SplatArrays], antialiased: bool = False) -> None:
+    """:func:`save_ply` of ``count`` Gaussians that come in parts; raises InputError as that does."""
+    write_parts(path, "vertex", count, map(_table_of, parts), [ANTIALIASED] * antialiased)
+
+
+def _table_of(splats: SplatArrays) -> np.ndarray:
+    """Gaussians as rows of the file."""
+    check_shapes(splats)
+    means, sh, opacities, scales, quats = splats
     count, coefficients, _ = sh.shape
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
     columns = (means, np.zeros((count, 3)), sh[:, 0], rest, opacities[:, None], scales, quats)
     names = (*POSITION, *NORMAL, *F_DC, *_rest_names(rest.shape[1]), "opacity", *SCALE, *ROTATION)
     table = np.concatenate(columns, axis=1, dtype="<f4")
-    rows = table.view([(name, "<f4") for name in names])[:, 0]
-    write_tables(path, {"vertex": rows}, [ANTIALIASED] * file.antialiased + comments_of(file.coordinates))
+    return table.view([(name, "<f4") for name in names])[:, 0]
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

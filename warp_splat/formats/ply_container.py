@@ -4,7 +4,7 @@ Own code, since no permissively licensed reader of arbitrary properties is well 
 """
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -31,15 +31,29 @@ def write_tables(path: str | Path, tables: Mapping[str, np.ndarray], comments: S
     Raises:
         InputError: if the file cannot be written.
     """
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    for name, rows in tables.items():
-        header += [f"element {name} {len(rows)}"]
-        header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code, *_ in rows.dtype.descr]
-    header += ["end_header", ""]
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write(_header({name: (len(rows), rows.dtype) for name, rows in tables.items()}, comments))
         for rows in tables.values():
             file.write(rows.data)
+
+
+def write_parts(
+    path: str | Path, name: str, count: int, parts: Iterable[np.ndarray], comments: Sequence[str] = ()
+) -> None:
+    """:func:`write_tables` of one table of ``count`` rows, which comes in parts."""
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        for place, rows in enumerate(parts):
+            if not place:
+                file.write(_header({name: (count, rows.dtype)}, comments))
+            file.write(rows.data)
+
+
+def _header(tables: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str]) -> bytes:
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    for element, (count, dtype) in tables.items():
+        header += [f"element {element} {count}"]
+        header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code, *_ in dtype.descr]
+    return "\n".join([*header, "end_header", ""]).encode("ascii")
 
 
 def columns_of(rows: np.ndarray, names: Sequence[str], dtype: str = "f4") -> np.ndarray:

@@ -27,7 +27,7 @@ from warp_splat.raster.checks import (
     explain_invalid,
     own_explained,
 )
-from warp_splat.raster.data import Dropped, Gaussians, Room
+from warp_splat.raster.data import Dropped, Gaussians, Room, Splats2D
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing
@@ -184,9 +184,25 @@ def render(
     The background may be harmonics [16, 3], too: see :func:`put_behind`. With ``room`` for tile instances, a GPU need
     not stop for their number; if there is too little, the view is rendered again.
     """
-    driver, dropped = driver_of(gaussians.means.device), Dropped()
+    dropped = Dropped()
     with stage("project"):
-        splats = project(gaussians, camera, far_reaching(options), driver, dropped)
+        splats = project(gaussians, camera, far_reaching(options), dropped=dropped)
+    return render_splats(splats, gaussians, camera, background, options, adjoint, features, room, dropped)
+
+
+def render_splats(
+    splats: Splats2D,
+    gaussians: Gaussians,
+    camera: Camera | CameraParameters,
+    background: torch.Tensor,
+    options: RasterOptions,
+    adjoint: str = "manual",
+    features: torch.Tensor | None = None,
+    room: Room | None = None,
+    dropped: Dropped | None = None,
+) -> RenderOutput:
+    """:func:`render` of what is projected."""
+    driver, dropped = driver_of(splats.means2d.device), dropped or Dropped()
     seen = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
     crossing = find_crossing(splats, seen)
     copied = around(splats, seen, crossing)
@@ -216,7 +232,7 @@ def render(
         with stage("channels"):
             more = blend_beside(features, gaussians, drawn, camera, blending, crossing)
     if room and room.overflowed():
-        return render(gaussians, camera, background, options, adjoint, features, room)
+        return render_splats(splats, gaussians, camera, background, options, adjoint, features, room, dropped)
     if certificate:
         more |= {"bound": certificate.bound, "rounding": certificate.rounding}
         splats = splats._replace(radii=drawn.radii[: len(splats.radii)])

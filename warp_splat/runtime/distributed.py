@@ -10,14 +10,17 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from typing import TypeVar
 
 import torch
 import torch.distributed as dist
 
 from warp_splat.errors import InputError
 from warp_splat.runtime.devices import is_out_of_memory
+from warp_splat.runtime.rows import Rows
 from warp_splat.runtime.timers import stage
 
+T = TypeVar("T")
 PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
 
 
@@ -25,7 +28,7 @@ class GroupError(InputError):
     """The processes cannot go on together: one has ended, or their models differ."""
 
 
-class Processes:
+class Processes(Rows):
     """One of several processes, all of which call the same methods in the same order; or one that trains alone.
 
     Attributes:
@@ -69,6 +72,20 @@ class Processes:
         """Replace each element of ``tensor`` by its largest value in any process."""
         self._exchange(dist.all_reduce, tensor, dist.ReduceOp.MAX)
 
+    def merge(self, tensor: torch.Tensor, largest: bool = False) -> None:
+        """Sums (or the largest values) of what each process saw of the Gaussians that it holds, in their place."""
+        (self.maximum if largest else self.sum)(tensor)
+
+    def observed(self, rows: torch.Tensor) -> torch.Tensor:
+        """What each process saw of the Gaussians that it holds [n], as a checkpoint keeps it: [count, n]."""
+        return self.gather(rows)
+
+    def restored(self, rows: torch.Tensor, largest: bool = False) -> torch.Tensor:
+        """What :meth:`observed` gave, of this process; the first takes all, if there were more or fewer."""
+        if len(rows) == self.count:
+            return rows[self.rank]
+        return (rows.amax(0) if largest else rows.sum(0)) * (self.rank == 0)
+
     def largest(self, value: int) -> int:
         """The largest ``value`` of all processes."""
         found = torch.tensor([value], dtype=torch.int32)
@@ -81,9 +98,9 @@ class Processes:
         self._exchange(dist.all_gather, found, tensor)
         return torch.stack(found)
 
-    def first(self, text: str) -> str:
-        """What process 0 calls ``text``."""
-        box = [text]
+    def first(self, value: T) -> T:
+        """What process 0 calls ``value``."""
+        box = [value]
         self._exchange(dist.broadcast_object_list, box, 0)
         return box[0]
 
@@ -124,12 +141,13 @@ ALONE = Processes()
 
 
 @contextmanager
-def join(device: str, images: int = 0) -> Iterator[Processes]:
+def join(device: str, images: int = 0, kind: type[Processes] = Processes) -> Iterator[Processes]:
     """The processes that ``torchrun`` started, for as long as the block runs; without it, this one alone.
 
     Args:
         device: "auto", "cpu" or "cuda"; on GPUs, each process of a machine takes another one.
         images: of a step; 0: one for each process.
+        kind: what several processes are.
 
     Raises:
         InputError: if a machine has fewer GPUs than processes, or the processes do not find each other, or cannot
@@ -146,7 +164,7 @@ def join(device: str, images: int = 0) -> Iterator[Processes]:
             f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
             f"({error}); start several processes with torchrun, or unset it."
         ) from error
-    if images % count:
+    if images % count and not kind.sharded:
         raise InputError(f"--views {images}: expected a multiple of {count} processes; give each as many.")
     # torch loads this later anyhow. Its functions would then keep the group of that moment as a default argument.
     # Nothing would end that group or its gloo threads, which abort a process that shuts down around them.
@@ -171,6 +189,6 @@ def join(device: str, images: int = 0) -> Iterator[Processes]:
             f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges ({str(error).splitlines()[0]})."
         ) from error
     try:
-        yield Processes(rank, count, local_count, images)
+        yield kind(rank, count, local_count, images)
     finally:
         dist.destroy_process_group()

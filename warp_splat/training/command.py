@@ -12,11 +12,13 @@ from tqdm import tqdm
 
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
-from warp_splat.formats.checkpoint import Checkpoint, load_checkpoint
+from warp_splat.formats.blocks import load_own
+from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.runtime import pool
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
+from warp_splat.runtime.shards import Shards
 from warp_splat.training import memory
 from warp_splat.training.deadline import plan_training
 from warp_splat.training.loop import train_steps
@@ -42,7 +44,7 @@ def train(config: TrainConfig) -> int:
             saved, has not the hash that ``verify`` asks for.
     """
     check_train(config)
-    with join(config.machine.device, config.learn.views) as processes:
+    with join(config.machine.device, config.learn.views, Shards if config.machine.shard else Processes) as processes:
         if config.report.viewer and processes.count > 1:
             raise InputError("--viewer: expected one process, since others would wait for it; leave it out.")
         return _train(config, processes)
@@ -87,7 +89,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     trainer.warm_up()
     say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
     if begun:
-        restore(trainer, run, load_checkpoint(begun.path))
+        restore(trainer, run, load_own(begun.path, trainer.processes))
         say(f"Continuing after {run.iteration} iterations, from {begun.path}")
         before = begun.facts["options"].get("parts", "").split(",")
         for name in filter(lambda name: name in PARTS and name not in config.used_parts, before):
@@ -105,17 +107,22 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
 def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
     """Train and save; 1 if another process went away."""
     processes = trainer.processes
+    whole = not processes.sharded  # else only what all send makes a model
     with interruptible() as interrupted:
         if viewer:  # only now: who has read it may press Ctrl-C
             print(viewer.viewer.announcement, flush=True)
         try:
             train_steps(trainer, run, interrupted, viewer)
+            whole = True
         except GroupError as error:  # said here, where torchrun's SIGTERM does not end this process yet
             tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
             return 1
         finally:  # whatever happened, the model comes first
-            if processes.rank == 0 or processes.lost:
-                run.saved = save_model(trainer, run)
+            if whole:
+                run.saved = (
+                    save_model(trainer, run) if processes.lost else trainer.lead(lambda: save_model(trainer, run))
+                )
+            if run.saved:
                 print(f"Model after {run.iteration} iterations: {run.saved}")
             if run.kept is not None and run.iteration < trainer.config.learn.end:
                 print(f"To continue after iteration {run.kept}: {how_to_continue(run.folder, processes)}")
@@ -127,8 +134,9 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say)
     end = trainer.config.learn.end
     if viewer:
         viewer.show_end()
-    if trainer.processes.rank == 0:
-        finish(trainer, run, say)
+    run.gaussians = trainer.processes.total(len(trainer.model))
+    trainer.model = trainer.model.arranged(trainer.processes)  # as in the file: at one depth, the first is in front
+    trainer.lead(lambda: finish(trainer, run, say))
     if viewer and run.iteration >= end:
         viewer.linger()
     if run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration):

@@ -89,7 +89,7 @@ def _do_what_is_due(trainer: Trainer, run: Run, interrupted: list[int], bar: tqd
     if stop and not check:  # after the checkpoint: a run that goes on from there never had this record
         _check(trainer, run, bar, whole=False)
     if processes.reaches(run.iteration, report.save_iterations) and not stop:
-        save_or_warn(trainer, run)
+        trainer.lead(lambda: save_or_warn(trainer, run))
     return stop
 
 
@@ -105,8 +105,12 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
     trainer.check_identical(run.iteration)
     losses, run.losses = run.losses, []
-    if trainer.processes.rank > 0:
-        return
+    run.gaussians = trainer.processes.total(len(trainer.model))
+    trainer.lead(lambda: _measure(trainer, run, bar, whole, losses))
+
+
+def _measure(trainer: Trainer, run: Run, bar: tqdm, whole: bool, losses: list[torch.Tensor]) -> None:
+    """What the first process does of :func:`_check`."""
     split, views = trainer.scene.evaluated
     if not whole:
         views = views[:: -(-len(views) // PROGRESS_VIEWS)]
@@ -115,7 +119,7 @@ def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
         "iteration": run.iteration,
         "loss": float(np.mean(values)),
         "psnr": trainer.evaluate(views),
-        "gaussians": len(trainer.model),
+        "gaussians": run.gaussians,
         "seconds": run.seconds,
     }
     run.history.append(record)

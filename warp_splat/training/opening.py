@@ -10,7 +10,8 @@ from tqdm import tqdm
 from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
-from warp_splat.formats.checkpoint import LAST, Checkpoint, load_checkpoint, remove_leftovers
+from warp_splat.formats.blocks import load_own
+from warp_splat.formats.checkpoint import LAST, Checkpoint, remove_leftovers
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.ply import save_points
 from warp_splat.kernels.compiler import PORTABLE
@@ -48,7 +49,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         raise InputError("portable: expected to be set before kernels are loaded; set WARP_SPLAT_PORTABLE=1 instead.")
     begun = None
     if data.start_checkpoint:  # whole, without its arrays: beside the trainer's they would take as much memory again
-        begun = replace(load_checkpoint(data.start_checkpoint), arrays={})
+        begun = replace(load_own(data.start_checkpoint, processes), arrays={})
     if begun and (kept := load_options(begun.path)["portable"]) != PORTABLE:
         expected, here = ("1", "unset") if kept else ("unset", "1")
         raise InputError(

@@ -155,11 +155,11 @@ class Optimizer:
             moments = [torch.cat([moment[kept], nothing.to(moment)]) for moment in table.moments]
             self._put(name, torch.cat([table.leaf.detach()[kept], rows]), moments)
 
-    def arrange(self, order: torch.Tensor) -> None:
-        """Put the rows in ``order`` (indices), moments and all."""
+    def arrange(self, moved: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        """Put the rows, moments and all, into the order that ``moved`` gives them."""
         for name in self.model.NAMES:
             table = self.tables[name]
-            self._put(name, table.leaf.detach()[order], [moment[order] for moment in table.moments])
+            self._put(name, moved(table.leaf.detach()), [moved(moment) for moment in table.moments])
 
     def reset_opacities(self, ceiling: float) -> None:
         """Lower every opacity to at most ``ceiling`` and forget its moments."""

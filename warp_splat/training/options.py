@@ -143,6 +143,7 @@ class MachineOptions:
     device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = machinery("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
     threads: int = machinery(0, "CPU threads of a process; 0: all cores, or its share (results do not depend on it)")
+    shard: bool = machinery(False, "each process that torchrun starts holds a share of the Gaussians, not all of them")
     portable: bool = machinery(
         False, "multiply and add apart, as processors without fused multiply-adds do: slower, the same bytes there, too"
     )

@@ -48,20 +48,25 @@ class Photographs:
         """The step from which photographs have their full size."""
         return self.config.learn.coarse_until_iter * self.shares[-1] if self.shares else 0.0
 
-    def at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
-        """Camera and photograph of ``view`` at the size of this iteration, the photograph on the device."""
-        learn = self.config.learn
-        shrink = shrink_at(learn, self.shares, iteration)
+    def camera_at(self, view: View, iteration: int) -> Camera:
+        """The camera of ``view`` at the size of this iteration."""
+        shrink = shrink_at(self.config.learn, self.shares, iteration)
         if shrink != self._shrink:
             self._shrink = shrink
             self.kept.clear()
         width, height = (max(size // shrink, 1) for size in (view.camera.width, view.camera.height))
-        camera = view.camera if shrink == 1 else view.camera.resized(width, height)
+        return view.camera if shrink == 1 else view.camera.resized(width, height)
+
+    def at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
+        """Camera and photograph of ``view`` at the size of this iteration, the photograph on the device."""
+        camera = self.camera_at(view, iteration)
         if view not in self.kept:
             with stage("photographs"):
                 alpha = view.alpha if self.with_alpha else None
                 planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
-                self.kept[view] = Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
+                self.kept[view] = Photograph(
+                    *(None if p is None else self._resized(p, camera.height, camera.width) for p in planes)
+                )
         here = (None if p is None else p.to(self.device, non_blocking=True) for p in self.kept[view])
         return camera, Photograph(*here)
 

@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,6 +19,7 @@ from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.atomic import write_json
+from warp_splat.formats.blocks import save_in_blocks
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
 from warp_splat.formats.colmap_text import write_colmap
 from warp_splat.formats.exposures import write_exposures
@@ -42,6 +44,7 @@ class Run:
     history: list[dict[str, float]] = field(default_factory=list)
     losses: list[torch.Tensor] = field(default_factory=list)  # since the last record, scalars on the device
     iteration: int = 0
+    gaussians: int = 0  # of all processes, when last measured
     seconds: float = 0.0  # of training steps alone, without evaluations and pictures
     spent: float = 0.0  # seconds since the first step, with evaluations, without pauses
     preview: float = 0.0  # when last drawn
@@ -62,13 +65,12 @@ def warn(error: Exception) -> None:
 def save_model(trainer: Trainer, run: Run) -> Path:
     """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
     path = model_folder.ply_path(run.folder, run.iteration)
-    antialiased = trainer.config.model.antialiasing
     try:
-        trainer.model.save(path, antialiased)
+        trainer.save(path)
     except InputError as error:
         warn(error)
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
-        trainer.model.save(path, antialiased)
+        trainer.save(path)
         tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
     try:
         _save_cameras(trainer, run.folder, path.parent)
@@ -97,8 +99,6 @@ def _save_cameras(trainer: Trainer, folder: Path, beside: Path) -> None:
 
 def save_or_warn(trainer: Trainer, run: Run) -> None:
     """Save before the end: training goes on if that fails."""
-    if trainer.processes.rank > 0:
-        return
     try:
         save_model(trainer, run)
     except (InputError, OSError) as error:
@@ -108,10 +108,12 @@ def save_or_warn(trainer: Trainer, run: Run) -> None:
 def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
     """Write a checkpoint, in the place of the last one; ``named``: and one that stays. Training goes on if that fails.
 
-    All processes call this, where :meth:`Trainer.state` says; the first one writes.
+    All processes call this, where :meth:`Trainer.state` says; the first one writes, and each its own Gaussians.
     """
     tensors, facts = trainer.state()
-    if trainer.processes.rank == 0:
+    processes = trainer.processes
+    save = partial(save_in_blocks, processes) if processes.sharded else save_checkpoint
+    if processes.sharded or processes.rank == 0:
         if run.losses:
             tensors["losses"] = torch.stack(run.losses)
         options = {name: value for name, value in trainer.config.flat().items() if name not in OF_ONE_RUN}
@@ -120,7 +122,7 @@ def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
         arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
         try:
             for name in [LAST, f"chkpnt{run.iteration}.safetensors"][: 1 + named]:
-                save_checkpoint(run.folder / name, arrays, facts)
+                save(run.folder / name, arrays, facts)
             run.kept = run.iteration
         except InputError as error:
             warn(error)
@@ -166,7 +168,6 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     wall = time.perf_counter() - run.start
     with run.saved.open("rb") as file:
         run.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    trainer.model = trainer.model.arranged()  # as in the file: at one depth, the first is drawn in front
     split, views = trainer.scene.evaluated
     write_json(run.folder / "history.json", run.history)  # now, since the evaluation may fail
     plot = run.folder / "training.png"
@@ -175,7 +176,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     extra = {
         "split": split,
         "iterations": run.iteration,
-        "gaussians": len(trainer.model),
+        "gaussians": run.gaussians,
         "sha256": run.sha256,
         "seconds": round(wall, 2),
         "iterations_per_second": round(run.iteration / run.seconds, 2),
@@ -203,7 +204,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
     print(
         f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
-        f"{split} {metrics_line(means)}, {len(trainer.model)} Gaussians"
+        f"{split} {metrics_line(means)}, {run.gaussians} Gaussians"
     )
     for name, where in lines:
         print(f"  {name:9s} {where}")

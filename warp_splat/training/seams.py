@@ -39,6 +39,7 @@ Both may have, the growth after the parts:
     load()                                  compile and load the kernels that they launch, before the first step
     asks(options, step) -> options          what they need of the renderer in this step: depth, ...
     loss(loss, out, step) -> loss           a scalar, which is differentiated
+    price(gaussians) -> price               a scalar that is added to it: what Gaussians cost by themselves
     after_step(iteration)                   after Adam
     state() -> {name: tensor}               what a checkpoint keeps besides ``parameters``, by names that no other has
     restore(checkpoint)                     take that back; raise InputError if it does not fit

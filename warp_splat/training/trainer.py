@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,13 +20,14 @@ from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.exposures import Exposures
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
-from warp_splat.raster.api import RenderOutput, render
+from warp_splat.raster.api import RenderOutput, render, render_splats
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.data import Room
+from warp_splat.raster.data import Gaussians, Room, Splats2D
 from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load
+from warp_splat.runtime.shards import Shards
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.growth import GROWTHS
@@ -35,6 +37,7 @@ from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import Deck, Photographs
 from warp_splat.training.seams import Setting, Step, having
+from warp_splat.training.sharded import Blocks, Observed
 
 T = TypeVar("T")
 #: What is kept from spreading because it is not finite: pixels with an upstream gradient that is not; gradients of
@@ -75,7 +78,8 @@ class Trainer:
             model = GaussianModel.from_splats(scene.start.splats, config.model.sh_degree)
         else:
             model = GaussianModel.from_points(scene.points, scene.colors, config.model.sh_degree)
-        self.model = model.arranged().to(self.device)
+        arranged, own = model.arranged(), processes.own(len(model))
+        self.model = GaussianModel({name: rows[own] for name, rows in arranged.parameters.items()}).to(self.device)
         self.background = torch.full((3,), float(config.data.white_background), device=self.device)
         seed, limit, growth = config.learn.seed, config.grow.max_gaussians, config.grow.growth
         setting = Setting(scene, self.model, self.background, processes, seed, limit, config.learn.iterations)
@@ -87,11 +91,12 @@ class Trainer:
         self.dropped: Counter = Counter()  # of NOT_FINITE, on the device; prunings that would have emptied the scene
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = 0
+        self.blocks = Blocks(self, processes) if isinstance(processes, Shards) else None
         self.deck = Deck(scene.train, seed)
         self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
         self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
-        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)  # largest in the last step
+        self._radii = self.model.parameters["means"].new_zeros(len(self.model), dtype=torch.int32)  # in the last step
 
     def differentiate(self, iteration: int) -> torch.Tensor:
         """Gradients of the loss of a step's views; returns the loss, a scalar. Means over all views of all processes.
@@ -102,22 +107,22 @@ class Trainer:
         unsettled and renders several dB worse.
         """
         self._set_iteration(iteration)
-        self._radii = torch.zeros(len(self.model), dtype=torch.int32, device=self.device)
+        self._radii = self._radii.new_zeros(len(self.model))  # largest in any view
         steps = [Step(iteration, view, place) for place, view in enumerate(self.deck.deal(self.processes.images))]
-        first, *others = map(self._differentiate, steps[self.processes.rank :: self.processes.count])
-        loss = sum(others, first)
+        own = steps[self.processes.rank :: self.processes.count]
+        losses = self.blocks.differentiate(steps) if self.blocks else [self.differentiate_view(step) for step in own]
+        loss = sum(losses[1:], losses[0])
         if self.config.learn.optimizer_type == "sparse_adam":
-            self.processes.maximum(self._radii)
+            self.processes.merge(self._radii, largest=True)
         self.processes.average([*self.model.gradients(self.degree), *self.optimizer.part_gradients(), loss])
         return loss
 
-    def _differentiate(self, step: Step) -> torch.Tensor:
-        """Add the gradients of one view; returns its loss."""
-        learn, iteration = self.config.learn, step.iteration
-        camera, photograph = self.photographs.at_size(step.view, iteration)
-        options = self._through("asks", self.options, step)
+    def differentiate_view(self, step: Step, splats: Splats2D | None = None) -> torch.Tensor:
+        """Add the gradients of one view, down to its ``splats``, if they are given; returns its loss."""
+        camera, photograph = self.photographs.at_size(step.view, step.iteration)
+        options = self.options_at(step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
-        out = self._render(camera, background, options, self.room)
+        out = self._render(camera, background, options, self.room, splats)
         out.means2d.retain_grad()
         image = self._through("image", out.image, out, step)
         photograph = self._through("photograph", photograph, step)
@@ -125,16 +130,33 @@ class Trainer:
         if self.scene.linear:
             image, target = (LOSS_CURVES[self.config.data.loss_space](picture) for picture in (image, target))
         # clamped as in the reference's renderer: what is too bright learns nothing from being brighter still
-        loss = image_loss(image, target, learn.lambda_dssim, photograph.mask, clamped=not self.scene.linear)
+        share = self.config.learn.lambda_dssim
+        loss = image_loss(image, target, share, photograph.mask, clamped=not self.scene.linear)
         loss = self._through("loss", loss, out, step)
+        for price in [] if splats else self.prices(out.gaussians):
+            loss = loss + price.to(loss.dtype)
         loss.backward(self._one)
-        with stage("densify"):
-            for observe in having([self.growth] if learn.grows_at(iteration) else [], "observe"):
-                observe(out, step)
+        if not splats:
+            self.see(out, step)
         dropped = (out.dropped.pixel_count, out.dropped.gaussian_count, out.invalid_count)
         self.dropped.update(dict(zip(NOT_FINITE, dropped, strict=True)))
-        self._radii = torch.maximum(self._radii, out.radii)
         return loss.detach()
+
+    def options_at(self, step: Step) -> RasterOptions:
+        """What the renderer is to compute in a step."""
+        return replace(self._through("asks", self.options, step), sh_degree=self.degree)
+
+    def prices(self, gaussians: Gaussians) -> list[torch.Tensor]:
+        """What Gaussians cost by themselves, in each view."""
+        return [price(gaussians) for price in having((*self.parts, self.growth), "price")]
+
+    def see(self, out: RenderOutput | Observed, step: Step) -> None:
+        """Note what a view showed of the Gaussians."""
+        with stage("densify"):
+            grows = self.config.learn.grows_at(step.iteration)
+            for observe in having([self.growth] if grows else [], "observe"):
+                observe(out, step)
+        self._radii = torch.maximum(self._radii, out.radii)
 
     def _through(self, method: str, value: T, *arguments: Any) -> T:
         """What the parts and then the growth make of ``value``, one after another."""
@@ -174,7 +196,8 @@ class Trainer:
 
     def check_identical(self, iteration: int) -> None:
         """Raise GroupError if the model is not the same, byte for byte, in all processes."""
-        self.processes.check_identical([*self.model.parameters.values(), *self.optimizer.parts.values()], iteration)
+        own = [] if self.blocks else self.model.parameters.values()
+        self.processes.check_identical([*own, *self.optimizer.parts.values()], iteration)
 
     def all_dropped(self) -> dict[str, int]:
         """What was dropped so far, by name, over all processes."""
@@ -233,9 +256,12 @@ class Trainer:
         background: torch.Tensor,
         options: RasterOptions,
         room: Room | None = None,
+        splats: Splats2D | None = None,
     ) -> RenderOutput:
         with stage("project"):
             gaussians = self.model.activated(self.degree)
+        if splats:
+            return render_splats(splats, gaussians, camera, background, options, self.config.model.adjoint, room=room)
         options = replace(options, sh_degree=self.degree)
         return render(gaussians, camera, background, options, self.config.model.adjoint, room=room)
 
@@ -247,7 +273,20 @@ class Trainer:
     def look(self, camera: Camera, depth: bool = False) -> RenderOutput:
         """The present model seen by ``camera``, without gradients; nothing of the training changes."""
         with torch.no_grad():
-            return self._render(camera, self.behind, replace(self.options, depth=depth))
+            options = replace(self.options, depth=depth, sh_degree=self.degree)
+            splats = self.blocks.ask("show", camera, options) if self.blocks else None
+            return self._render(camera, self.behind, options, splats=splats)
+
+    def lead(self, do: Callable[[], T]) -> T | None:
+        """What process 0 does while the others wait; what it looks at, it sees of the Gaussians of all."""
+        if self.blocks:
+            return self.blocks.lead(do)
+        return do() if self.processes.rank == 0 else None
+
+    def save(self, path: Path) -> None:
+        """Write the model. Raises InputError if that fails."""
+        save = self.blocks.save if self.blocks else self.model.save
+        save(path, self.config.model.antialiasing)
 
     @property
     def exposures(self) -> Exposures | None:

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import activate, logarithm
 from warp_splat.training.growth import ReferenceOptions, check_budget
 from warp_splat.training.growth.reference import Reference, rotate, survivors
@@ -25,7 +24,7 @@ class Budget(Reference):
 
     def __init__(self, options: ReferenceOptions, setting: Setting, optimizer: Optimizer):
         super().__init__(options, setting, optimizer)
-        self.start = len(self.model)
+        self.start = self.processes.total(len(self.model))
         self.end = min(options.densify_until_iter, setting.iterations)
         check_budget("budget", setting.max_gaussians)
 
@@ -59,31 +58,30 @@ class Budget(Reference):
         return self.start + round((self.setting.max_gaussians - self.start) * share)
 
     def _grow(self, due: int) -> Change | None:
-        self.processes.sum(self.gradient)
-        self.processes.sum(self.views)
+        self.processes.merge(self.gradient)
+        self.processes.merge(self.views)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
-        keep = survivors(raw)
-        if (kept := int(keep.sum())) >= due:
-            keep &= ~self._faintest(keep, kept - due)
-        kept = int(keep.sum())
-        pruned, room = len(keep) - kept, min(max(due - kept, 0), kept)
+        keep, total = survivors(raw), self.processes.total
+        if (kept := total(int(keep.sum()))) >= due:
+            keep &= ~self._faintest(keep, max(round(MOVED * kept), kept - due))
+        kept = total(int(keep.sum()))
+        pruned, room = total(len(keep)) - kept, min(max(due - kept, 0), kept)
         if not pruned + room or not kept:  # an empty scene could never recover
             self.clear()
             return None if kept else Change(0, 0, 0, refused=True)
         gradient = self.gradient / self.views.clamp_min(1.0)
         score = torch.where(keep, gradient.nan_to_num(0.0, 0.0, 0.0), -1.0)
-        split = torch.sort(torch.sort(score, descending=True, stable=True).indices[:room]).values
+        split = self.processes.lowest(-score, room).nonzero()[:, 0]
         keep[split] = False
         self.optimizer.replace(keep.nonzero()[:, 0], halves(raw, split))
-        self.optimizer.arrange(along_curve(self.model.parameters["means"]))
+        sizes = [int(keep.sum()), len(split), len(split)]
+        self.optimizer.arrange(self.model.arranging(self.processes, sizes))
         self.clear()
         return Change(0, len(split), pruned)
 
-    def _faintest(self, keep: torch.Tensor, excess: int) -> torch.Tensor:
-        """A share of the Gaussians, of the lowest opacity, or the ``excess`` if that is more [N]."""
-        logits = torch.where(keep, self.model.parameters["opacities"].detach(), torch.inf)
-        order = torch.sort(logits, stable=True).indices
-        return torch.zeros_like(keep).index_fill_(0, order[: max(round(MOVED * int(keep.sum())), excess)], True)
+    def _faintest(self, keep: torch.Tensor, count: int) -> torch.Tensor:
+        """The ``count`` Gaussians of the lowest opacity [N]."""
+        return self.processes.lowest(torch.where(keep, self.model.parameters["opacities"].detach(), torch.inf), count)
 
     def state(self) -> dict[str, torch.Tensor]:
         """As the reference's, and how many Gaussians there were at the start."""

@@ -12,15 +12,14 @@ import numpy as np
 import torch
 
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import activate, logarithm
-from warp_splat.raster.api import RenderOutput
+from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.training.growth import ReferenceOptions, check_budget
 from warp_splat.training.growth.reference import LEVELS, PRUNE_OPACITY, normals, rotate, survivors
 from warp_splat.training.optimizer import Optimizer
-from warp_splat.training.seams import Change, Setting, Step
+from warp_splat.training.seams import Change, Setting
 
 NOISE = 5e5  # times the means' rate and the covariance
 SHARPNESS = 100.0  # of the fall of the noise around the opacity at which a Gaussian is dead
@@ -41,23 +40,23 @@ class Mcmc:
         self.options, self.setting, self.optimizer = options, setting, optimizer
         self.model, self.processes = setting.model, setting.processes
         self.random = torch.Generator().manual_seed(setting.seed)
-        check_budget("mcmc", setting.max_gaussians, len(self.model))
+        check_budget("mcmc", setting.max_gaussians, self.processes.total(len(self.model)))
 
-    def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
-        """Add the prices on opacity and on size (equation 14)."""
-        opacities, scales = out.gaussians.opacities, out.gaussians.scales
-        price = PRICE_OPACITY * in_pairs(opacities.nan_to_num()) / max(len(opacities), 1)
-        price = price + PRICE_SCALE * in_pairs(scales.nan_to_num().reshape(-1)) / max(scales.numel(), 1)
-        return loss + price.to(loss.dtype)
+    def price(self, gaussians: Gaussians) -> torch.Tensor:
+        """On opacity and on size (equation 14)."""
+        opacities, scales = gaussians.opacities, gaussians.scales
+        count = max(self.processes.total(len(opacities)), 1)
+        price = PRICE_OPACITY * in_pairs(opacities.nan_to_num()) / count
+        return price + PRICE_SCALE * in_pairs(scales.nan_to_num().reshape(-1)) / (3 * count)
 
     @torch.no_grad()
     def after_step(self, iteration: int) -> None:
         """Move the means of faint Gaussians at random, by their covariances (equation 9)."""
         raw = self.model.parameters
         scales, opacities = activate(raw["scales"].detach(), raw["opacities"].detach())
-        if driver_of(scales.device).peeks:
+        if driver_of(scales.device).peeks or self.processes.sharded:
             faint = (opacities < STILL).nonzero()[:, 0]
-            drawn = normals()[torch.randint(LEVELS, (len(faint), 3), generator=self.random)]
+            drawn = normals()[self.processes.draw(self.random, LEVELS, [len(faint)])].to(scales)
         else:  # the host would wait for their number: a GPU draws for all, and their gates tell them apart
             faint, seed = slice(None), int(torch.randint(2**62, (), generator=self.random))
             random = torch.Generator(scales.device).manual_seed(seed)
@@ -78,19 +77,23 @@ class Mcmc:
             return None
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         keep = survivors(raw)
-        kept, before = int(keep.sum()), len(keep)
+        kept, before = (self.processes.total(count) for count in (int(keep.sum()), len(keep)))
         due = max(min(math.ceil((1.0 + GAIN) * before), self.setting.max_gaussians), before)
         if not kept or due == kept:
             return None if kept else Change(0, 0, 0, refused=True)
         alive = keep.nonzero()[:, 0]
-        edges = np.cumsum(activate(raw["scales"], raw["opacities"])[1][alive].cpu().double().numpy())
+        opacities = activate(raw["scales"], raw["opacities"])[1][alive]
+        begin, edges, end = self.processes.running_sums(opacities.cpu().double().numpy())
         drawn = torch.randint(DRAWS, (due - kept,), generator=self.random).double().numpy() / DRAWS
-        chosen = np.searchsorted(edges, drawn * edges[-1], side="right").clip(max=kept - 1)  # likelier, if more opaque
+        drawn = np.minimum(drawn * end, np.nextafter(end, 0.0))
+        drawn = drawn[(drawn >= begin) & (drawn < edges[-1:].sum())]  # where own Gaussians are
+        chosen = np.searchsorted(edges, drawn, side="right")  # likelier, if more opaque
         sources, times = np.unique(chosen, return_counts=True)
         rows = alive[torch.from_numpy(sources).to(alive.device)]
         keep[rows] = False
         self.optimizer.replace(keep.nonzero()[:, 0], crowds(raw, rows, torch.from_numpy(times + 1)))
-        self.optimizer.arrange(along_curve(self.model.parameters["means"]))
+        sizes = [int(keep.sum()), int((times + 1).sum())]
+        self.optimizer.arrange(self.model.arranging(self.processes, sizes))
         return Change(due - kept, 0, before - kept)
 
     def grows(self, iterations: int) -> bool:

@@ -9,7 +9,6 @@ import torch
 import warp as wp
 
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import activate
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput
@@ -37,7 +36,7 @@ class Reference:
 
     def told(self) -> list[str]:
         """What may surprise about the limit, as sentences."""
-        limit, start = self.setting.max_gaussians, len(self.model)
+        limit, start = self.setting.max_gaussians, self.processes.total(len(self.model))
         if not 0 < limit < start:
             return []
         return [f"Warning: --max_gaussians {limit} bounds growth alone; training starts with all {start} Gaussians."]
@@ -88,7 +87,7 @@ class Reference:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Statistics since the last densification, [R, N] with a row for each process, and the random state."""
-        found = {f"statistics.{name}": self.processes.gather(rows) for name, rows in self.statistics().items()}
+        found = {f"statistics.{name}": self.processes.observed(rows) for name, rows in self.statistics().items()}
         return {**found, "random.densification": self.random.get_state()}
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -97,16 +96,13 @@ class Reference:
         for name, own in self.statistics().items():
             dtype = np.int32 if name == "radius" else np.float32
             rows = torch.from_numpy(checkpoint.array(f"statistics.{name}", (-1, len(self.model)), dtype))
-            if len(rows) != self.processes.count:  # the first takes all
-                rows = rows.amax(0, keepdim=True) if name == "radius" else rows.sum(0, keepdim=True)
-                rows = torch.nn.functional.pad(rows, (0, 0, 0, self.processes.count - 1))
-            own.copy_(rows[self.processes.rank])
+            own.copy_(self.processes.restored(rows, largest=name == "radius"))
         self.random.set_state(torch.from_numpy(checkpoint.generator("random.densification")))
 
     def _densify(self, prune_large: bool) -> Change:
-        self.processes.sum(self.gradient)
-        self.processes.sum(self.views)
-        self.processes.maximum(self.radius)
+        self.processes.merge(self.gradient)
+        self.processes.merge(self.views)
+        self.processes.merge(self.radius, largest=True)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         chosen = self._choose()
         splits = raw["scales"].amax(1) > _log(self.options.percent_dense * self.extent)
@@ -118,29 +114,29 @@ class Reference:
             keep &= self.radius <= self.options.prune_screen_size
         keep[split] = False
         pruned = len(keep) + len(keep_added) - int(keep.sum()) - int(keep_added.sum()) - len(split)
-        if not bool(keep.any()) and not bool(keep_added.any()):  # an empty scene could never recover
+        if not self.processes.total(int(keep.sum()) + int(keep_added.sum())):  # an empty scene could never recover
             self.clear()
             return Change(0, 0, 0, refused=True)
         self.optimizer.replace(keep.nonzero()[:, 0], {name: rows[keep_added] for name, rows in added.items()})
-        self.optimizer.arrange(along_curve(self.model.parameters["means"]))
+        pieces = [keep, *keep_added.split([len(clone), len(split), len(split)])]
+        self.optimizer.arrange(self.model.arranging(self.processes, [int(piece.sum()) for piece in pieces]))
         self.clear()
         return Change(len(clone), len(split), pruned)
 
     def _choose(self) -> torch.Tensor:
         """Gaussians whose mean gradient is over the threshold, ascending; the largest first where room is short."""
         mean = self.gradient / self.views.clamp_min(1.0)
-        over = (mean >= self.options.densify_grad_threshold).nonzero()[:, 0]
-        room = max(self.setting.max_gaussians - len(self.model), 0)
-        if self.setting.max_gaussians and len(over) > room:
-            largest = torch.sort(mean[over], descending=True, stable=True).indices[:room]
-            over = torch.sort(over[largest]).values
-        return over
+        over = mean >= self.options.densify_grad_threshold
+        room = max(self.setting.max_gaussians - self.processes.total(len(self.model)), 0)
+        if self.setting.max_gaussians and self.processes.total(int(over.sum())) > room:
+            over &= self.processes.lowest(torch.where(over, -mean, torch.inf), room)
+        return over.nonzero()[:, 0]
 
     def _children(self, raw: dict[str, torch.Tensor], split: torch.Tensor) -> dict[str, torch.Tensor]:
         """Two samples of each Gaussian in ``split``, smaller than it."""
         twice = split.repeat(2)
         rows = {name: tensor[twice] for name, tensor in raw.items()}
-        drawn = torch.randint(LEVELS, (len(twice), 3), generator=self.random)  # on the host: the same on any device
+        drawn = self.processes.draw(self.random, LEVELS, [len(split)] * 2)
         offsets = activate(rows["scales"], rows["opacities"])[0] * normals()[drawn].to(twice.device)
         rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
         rows["scales"] = rows["scales"] - math.log(SPLIT_SHRINK)

@@ -2,11 +2,11 @@
 
 import torch
 
-from warp_splat.raster.api import RenderOutput
+from warp_splat.raster.data import Gaussians
 from warp_splat.scene.coverage import few_photographs
 from warp_splat.scene.types import Scene
 from warp_splat.training.parts import FloatersOptions
-from warp_splat.training.seams import Setting, Step, Verdict
+from warp_splat.training.seams import Setting, Verdict
 
 FEW = 25  # photographs that show a point, from which on there is little room for floaters: not worth a trial
 
@@ -17,16 +17,16 @@ class Floaters:
     tried = True
 
     def __init__(self, options: FloatersOptions, setting: Setting):
-        self.weight = options.opacity_reg
+        self.weight, self.processes = options.opacity_reg, setting.processes
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If few photographs show the same: what hangs before some of them is not seen by the others."""
         return Verdict(*few_photographs(scene, FEW))
 
-    def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
-        """Add the term; its gradient is the weight / N for each opacity."""
-        opacities = out.gaussians.opacities.nan_to_num()
+    def price(self, gaussians: Gaussians) -> torch.Tensor:
+        """The term; its gradient is the weight / N for each opacity."""
+        opacities = gaussians.opacities.nan_to_num()
         # Now multiples of 2^-23: in float64 their sum is exact, and the same in any order.
         total = (opacities + 1.0 - 1.0).double().sum()
-        return loss + (self.weight * (total / max(len(opacities), 1))).to(loss.dtype)
+        return self.weight * (total / max(self.processes.total(len(opacities)), 1))
