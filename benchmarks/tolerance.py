@@ -32,6 +32,7 @@ import matplotlib.pyplot as plt
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 HEADERS = ("scene", "options", "error, worst", "error, median", "bound, worst", "bound, median", "bound : error")
 HEADERS += ("times default", "adjoint")
+PLOTTED = ("extent", "exp_degree", "max_steps")  # and not in the table
 ROUNDS = 2
 
 
@@ -156,7 +157,10 @@ def plot(path: Path, rows: list[dict]) -> None:
 def write(rows: list[dict], extreme: list[dict], count: int, out: Path | None) -> None:
     """The table, and the plot."""
     keys = ("worst", "median", "bound", "bound_median", "ratio", "times", "adjoint")
-    cells = [(row["scene"], row["options"], *(f"{row[key]:.2g}" if key in row else "" for key in keys)) for row in rows]
+    shown = [row for row in rows if row["curve"] not in PLOTTED]
+    cells = [
+        (row["scene"], row["options"], *(f"{row[key]:.2g}" if key in row else "" for key in keys)) for row in shown
+    ]
     ratios = sorted(row["ratio"] for row in extreme)
     exceeded = sum(row.get("exceeded", 0) for row in rows + extreme)
     costs = [f"{row['scene']} {row['cost of bound']:.2f}" for row in rows if "cost of bound" in row]

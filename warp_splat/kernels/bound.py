@@ -106,12 +106,19 @@ def brightness(color: wp.vec3, usual: float):
     return wp.max(wp.max(color) / usual, 1.0)
 
 
-@wp.func
-def skipped(raw: Any, alpha_min: float, color: wp.vec3, bound: BoundView, before: Any):
-    """Add alpha that the cut leaves out, and the ideal does not, by its :func:`brightness`."""
-    none = fill(0.0, raw)
-    left_out = where_less(raw, fill(alpha_min, raw), where_less(raw, fill(bound.floor, raw), none, raw), none)
-    return fma(left_out, fill(brightness(color, bound.usual), raw), before)
+@functools.cache
+def make_skipped(floor: bool) -> wp.Function:
+    """What adds alpha that the cut leaves out, by its :func:`brightness`; with ``floor``, the ideal has one."""
+
+    @wp.func
+    def skipped(raw: Any, alpha_min: float, color: wp.vec3, bound: BoundView, before: Any):
+        none = fill(0.0, raw)
+        left_out = where_less(raw, fill(alpha_min, raw), raw, none)
+        if wp.static(floor):
+            left_out = where_less(raw, fill(bound.floor, raw), none, left_out)
+        return fma(left_out, fill(brightness(color, bound.usual), raw), before)
+
+    return skipped
 
 
 @wp.func
@@ -185,8 +192,8 @@ def short_axis(conic: wp.vec3):
 
 
 @wp.func
-def alpha_error(rules: Rules, mean: wp.vec2, conic: wp.vec3, spread: wp.vec2, size: float, z: float, q: float):
-    """Relative error of alpha at the exponent ``q`` (docs/tolerance.md, Rounding).
+def conditions(rules: Rules, mean: wp.vec2, conic: wp.vec3, spread: wp.vec2, size: float, z: float):
+    """How much rounding changes the exponent, relative, and the place, in standard deviations (docs/tolerance.md).
 
     ``spread``: standard deviations along x and y [px]; ``size``: the largest scale; ``z``: depth.
     """
@@ -197,7 +204,13 @@ def alpha_error(rules: Rules, mean: wp.vec2, conic: wp.vec3, spread: wp.vec2, si
     long = most * size / z
     condition = wp.sqrt((3.0 * aside * long * long + wp.dot(spread, spread)) / short)
     shift = EPS * (2.5 * aside * most + wp.length(mean) + wp.length(rules.principal))
-    return rules.exp_error + 16.0 * EPS * (1.0 + condition * q) + wp.sqrt(2.0 * q / short) * shift
+    return 16.0 * EPS * condition, shift / wp.sqrt(short)
+
+
+@wp.func
+def alpha_error(rules: Rules, condition: float, shift: float, q: float):
+    """Relative error of alpha at the exponent ``q``, from :func:`conditions`."""
+    return rules.exp_error + 16.0 * EPS + condition * q + wp.sqrt(2.0 * q) * shift
 
 
 @functools.cache
@@ -206,24 +219,17 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
     reach_of, fall_at = falloff.reach_of, falloff.value
 
     @wp.func
-    def beyond(maps: wp.array4d[int], box: wp.vec4i, mean: wp.vec2, sigma: wp.vec2, most: float):
-        """The largest alpha to the left of a box of blocks, to its right, above and below it, rounded up.
-
-        Nothing is beyond the image.
-        """
-        ends = wp.vec4i(0, maps.shape[3] - 1, 0, maps.shape[2] - 1)
-        distances = wp.vec4(
-            (mean[0] + 0.5 - BLOCK * float(box[0])) / sigma[0],
-            (BLOCK * float(box[1]) + 0.5 - mean[0]) / sigma[0],
-            (mean[1] + 0.5 - BLOCK * float(box[2])) / sigma[1],
-            (BLOCK * float(box[3]) + 0.5 - mean[1]) / sigma[1],
+    def beyond(low: int, high: int, blocks: int, mean: float, deviation: float, most: float):
+        """The largest alpha outside of some of a row of blocks, rounded up; nothing is outside the image."""
+        distance = float(1.0e30)
+        if low > 0:
+            distance = mean + 0.5 - BLOCK * float(low)
+        if high < blocks:
+            distance = wp.min(distance, BLOCK * float(high) + 0.5 - mean)
+        d = wp.max(distance / deviation * 0.9999 - 1.0e-3, 0.0)
+        return int(
+            wp.where(d > 16.0, wp.where(distance < 1.0e30, 1.0, 0.0), wp.ceil(most * fall_at(0.5 * LOG2_E * d * d)))
         )
-        found = wp.vec4i()
-        for side in range(4):
-            d = wp.max(distances[side] * 0.9999 - 1.0e-3, 0.0)
-            if box[side] != ends[side]:
-                found[side] = int(wp.ceil(most * fall_at(0.5 * LOG2_E * d * d)))
-        return found
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def spread(
@@ -253,7 +259,8 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 sigma = splats2d.extents[i] / wp.sqrt(far)
                 half = sigma * wp.sqrt(near)
                 size = wp.max(scales[i])
-                error = alpha_error(rules, mean, conic, sigma, size, z, wp.max(0.5 * near, 1.0))
+                condition, shift = conditions(rules, mean, conic, sigma, size, z)
+                error = alpha_error(rules, condition, shift, wp.max(0.5 * near, 1.0))
                 hidden = rules.alpha_min * error * (1.0 + error)  # as exp(e) - 1 is less
                 if error > 1.0:  # nothing is known of its place
                     hidden = opacity
@@ -261,7 +268,9 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 depth = int(0)
                 while depth + 1 < begins.shape[0] and begins[depth + 1] <= z:
                     depth += 1
-                loose = wp.exp(wp.min(alpha_error(rules, mean, conic, sigma, size, z, 0.5 * far), 1.0))
+                ends_at = wp.where(rules.floor > 0.0, near, far)
+                most_error = wp.min(alpha_error(rules, condition, shift, 0.5 * ends_at), 1.0)
+                loose = 1.0 + most_error + most_error * most_error  # above its exponential
                 unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0)  # the blend looks a tenth below a floor
                 if unsure:
                     wp.atomic_add(lost_out, 0, 1)
@@ -277,21 +286,19 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                         half = square_of(half, conic, near)
                 else:
                     half = wp.vec2(0.0)
-                seen = box_of(maps_out, mean, half - slack)
+                inner = box_of(maps_out, mean, half - slack)
+                carried = int(0)  # what the box before counts
                 for step in range(2):
                     alpha = wp.where(step == 0, wp.max(level * SHARE, rules.faint), rules.faint)
                     wider = wp.max(sigma * wp.sqrt(reach_of(opacity, alpha)), half) + slack
-                    box = box_of(maps_out, mean, wider)
-                    if rules.floor == 0.0 and not unsure and wp.length_sq(box - seen) != 0:
-                        most_of = beyond(maps_out, seen, mean, sigma, most)
-                        left = wp.vec4i(box[0], seen[0], box[2], box[3])
-                        right = wp.vec4i(seen[1], box[1], box[2], box[3])
-                        above = wp.vec4i(seen[0], seen[1], box[2], seen[2])
-                        below = wp.vec4i(seen[0], seen[1], seen[3], box[3])
-                        add_box(maps_out, here, depth, left, most_of[0])
-                        add_box(maps_out, here, depth, right, most_of[1])
-                        add_box(maps_out, here, depth, above, most_of[2])
-                        add_box(maps_out, here, depth, below, most_of[3])
-                    seen = box
+                    if rules.floor == 0.0 and not unsure:
+                        aside = beyond(inner[0], inner[1], maps_out.shape[3] - 1, mean[0], sigma[0], most)
+                        above = beyond(inner[2], inner[3], maps_out.shape[2] - 1, mean[1], sigma[1], most)
+                        outer = box_of(maps_out, mean, wider)
+                        add_box(maps_out, here, depth, inner, carried - above)
+                        add_box(maps_out, here, depth, wp.vec4i(inner[0], inner[1], outer[2], outer[3]), above - aside)
+                        inner = outer
+                        carried = aside
+                add_box(maps_out, here, depth, inner, carried)
 
     return spread

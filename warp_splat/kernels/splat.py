@@ -40,6 +40,7 @@ class BlendVariant(NamedTuple):
     falloff: Falloff | int | None = 5  # the user's, or the degree of the Gaussian's polynomial (see make_falloff)
     keep: bool = False  # every transmittance is stored
     bound: bool = False  # how wrong a pixel can be is found
+    floor: bool = False  # compared with what has nothing below an alpha
 
     @property
     def columns(self) -> int:

@@ -16,7 +16,7 @@ from warp_splat.runtime.launch import launch, pack_struct, view
 from warp_splat.runtime.pool import even_slices
 
 #: Where maps of depth begin, as shares of the Gaussians: most is hidden by what is near.
-STARTS = (0.04, 0.1, 0.17, 0.25, 0.35, 0.45, 0.6, 0.8)
+STARTS = (0.06, 0.15, 0.3, 0.55)
 SAMPLE = 2048  # Gaussians that tell depths and colors
 #: Relative error of alpha by the degree of its exponential (kernels/falloff.py).
 EXP_ERRORS = {3: 7.6e-5, 4: 3.1e-6, 5: 1.8e-7, 6: 1.8e-7, None: 1.8e-7}

@@ -188,7 +188,7 @@ def falloff_of(options: RasterOptions) -> FalloffFunctions:
 def variant_of(options: RasterOptions, keep: bool = False, bound: bool = False) -> BlendVariant:
     """What the kernels are compiled for; see :class:`BlendVariant`."""
     falloff = options.exp_degree if options.falloff is None else options.falloff
-    return BlendVariant(3 + options.depth, falloff, keep, bound)
+    return BlendVariant(3 + options.depth, falloff, keep, bound, bound and options.of == "trained")
 
 
 def alphas_of(options: RasterOptions) -> wp.vec2:

@@ -16,8 +16,8 @@ from warp_splat.raster.data import Bins, Pixels, Splats2D
 
 #: From which tolerance on the exponential's polynomial may be of that degree; its error is a tenth at most.
 DEGREES = ((3, 2e-3), (4, 1e-4))
-FIRST = 0.25  # the cut that is tried first, as a share of the tolerance
-STOP = 0.02  # where pixels stop, likewise: the Gaussian that crosses it may take 50 times as much
+FIRST = 1.0 / 400.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
+STOP = 0.005  # where pixels stop, likewise: the Gaussian that crosses it may take 100 times as much
 LOWER = 0.6  # of what the bound asks for, the cut of tiles that are drawn again
 MOST_ROUNDS = 4
 BAND = 1e-4  # around 1/255, where rounding decides what the reference leaves out
@@ -50,7 +50,7 @@ def paint_within(
     allowed = allowed.expand(camera.height, camera.width)
     degree = next((degree for degree, least in DEGREES if float(allowed.min()) >= least), 5)
     by_polynomial = {} if options.exp_degree is None else {"exp_degree": min(degree, options.exp_degree)}
-    cut = FIRST * float(allowed.max())
+    cut, uniform = FIRST * float(allowed.max()), bool(allowed.min() == allowed.max())
     done = paint(replace(options, bound=True, **_cuts(options, cut), **by_polynomial), None)
     tiles = None
     for left in range(MOST_ROUNDS, 0, -1):
@@ -58,7 +58,7 @@ def paint_within(
         cuts = done.certificate.bound - done.certificate.rounding
         worst = _worst_of_tiles(cuts / allowed.to(cuts.device))
         before, tiles = tiles, worst > 1.0
-        hopeless = options.of == "trained" and before is not None and torch.equal(before, tiles)
+        hopeless = options.of == "trained" and (uniform or (before is not None and torch.equal(before, tiles)))
         if cut <= FAINT or hopeless or not tiles.any():
             break
         cut = max(cut * LOWER / float(worst[tiles].quantile(0.9)), FAINT) if left > 1 else FAINT

@@ -34,7 +34,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.bound import BoundView, skipped
+from warp_splat.kernels.bound import BoundView, make_skipped
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.cpu.settle import SETTLED, make_settle
@@ -142,6 +142,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
     fall_at, way = make_falloff(variant.falloff).value, 1
     expect, conclude = make_settle(RGB, SKIPPED, AHEAD)
+    skipped = make_skipped(variant.floor)
 
     def begin(k, here, out, s, bound, tile, bins, near, length):
         """Instances walked."""
@@ -151,10 +152,11 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
 
     def step(k, splat, dx, dy, block, here, walked, kept_out, s, alphas, t_min, bound):
         fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
-        alpha = alpha_of(fall * splat.opacity, alphas)
+        raw = fall * splat.opacity
+        alpha = alpha_of(raw, alphas)
         if wp.static(variant.bound):
             row = SKIPPED + block
-            s[row] = skipped(fall * splat.opacity, alphas[0], splat.color, bound, s[row])
+            s[row] = skipped(raw, alphas[0], splat.color, bound, s[row])
         behind = advance(s[T + block], alpha, t_min)
         w = weight(s[T + block], alpha, behind)
         if wp.static(variant.keep):

@@ -9,11 +9,11 @@ from warp_splat.kernels.bound import (
     all_cuts,
     all_rounding,
     light_behind,
+    make_skipped,
     next_map,
     outside_of,
     own_light,
     rounding_of,
-    skipped,
     watch,
 )
 from warp_splat.kernels.cuda.warps import across_of, down_of
@@ -21,6 +21,7 @@ from warp_splat.kernels.simd import where_less
 from warp_splat.kernels.structs import BinsView
 
 EACH = 4  # pixels of a lane
+skipped = make_skipped(floor=True)
 SKIPPED, TOTAL, TAKEN, ADDED, ROUNDING, BEFORE, LIGHT = (wp.constant(row) for row in range(7))
 mat_settled = wp.types.matrix(shape=(9, EACH), dtype=float)
 vec_each = wp.types.vector(length=EACH, dtype=float)
