@@ -5,36 +5,35 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
+import torch
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import atomic_write
-from warp_splat.raster.api import RenderOutput
 from warp_splat.scene.types import View
 
 SCALE = (1e-6, 1.0)  # of the colors
 DPI = 100
 
 
-def write_bounds(draw: Callable[..., RenderOutput], views: list[View], folder: Path) -> float:
-    """Write ``bound/00000.png`` and ``bound/00000.exr`` in ``folder`` for each of ``views``.
+def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[View], folder: Path) -> float:
+    """Write ``NAME/00000.png`` and ``NAME/00000.exr`` in ``folder`` for each of ``views``, of which ``find`` finds one.
 
     Returns:
-        The largest bound of all.
+        The largest number of all.
 
     Raises:
         InputError: if a file cannot be written.
     """
     largest = 0.0
     for index, view in enumerate(views):
-        bound = draw(view.camera).bound
-        assert bound is not None
-        values = bound.cpu().numpy()
-        (folder / "bound").mkdir(parents=True, exist_ok=True)
+        values = find(view.camera).cpu().numpy()
+        (folder / name).mkdir(parents=True, exist_ok=True)
         largest = max(largest, float(values.max()))
-        save_scaled(folder / "bound" / f"{index:05d}.png", values)
-        save_exr(folder / "bound" / f"{index:05d}.exr", values)
+        save_scaled(folder / name / f"{index:05d}.png", values)
+        save_exr(folder / name / f"{index:05d}.exr", values)
     return largest
 
 

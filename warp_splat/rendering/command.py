@@ -19,11 +19,11 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
-from warp_splat.rendering.certificates import write_bounds
+from warp_splat.rendering.certificates import write_maps
 from warp_splat.rendering.finished import Finished
+from warp_splat.rendering.popping import popping_of
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
@@ -61,7 +61,11 @@ def render_model(config: RenderConfig) -> int:
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = finished.picture(model.to(device), scene, options)
-        certified = finished.renderer(model, replace(options, bound=True))
+        draw, activated = finished.renderer(model, replace(options, bound=True)), model.activated()
+        maps = {
+            "bound": lambda camera: draw(camera).bound,
+            "popping": lambda camera: popping_of(activated, camera, options),
+        }
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -71,7 +75,7 @@ def render_model(config: RenderConfig) -> int:
                 written = folder / "train" / f"ours_{iteration}"
                 write_views(picture, scene.train, written)
                 print(f"  train  {len(scene.train)} views in {written}")
-                _certify(config, certified, scene.train, written)
+                _certify(config, maps, scene.train, written)
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}
                 where = None
@@ -80,16 +84,20 @@ def render_model(config: RenderConfig) -> int:
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-                _certify(config, certified, scene.test, folder / "test" / f"ours_{iteration}")
+                _certify(config, maps, scene.test, folder / "test" / f"ours_{iteration}")
                 print(f"  {metrics_line(means)}: {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
     return 0
 
 
-def _certify(config: RenderConfig, draw: Callable[..., RenderOutput], views: list[View], folder: Path) -> None:
-    """Write how wrong pixels may be, if asked for."""
-    if config.bound:
-        largest = write_bounds(draw, views, folder)
-        print(f"  no pixel is farther from the {config.of} than {largest:.1e}: {folder / 'bound'}")
+def _certify(config: RenderConfig, maps: dict[str, Callable[[Camera], torch.Tensor]], views: list[View], folder: Path):
+    """Write how wrong pixels may be, and how much another order may change them, if asked for."""
+    what = {"ideal": "what its Gaussians say", "trained": "what was trained"}[config.of]
+    sentences = {
+        "bound": f"no pixel is farther from {what} than",
+        "popping": "another order of Gaussians that overlap in depth changes no pixel by more than",
+    }
+    for name, find in maps.items() if config.bound else ():
+        print(f"  {sentences[name]} {write_maps(name, find, views, folder):.1e}: {folder / name}")
 
 
 def _check(config: RenderConfig) -> None:
@@ -98,6 +106,8 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"--orbit, --video {config.video}: expected one of them; leave the other out.")
     if config.video_output and not (config.orbit or config.video):
         raise InputError(f"--video_output {config.video_output}: expected --video or --orbit beside it.")
+    if config.bound and (config.orbit or config.video):
+        raise InputError("--bound: expected views of a scene, got a video or --orbit; leave one of them out.")
     if config.frames != RenderConfig.frames and not config.video:
         raise InputError(f"--frames {config.frames}: expected --video beside it.")
     suffix = Path(config.video_output).suffix.lower()
