@@ -98,3 +98,9 @@ def end(process):
     said = process.communicate(timeout=PATIENCE)[0]
     assert "Traceback" not in said
     return process.returncode, said
+
+
+def changes_told(said):
+    """The largest change of a pixel, measured, and its bound."""
+    numbers = re.search(r"largest change of a pixel, .*: (\S+) measured, (\S+) its bound", said)
+    return float(numbers[1]), float(numbers[2])

@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from commands import changes_told
 from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import (
@@ -296,6 +297,19 @@ def test_renders_of_the_converted_file(tmp_path, ending, decibels):
     for one in (splats, load_gaussians(tmp_path / f"a{ending}").splats):
         images.append(make_picture(GaussianModel.from_splats(one), False, RasterOptions())(camera))
     assert images[0].std() > 20 and psnr(images[1], images[0]) > decibels
+
+
+@pytest.mark.parametrize("ending", [".spz", ".splat"])
+def test_convert_bounds_what_pictures_lose(tmp_path, capsys, ending):
+    save_gaussians(tmp_path / "a.ply", some_file(100, seed=3), report=silent)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / f"b{ending}"), "--bound"]) == 0
+    measured, bound = changes_told(capsys.readouterr().out)
+    assert 0.0 < measured <= bound
+
+
+def test_render_refuses_a_bound_of_a_video(tmp_path, fails):
+    save_gaussians(tmp_path / "a.spz", some_file(100))
+    assert "--bound: expected views" in fails("render", "-m", tmp_path / "a.spz", "--orbit", "--bound")
 
 
 def test_render_takes_a_file(tmp_path, fails):

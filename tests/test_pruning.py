@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from commands import changes_told
 from scenes import C0
 from scipy.spatial.transform import Rotation
 
@@ -210,6 +211,22 @@ def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, capsys):
     assert loss > -0.51 and len(load_gaussians(tmp_path / "b.ply").splats.means) < len(splats.means)
 
 
+@pytest.mark.long
+def test_simplify_within_a_tolerance(folder, tmp_path, capsys):
+    folder, splats = folder
+    output = tmp_path / "b.ply"
+    assert main(["simplify", str(folder), "--device", "cpu", "--tolerance", "0.05", "-o", str(output)]) == 0
+    measured, bound = changes_told(capsys.readouterr().out)
+    views = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None).train
+    setting, left = (
+        setting_of([view.camera for view in views], background=(0.0, 0.0, 0.0)),
+        load_gaussians(output).splats,
+    )
+    changes = [(drawn(splats, setting, v.camera) - drawn(left, setting, v.camera)).abs().max() for v in views]
+    assert max(changes) == pytest.approx(measured, rel=0.1) and measured <= bound <= 0.05
+    assert len(left.means) < len(splats.means)
+
+
 def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys):
     camera = make_camera(*SIZE, seed=3)
     splats = splats_before(camera)
@@ -223,13 +240,15 @@ def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ("", "expected one of --keep, --max_loss and --size, got none"),
+        ("", "expected one of --keep, --max_loss, --size and --tolerance, got none"),
         ("--keep 0.5 --size 1MB", "got --keep and --size"),
         ("--keep 0.001", "nothing would be left of 40 Gaussians"),
         ("--keep 1.5", "--keep: expected"),
         ("--size 10miles", "--size 10miles: expected a size of file such as 10MB"),
         ("--size 3B", "nothing would be left of 40 Gaussians"),
         ("--max_loss 0.1", "expected photographs to compare with"),
+        ("--tolerance 0.1", "expected photographs to compare with"),
+        ("--tolerance 0.1 --steps 3", "training changes all pixels"),
         ("--keep 0.5 --steps -1", "--steps: expected"),
         ("--keep 0.5 -o b.obj", "b.obj: expected a name that ends in"),
         ("--keep 0.5 -o a.ply", "a.ply: expected another file than the model"),

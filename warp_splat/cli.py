@@ -37,7 +37,7 @@ COMMANDS = {
     "view": (ViewConfig, "viewer.command.view_model", "look at a trained model in a browser"),
     "convert": (
         ConvertConfig,
-        "formats.convert.convert",
+        "rendering.changes.convert_and_compare",
         "convert Gaussians between .ply, .splat, .spz, .sog, glTF, USD",
     ),
     "simplify": (SimplifyConfig, "pruning.simplify.simplify", "leave out what a finished model does not need"),

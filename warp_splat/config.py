@@ -138,8 +138,11 @@ class RenderConfig(OnDevice):
     )
     quiet: bool = flag(False, "print only the summary")
     tolerance: float = flag(0.0, "leave out what changes no pixel by more, of 1; 0: the usual cuts", most=1)
-    of: str = flag("ideal", "what a tolerance and a bound compare with: see docs/tolerance.md", choices=BOUNDS_OF)
-    bound: bool = flag(False, "also write how wrong each pixel may be: pictures with a scale, and EXR files")
+    of: str = flag("trained", "what a tolerance and a bound compare with: see docs/tolerance.md", choices=BOUNDS_OF)
+    bound: bool = flag(
+        False,
+        "also write how wrong each pixel may be, and what another order may change: pictures with a scale, EXR files",
+    )
 
     frames: int = film(250, "frames of the video, 25 a second", least=1)
     video_output: str = film("", "an .mp4 file, or a folder for PNG; default: <model>/<video>.mp4", "--orbit_output")
@@ -200,6 +203,7 @@ class ConvertConfig:
 
     source: str = argument("the file to read, or the folder of a trained model")
     target: str = argument("the file to write; its ending says in which format")
+    bound: bool = flag(False, "also print how much pictures from around change, measured and with a bound")
 
 
 @dataclass
@@ -209,6 +213,7 @@ class SimplifyConfig(FinishedModel):
     keep: float = flag(0.0, "the share of the Gaussians to keep", most=1)
     max_loss: float = flag(0.0, "or: keep as few as cost at most this much PSNR of the training views, in dB")
     size: str = flag("", "or: keep as many as fit into a file of this size, such as 10MB")
+    tolerance: float = flag(0.0, "or: keep as few as change no pixel of a training view by more, of 1", most=1)
     steps: int = flag(0, "steps of training that make up for what was left out (300 are enough)")
     output: str = flag("", "the file to write, of any format; default: simplified.ply in the model's folder", "-o")
 

@@ -16,7 +16,8 @@ from warp_splat.formats.atomic import write_csv
 from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
 from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
-from warp_splat.pruning.thinning import Thinning, fewer_harmonics, rows_of, tuned
+from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, rows_of, tuned
+from warp_splat.rendering.changes import largest_change
 from warp_splat.rendering.finished import Finished
 from warp_splat.text import format_table
 
@@ -46,14 +47,28 @@ def simplify(config: SimplifyConfig) -> int:
         return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained)
 
     total, views = len(file.splats.means), opened.scene.train
-    if config.max_loss:
+
+    def changed(splats: SplatArrays) -> tuple[float, float]:
+        before, after = (model_of(some, opened.setting).activated() for some in (file.splats, splats))
+        cameras = [view.camera for view in views]
+        return largest_change(before, after, cameras, opened.setting.background, opened.setting.options)
+
+    if config.tolerance:
+        count = _fewest(total, lambda count: changed(made(count))[1] <= config.tolerance)
+    elif config.max_loss:
         least = opened.psnr(file.splats, views) - config.max_loss
         count = _fewest(total, lambda count: opened.psnr(made(count), views) >= least)
     else:
         count = _count(config, total, lambda count: written_bytes(output, file._replace(splats=thinning.to(count))))
     splats = made(count)
-    splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
+    if not config.tolerance:
+        splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
     write(output, file, splats)
+    if config.tolerance:
+        measured, bound = changed(splats)
+        print(
+            f"  largest change of a pixel, {len(views)} training views: {measured:.2g} measured, {bound:.2g} its bound"
+        )
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
     print_quality(opened.quality(file.splats), opened.quality(splats))
@@ -82,12 +97,16 @@ def bytes_of(size: str) -> int:
 
 def _check(config: SimplifyConfig) -> None:
     check_numbers(config)
-    given = [name for name in ("keep", "max_loss", "size") if getattr(config, name)]
+    given = [name for name in ("keep", "max_loss", "size", "tolerance") if getattr(config, name)]
     if len(given) != 1:
         found = " and ".join(f"--{name}" for name in given) or "none"
-        raise InputError(f"warp-splat simplify: expected one of --keep, --max_loss and --size, got {found}.")
+        raise InputError(
+            f"warp-splat simplify: expected one of --keep, --max_loss, --size and --tolerance, got {found}."
+        )
     if config.size:
         bytes_of(config.size)
+    if config.tolerance and config.steps:
+        raise InputError("--steps: training changes all pixels; leave it out where there is a --tolerance.")
 
 
 def _count(config: SimplifyConfig, total: int, size_of: Callable[[int], int]) -> int:
@@ -164,8 +183,10 @@ def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
 
 def _unseen(config: SimplifyConfig, output: Path) -> int:
     """Without a scene: the largest by opacity and extent."""
-    if config.max_loss or config.steps:
-        raise InputError("--max_loss, --steps: expected photographs to compare with; name the scene with -s.")
+    if config.max_loss or config.steps or config.tolerance:
+        raise InputError(
+            "--max_loss, --tolerance, --steps: expected photographs to compare with; name the scene with -s."
+        )
     print(UNSEEN)
     finished = Finished(config.model, config.iteration)
     require_some(finished)
