@@ -1,0 +1,205 @@
+"""What a gradient owes to rounding, to the cuts, and to decisions at their thresholds.
+
+Walks: a pixel of random alphas through which a thousandth of the light comes, forward and back in float32, against the
+same in float64; the bounds are those of docs/adjoints.md. Trained scenes: float64 without and with a cut, and how often
+float32 decides otherwise at 1/255. Integrators: the observed order, from docs/compare/volume.csv.
+
+    python benchmarks/numerics.py [-s SCENE -m MODEL ...] [--out docs/benchmarks]
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import torch
+from common import ROOT, option, parse, write_table
+
+from warp_splat.camera import Camera
+from warp_splat.compare import oracle
+from warp_splat.config import ALPHA_MIN, RasterOptions
+from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.data import Gaussians
+from warp_splat.raster.project import project
+from warp_splat.runtime import launch
+from warp_splat.scene import load_scene
+
+EPS = 2.0**-24
+LAYERS, PIXELS = (10, 100, 1_000, 10_000, 100_000), 256
+LEFT = 1e-3  # of the light, behind all layers
+NEAR = 0.05  # of 1/255, relative: pairs that tell how many of them are where rounding decides
+HEADERS = ("what", "where", "measured", "along the exact one", "by the square root", "bound", "condition")
+
+
+def single(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float32).astype(np.float64)
+
+
+def forward(alphas: np.ndarray, rounded) -> np.ndarray:
+    """Transmittances in front of each layer, and behind the last, [n + 1, P]."""
+    t = [np.ones(alphas.shape[1])]
+    for alpha in alphas:
+        t.append(rounded(t[-1] - alpha * t[-1]))  # fused: one rounding
+    return np.array(t)
+
+
+def backward(alphas: np.ndarray, light: np.ndarray, last: np.ndarray, rounded) -> tuple[np.ndarray, np.ndarray]:
+    """T in front of each layer, recovered, and dL/dalpha, [n, P]; ``light``: color times upstream gradient."""
+    t, behind, ts, grads = last, np.zeros_like(last), [], []
+    for alpha, own in zip(alphas[::-1], light[::-1], strict=True):
+        odds = rounded(alpha / rounded(1.0 - alpha))
+        t = rounded(t + t * odds)
+        grads.append(rounded(t * own - rounded(behind * odds + behind)))
+        behind = rounded(rounded(alpha * t) * own + behind)
+        ts.append(t)
+    return np.array(ts[::-1]), np.array(grads[::-1])
+
+
+def walk(count: int) -> list[dict]:
+    """A pixel of ``count`` layers: the transmittance, and the gradients by which pass is rounded."""
+    generator = np.random.default_rng(count)
+    alphas = generator.uniform(0.0, 2.0, (count, PIXELS)) * -np.log(LEFT) / count
+    alphas = single(np.minimum(alphas, 0.99))
+    light = single(generator.uniform(-1.0, 1.0, (count, PIXELS)))
+    exact = lambda values: values  # noqa: E731
+    truth = forward(alphas, exact)
+    _, grads = backward(alphas, light, truth[-1], exact)
+    last = forward(alphas, single)[-1]
+    found, both = backward(alphas, light, last, single)
+    of_adjoint = backward(alphas, light, truth[-1], single)[1]
+    of_forward = backward(alphas, light, last, exact)[1]
+
+    # roundings of T in front of layer k: n of the forward pass, then 1 and two of the odds, which count alpha times
+    own = 1.0 + 2.0 * alphas
+    roundings = count + np.cumsum(own[::-1], 0)[::-1]
+    squares = np.sqrt(count + np.cumsum((1.0 + 2.0 * alphas**2)[::-1], 0)[::-1])
+    weights = np.abs(alphas * truth[:-1] * light)
+    after = (np.cumsum(weights[::-1], 0)[::-1] - weights) / (1.0 - alphas)
+    here = np.abs(truth[:-1] * light)
+    left = count - np.arange(count)[:, None]
+    bounds = [
+        EPS * (here * (counts + 2.0) + after * (counts + more + 4.0))
+        for counts, more in ((roundings, left), (squares, np.sqrt(left)))
+    ]
+    size = np.linalg.norm(grads)
+    where, condition = f"{count} layers", np.linalg.norm(here + after) / size
+    recovered = np.abs(found / truth[:-1] - 1.0).max()
+    rows = [{"what": "T, back at the front", "where": where, "measured": recovered}]
+    rows[0] |= {"root": 3.0 * EPS * squares.max(), "bound": EPS * roundings.max(), "condition": 1.0}
+    for name, got in (("forward pass alone", of_forward), ("adjoint alone", of_adjoint), ("both", both)):
+        row = {"what": f"gradient, rounded: {name}", "where": where, "measured": np.linalg.norm(got - grads) / size}
+        root, bound = (np.linalg.norm(some) / size for some in bounds[::-1])
+        rows.append(row | ({"root": root, "bound": bound, "condition": condition} if name == "both" else {}))
+    return rows
+
+
+def some_pixels(camera: Camera, count: int) -> tuple[torch.Tensor, torch.Generator]:
+    """Row and column of each, [P, 2], at random, and what goes on at random."""
+    generator = torch.Generator().manual_seed(1)
+    sides = (camera.height, camera.width)
+    return torch.stack([torch.randint(0, side, (count,), generator=generator) for side in sides], 1), generator
+
+
+def biased(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
+    """How far gradients with a cut are from those without, float64, of random signs at some pixels."""
+    generator = torch.Generator().manual_seed(1)
+    pixels = torch.stack(
+        [torch.randint(0, side, (count,), generator=generator) for side in (camera.height, camera.width)], 1
+    )
+    signs = 2.0 * torch.randint(0, 2, (count, 3), generator=generator).double() - 1.0
+    found, rows = {}, []
+    for cuts in ((0.0, 0.0), (ALPHA_MIN, 0.0), (0.0, 1e-4)):
+        double = [tensor.detach().double() for tensor in gaussians]
+        leaves = [tensor.requires_grad_() for tensor in (*double[:4], torch.cat(double[4:], 1))]
+        for part, sign in zip(pixels.split(8), signs.split(8), strict=True):
+            image = oracle.exact_render(*leaves, camera, alpha_min=cuts[0], t_min=cuts[1], pixels=part).image
+            (image * sign).sum().backward()
+        found[cuts] = [leaf.grad for leaf in leaves]
+    for cuts, what in (((ALPHA_MIN, 0.0), "the cut at 1/255"), ((0.0, 1e-4), "the stop at 1e-4")):
+        for place, of in ((0, "means"), (2, "scales"), (3, "opacities"), (4, "harmonics")):
+            exact, cut = found[0.0, 0.0][place], found[cuts][place]
+            along = float((cut * exact).sum() / exact.square().sum())
+            row = {"what": f"gradient of {of} by {what}", "where": name}
+            rows.append(row | {"measured": float((cut - exact).norm() / exact.norm()), "along": along})
+    return rows
+
+
+@torch.no_grad()
+def flipped(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
+    """How often float32 decides otherwise than float64 whether alpha is below 1/255, and what that changes."""
+    generator = torch.Generator().manual_seed(2)
+    pixels = torch.stack(
+        [torch.randint(0, side, (count,), generator=generator) for side in (camera.height, camera.width)], 1
+    )
+    double = [tensor.double() for tensor in gaussians]
+    exact = oracle.exact_splats(*double[:4], torch.cat(double[4:], 1), camera)
+    order = torch.sort(exact.z.float(), stable=True).indices
+    order = order[exact.live[order]]
+    drawn = project(gaussians, camera, RasterOptions(alpha_min=1e-6))
+    xx, xy, yy = drawn.conics[order].unbind(1)
+    flips = expected = near = off = worst = 0.0
+    for part in pixels.split(64):
+        raw, _ = oracle._alphas(exact, order, camera, part)
+        dx, dy = (drawn.means2d[order] - (part.flip(1) + 0.5)[:, None]).unbind(2)
+        alphas = drawn.opacities[order] * torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+        alphas = torch.where(drawn.radii[order] > 0, alphas.double(), raw)
+        solid = torch.where(raw < ALPHA_MIN, 0.0, raw.clamp_max(0.99))
+        front = torch.cumprod(1.0 - solid, 1) / (1.0 - solid)
+        close = ((raw / ALPHA_MIN).log().abs() < NEAR) & (front > 1e-4)
+        offs = (alphas / raw).log().abs()[close].clamp_max(NEAR)
+        other = ((raw < ALPHA_MIN) != (alphas < ALPHA_MIN)) & close
+        flips, near, off = flips + float(other.sum()), near + float(close.sum()), off + float(offs.sum())
+        expected += float(offs.sum()) / (2.0 * NEAR)  # as likely anywhere within NEAR
+        worst += float((front[close] * offs).sum())
+    per = 1e6 / count
+    return [
+        {"what": "decisions at 1/255 that float32 turns, a megapixel: found", "where": name, "measured": per * flips},
+        {"what": "the same, expected", "where": name, "measured": per * expected},
+        {"what": "error of alpha there, relative, mean", "where": name, "measured": off / near},
+        {"what": "T where they are turned, mean", "where": name, "measured": worst / off, "bound": 1.0},
+    ]
+
+
+def orders() -> list[dict]:
+    """By how much errors fall with twice the samples, at an optical depth of 1, between errors of 1e-1 and 1e-9."""
+    errors: dict = {}
+    with (ROOT / "docs/compare/volume.csv").open() as file:
+        for row in csv.DictReader(file):
+            if row["table"] == "integrators" and float(row["optical_depth"]) == 1.0:
+                errors.setdefault(row["method"], {})[int(row["samples"])] = float(row["error"])
+    rows = []
+    for method, found in errors.items():
+        pairs = [(found[n], found[2 * n]) for n in sorted(found) if 2 * n in found]
+        steps = [np.log2(a / b) for a, b in pairs if 1e-1 > a > b > 1e-9]
+        rows.append({"what": "order of the integrator", "where": method, "measured": float(np.median(steps[-3:]))})
+    return rows
+
+
+def main() -> None:
+    arguments = parse(
+        __doc__,
+        option("-s", "--scenes", nargs="*", default=[], action="extend"),
+        option("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene"),
+        option("--width", type=int, default=240, help="of the view [px]"),
+        option("--pixels", type=int, default=480),
+    )
+    launch.prepare("cpu", 0)
+    rows = [row for count in LAYERS for row in walk(count)]
+    for folder, model in zip(arguments.scenes, arguments.models, strict=True):
+        camera = load_scene(folder, resolution=arguments.width, eval=True, report=lambda _: None).train[0].camera
+        with torch.no_grad():
+            gaussians = GaussianModel.load(model).arranged().activated()
+        name = Path(folder).name
+        rows += flipped(name, gaussians, camera, arguments.pixels)
+        rows += biased(name, gaussians, camera, arguments.pixels // 24)
+    rows += orders()
+    formats = {"measured": ".2g", "along": ".3f", "root": ".2g", "bound": ".2g", "condition": ".2g"}
+    shown = [
+        (row["what"], row["where"], *(format(row[key], how) if key in row else "" for key, how in formats.items()))
+        for row in rows
+    ]
+    note = "Gradients: relative L2. The square root: of the number of roundings, three of them for the worst T."
+    write_table("numerics", arguments.out, HEADERS, shown, note, {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
