@@ -11,18 +11,17 @@ import json
 from pathlib import Path
 
 import numpy as np
-from audit_targets import OTHERS
+from audit_targets import OTHERS, OURS
 
 from warp_splat.audit.command import run_audit, side_by_side, worst_gradient
 from warp_splat.audit.renderer import Renderer, function_of
 from warp_splat.audit.small_scenes import SCENES
-from warp_splat.audit.targets import TARGETS
 from warp_splat.errors import InputError
 from warp_splat.formats.atomic import write_json, write_text
 from warp_splat.formats.png import save_png
 from warp_splat.text import table_of
 
-ALL = {**TARGETS, **OTHERS}
+ALL = {**OURS, **OTHERS}
 USUAL = 1e-2  # the first scene is pictured where more than this share of the pixels is off
 
 
@@ -34,7 +33,8 @@ def measured(name: str, scenes: tuple[str, ...], out: Path) -> None:
         print(f"{name}: left out. {error}")
         return
     renderer = Renderer(target.place, limit=120.0)
-    facts, rows = run_audit(renderer, target, name, scenes)
+    facts, rows = run_audit(renderer, name, target.degree, scenes)
+    facts |= {"version": target.version, "settings": target.settings}
     renderer.close()
     write_json(out / "audit" / f"{name}.json", facts | {"scenes": [row.record() for row in rows]})
     shown = next((row for row in rows if row.off > USUAL), None)
@@ -52,7 +52,6 @@ def summary(facts: dict) -> dict:
         if any(value is not None for value in row["gradients"].values())
     }
     return facts | {
-        "package": facts["package"].rsplit("@", 1)[0],
         "right": f"{sum(row['off'] == 0 for row in drawn)} of {len(rows)}",
         "by_rules": sum(row["own"] == 0 for row in drawn),
         "failed": len(rows) - len(drawn),
@@ -68,7 +67,7 @@ def write_summary(out: Path) -> None:
     records = [summary(json.loads(path.read_text())) for path in files if path.exists()]
     columns = {
         "target": "{target}",
-        "version": "{package} {version}",
+        "version": "{version}",
         "SH": "{degree}",
         "scenes right": "{right}",
         "by its own rules": "{by_rules}",

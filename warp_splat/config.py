@@ -254,7 +254,7 @@ class CompareConfig(OnDevice):
 class AuditConfig:
     """Options of the audit of a renderer."""
 
-    target: str = argument("MODULE:function, a name of the table in docs/audit.md, or with --command any name")
+    target: str = argument("MODULE:function, a page that ends in .html, or with --command any name")
     program: str = flag(
         "", "a program instead: 'prog {ply} {cameras} {out}' writes a PNG; {exr} and {background} too", "--command"
     )

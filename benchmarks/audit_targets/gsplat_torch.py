@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import torch
 from gsplat.cuda import _torch_impl as theirs
 
-from warp_splat.audit.targets.own import matrices_of
+from audit_targets.own import matrices_of
 
 TILE, ALPHA_MIN, STOP = 16, 1 / 255, 1e-4
 

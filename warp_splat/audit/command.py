@@ -16,8 +16,7 @@ from warp_splat.audit.judged import LEVEL, SceneRow, exact_image, in_eight_bits,
 from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
-from warp_splat.audit.targets import TARGETS, NamedRenderer
-from warp_splat.audit.targets.program import stored, write_files
+from warp_splat.audit.program import stored, write_files
 from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
@@ -37,50 +36,35 @@ def audit(config: AuditConfig) -> int:
     Raises:
         InputError: for a target, scene or command that there is not.
     """
-    target = target_of(config)
-    renderer = Renderer(target.place, config.limit)
+    place = config.program or config.target
+    function_of(place)
     if config.case and config.case not in SCENES:
         raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
+    renderer, out = Renderer(place, config.limit), Path(config.out)
     try:
         if config.case:
-            return _write_case(renderer, target, config.case, Path(config.out))
-        measured = run_audit(renderer, target, config.target)
+            return _write_case(renderer, config.degree, config.case, out)
+        facts, rows = run_audit(renderer, config.target, config.degree)
     finally:
         renderer.close()
-    write_audit(Path(config.out), *measured)
-    return int(any(row.level in ("warning", "error") for row in measured[1]))
-
-
-def target_of(config: AuditConfig) -> NamedRenderer:
-    """Where the target is called, and what it claims: by its name, its place, or its command."""
-    if config.target in TARGETS and not config.program:
-        found = TARGETS[config.target]
-        return found._replace(degree=min(found.degree, config.degree))
-    if not config.program and ":" not in config.target and not config.target.endswith(".html"):
-        raise InputError(
-            f"{config.target}: expected MODULE:function, a page that ends in .html, or one of {', '.join(TARGETS)}."
-        )
-    function_of(config.program or config.target)
-    package = "" if config.program else config.target.split(".")[0].split(":")[0]
-    return NamedRenderer(config.program or config.target, package, config.program, config.degree)
+    write_audit(out, facts, rows)
+    return int(any(row.level in ("warning", "error") for row in rows))
 
 
 def run_audit(
-    renderer: Renderer, target: NamedRenderer, name: str, scenes: tuple[str, ...] = tuple(SCENES)
+    renderer: Renderer, name: str, degree: int = 3, scenes: tuple[str, ...] = tuple(SCENES)
 ) -> tuple[dict[str, Any], list[SceneRow]]:
-    """What was found of rules and settings, and a row for each scene; prints both."""
-    rules = find_rules(renderer.draw, target.degree)
-    facts = {"target": name, "package": target.package, "version": target.version, "settings": target.settings}
-    facts |= {"date": date.today().isoformat(), "machine": machine(), "degree": target.degree}
-    facts |= {"rules": rules.sentences, "options": rules.options}
-    print(f"{name} ({target.package} {target.version}; {target.settings})")
+    """What was found of rules, and a row for each scene; prints both."""
+    print(name)
+    rules = find_rules(renderer.draw, degree)
     for rule, sentence in rules.sentences.items():
         print(f"  {rule:13s} {sentence}")
-    rows = list(measure(renderer, rules.options, target.degree, rules.background, scenes))
+    rows = list(measure(renderer, rules.options, degree, rules.background, scenes))
     columns = {"scene": "{scene}", "largest": "{largest:.1g}", "mean": "{mean:.1g}", "off": "{off:.1%}"}
     columns |= {"by its rules": "{own:.1%}", "gradients": worst_gradient, "verdict": "{verdict}"}
     print(table_of([row.record() for row in rows], columns))
-    return facts, rows
+    facts = {"target": name, "date": date.today().isoformat(), "machine": machine(), "degree": degree}
+    return facts | {"rules": rules.sentences, "options": rules.options}, rows
 
 
 def worst_gradient(record) -> str:
@@ -105,7 +89,7 @@ def write_audit(out: Path, facts: dict[str, Any], rows: list[SceneRow]) -> None:
     if drawn:
         save_png(out / "worst.png", side_by_side(*drawn[0].pictures))
     off = sum(row.level in ("warning", "error") for row in rows)
-    verdict = f"{off} of {len(rows)} scenes are off. {facts['settings']} {facts['version']}, {facts['date']}."
+    verdict = f"{off} of {len(rows)} scenes are off; {facts['date']}."
     write_page(out / "audit.html", f"Audit of {facts['target']}", verdict, findings, pictures)
     print(f"{verdict}\n  page {out / 'audit.html'}")
 
@@ -117,10 +101,10 @@ def side_by_side(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
     return (in_eight_bits(strip) * 255).astype(np.uint8).repeat(ZOOM, 0).repeat(ZOOM, 1)
 
 
-def _write_case(renderer: Renderer, target: NamedRenderer, name: str, out: Path) -> int:
+def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
     """The smallest scene that shows what a renderer does to ``name``: files, what was expected, what came."""
-    background = find_rules(renderer.draw, target.degree, ("background",)).background
-    workload = on_all_pixels(name, SCENES[name][1](), background, target.degree)
+    background = find_rules(renderer.draw, degree, ("background",)).background
+    workload = on_all_pixels(name, SCENES[name][1](), background, degree)
     try:
         workload, answer = smallest(renderer, workload)
     except RendererFailed as error:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.audit.targets.pages import draw_by_page
-from warp_splat.audit.targets.program import draw_by_program
+from warp_splat.audit.program import draw_by_program
+from warp_splat.audit.web import draw_by_page
 from warp_splat.compare.workloads import Workload
 from warp_splat.errors import InputError
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from functools import partial
 
@@ -12,10 +13,12 @@ from warp_splat.camera import Camera
 from warp_splat.compare.scenes import at_pixels, cloud, look, make_camera, tensors
 from warp_splat.compare.stability import pixel_loop, shapes
 from warp_splat.compare.stability.verdict import Problem
-from warp_splat.compare.workloads import Workload
+from warp_splat.compare.workloads import Workload, in_training
 from warp_splat.config import RasterOptions
 from warp_splat.formats.stored import SH_C0
 from warp_splat.raster.data import Gaussians
+from warp_splat.scene import load_scene
+from warp_splat.scene.embedded import embedded_scene
 
 SIZE = (64, 48)  # px
 REPEATED = ("cloud", "layers_4000")  # drawn ten times: whatever depends on an order of threads shows here
@@ -87,6 +90,14 @@ def _one() -> Drawn:
     return tensors(balls(camera, [[30.2, 25.6]], 3.0, 5.0, 0.8, [0.9, 0.5, 0.2])), camera
 
 
+@functools.cache
+def _trained() -> Drawn:
+    """After 300 steps with pictures of 64 px, seen in a view that was held out, at half their size."""
+    scene = load_scene(embedded_scene(), resolution=SIZE[0], eval=True, report=lambda *_: None)
+    last = in_training("trained", scene, torch.device("cpu"), lambda *_: None)[-1]
+    return last.gaussians._asdict(), last.camera.resized(32, 30)
+
+
 def _of(problem: Callable[[], Problem]) -> Drawn:
     found = problem()
     return found.gaussians, found.camera
@@ -111,6 +122,7 @@ SCENES: dict[str, tuple[str, Callable[[], Drawn]]] = {
         "depths of 0.19 and 0.21, around a near plane of 0.2",
         lambda: _of(lambda: shapes.at_depths(np.tile([0.19, 0.21], 15), opacity=(0.01, 0.1))),
     ),
+    "trained": ("the embedded scene after 300 steps of training", _trained),
     "opacity_1": ("opacities of 1", lambda: _of(pixel_loop.opacity_one)),
     **{
         name: (claim, partial(_of, build))

@@ -1,4 +1,4 @@
-"""A headless Chromium, what it is served, and a picture of a page in it."""
+"""A page in a headless Chromium, which shows a file of Gaussians from a camera."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import shutil
 import subprocess
 import tempfile
 import threading
+from collections.abc import Callable
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+from warp_splat.audit.program import stored, write_files
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import camera_entry
 from warp_splat.formats.png import load_png
 
 #: Without those of the second line, it draws a frame a second.
-FLAGS = (
-    "--use-angle=swiftshader --enable-unsafe-swiftshader --no-sandbox --disable-frame-rate-limit --disable-gpu-vsync"
-)
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+FLAGS += ["--disable-frame-rate-limit", "--disable-gpu-vsync"]
 CACHE = Path.home() / ".cache" / "warp_splat" / "web"  # where npm puts what it is asked for
 PACKAGES = re.compile(r'<meta name="npm" content="([^"]*)"')
 SHOW = """async ([camera, file]) => {
@@ -57,7 +58,7 @@ def _browser():
     return browser.new_page(), folder, f"http://127.0.0.1:{server.server_port}"
 
 
-def screenshot(page: Path, camera, write=lambda folder: None, file: str = "scene.ply"):
+def screenshot(page: Path, camera, write: Callable[[Path], object], file: str = "scene.ply"):
     """What ``page`` shows of the ``file`` that ``write`` puts into a folder, [H, W, 3] uint8; what ``show`` returns.
 
     Raises:
@@ -77,3 +78,22 @@ def screenshot(page: Path, camera, write=lambda folder: None, file: str = "scene
     returned = tab.evaluate(SHOW, [camera_entry(camera), f"/{file}"])
     tab.screenshot(path=folder / "screen.png")
     return load_png(folder / "screen.png"), returned
+
+
+def draw_by_page(page: str):
+    """A function that draws with a page whose ``window.show(camera, address)`` shows a PLY file from a camera.
+
+    The camera is as ``cameras.json`` has it. The page stands beside its scripts, and asks for packages of npm by
+    ``<meta name="npm" content="three@0.187.0">``: they are installed, and served as ``/node_modules``.
+
+    Raises:
+        InputError: if there is no such page.
+    """
+    if not Path(page).is_file():
+        raise InputError(f"{page}: expected a page with a function window.show(camera, address), found none.")
+
+    def draw(means, quats, scales, opacities, sh, camera, background):
+        file = stored(means, quats, scales, opacities, sh)
+        return screenshot(Path(page), camera, lambda folder: write_files(folder, file, camera))[0]
+
+    return draw

@@ -1,7 +1,5 @@
 """This package's renderer in all the ways in which it can be called."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch
