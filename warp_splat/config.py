@@ -81,6 +81,8 @@ class RasterOptions:
             the reference's rules left it out in training.
         tolerance: cut as much as the bound allows, which is then found, too: a number, or one for each pixel [H, W],
             above 0. Takes the place of ``alpha_min`` and ``t_min``, and lowers ``exp_degree``. Rounding comes on top.
+        hidden_from: depth of an opaque surface, [H, W] float32: a Gaussian whose center is as far or farther is hidden
+            by it. Where it is not positive, there is no surface. Not with ``bound`` or ``tolerance``.
     """
 
     depth: bool = False
@@ -102,6 +104,7 @@ class RasterOptions:
     bound: bool = False
     of: str = "ideal"
     tolerance: float | torch.Tensor | None = None
+    hidden_from: torch.Tensor | None = None
 
 
 @dataclass

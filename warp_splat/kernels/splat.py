@@ -41,6 +41,7 @@ class BlendVariant(NamedTuple):
     keep: bool = False  # every transmittance is stored
     bound: bool = False  # how wrong a pixel can be is found
     floor: bool = False  # compared with what has nothing below an alpha
+    hides: bool = False  # each pixel stops where it is told to
 
     @property
     def columns(self) -> int:

@@ -15,7 +15,7 @@ from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import LOG2_E, reach_of
 from warp_splat.kernels.simd import fill, over, root, rounded_down, rounded_up, times, whole
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.kernels.structs import Splats2DView
+from warp_splat.kernels.structs import BinsView, Splats2DView
 
 #: Every operation is rounded by itself, on a GPU, too.
 SPELLED_OUT = {**FORWARD_ONLY, "fuse_fp": False}
@@ -127,3 +127,35 @@ def cut(
         left = -x_extent
     first, last = pixels(x + left, x + right, width)
     return first, last
+
+
+@wp.kernel
+def count_in_front(
+    first: int,
+    bins: BinsView,
+    surface: wp.array2d[float],  # [H, W] its depth; where it is not positive, there is none
+    lanes: int,  # that hold the pixels of a block of 4 x 4, or one pixel after the other
+    # out
+    limits_out: wp.array2d[float],  # [T, TILE TILE] instances in front of it
+):
+    tile = first + wp.tid()
+    start = bins.ranges[tile][0]
+    for place in range(TILE * TILE):
+        x = place % TILE
+        y = place // TILE
+        if lanes > 1:
+            x = 4 * (place // lanes % 4) + place % 4
+            y = 4 * (place // lanes // 4) + place % lanes // 4
+        x = wp.min(tile % bins.tiles_x * TILE + x, surface.shape[1] - 1)
+        y = wp.min(tile // bins.tiles_x * TILE + y, surface.shape[0] - 1)
+        low = int(start)
+        high = int(bins.ranges[tile][1])
+        if not surface[y, x] > 0.0:
+            low = high
+        while low < high:
+            middle = (low + high) // 2
+            if bins.splats[bins.instances[middle]].depth < surface[y, x]:
+                low = middle + 1
+            else:
+                high = middle
+        limits_out[tile, place] = float(low - start)

@@ -22,6 +22,7 @@ from warp_splat.raster.checks import (
     check_camera,
     check_features,
     check_gaussians,
+    check_hidden_from,
     check_options,
     check_tolerance,
     explain_invalid,
@@ -159,7 +160,9 @@ def rasterize_views(
     check_tolerance(options, features)
     if features is not None:
         check_features(features, means)
-    outputs, bases = [], (camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras)
+    outputs, bases = [], [camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras]
+    for base in bases:
+        check_hidden_from(options, base, means.device)
     sizes = ((base.width, base.height) for base in bases)
     advice = "render smaller images (Camera.resized) or fewer Gaussians"
     with own_explained(options), memory_explained(means.device, means, sizes, advice):

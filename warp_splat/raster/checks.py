@@ -105,6 +105,14 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     )
 
 
+def check_hidden_from(options: RasterOptions, camera: Camera, device: torch.device) -> None:
+    """Raise InputError if the surface that hides is not one depth for each pixel of ``camera``, or beside a bound."""
+    if options.hidden_from is not None:
+        _check_tensor("options.hidden_from", options.hidden_from, (camera.height, camera.width), device)
+        if options.bound or options.tolerance is not None:
+            raise InputError("options.hidden_from: expected neither bound nor tolerance beside it; leave one out.")
+
+
 def check_tolerance(options: RasterOptions, features: object = None) -> None:
     """Raise InputError if the tolerance is no positive number, or if it asks for what only a single pass gives."""
     tolerance = options.tolerance

@@ -31,6 +31,7 @@ from warp_splat.kernels.cuda.warps import WARP
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant, Splat2D
 from warp_splat.kernels.structs import BinsView
+from warp_splat.kernels.tiles import count_in_front
 from warp_splat.raster import bin
 from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
 from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, pack_struct, view
@@ -96,8 +97,14 @@ class Driver:
         pixels = Pixels.empty(camera, options, background)
         final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.layout.counts)
         saved = Saved(final, count, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
-        kernel = self.kernels.blend(variant_of(options, keep, options.bound))
+        limits = new(0 if options.hidden_from is None else tile_count, *shape)
+        if options.hidden_from is not None:
+            inputs = [bins.view(), view(options.hidden_from, wp.float32), self.lanes]
+            outputs = [view(limits.view(-1, THREADS), wp.float32)]
+            launch(count_in_front, tile_count, inputs, outputs, bounds=bins.slices, device=background.device)
+        kernel = self.kernels.blend(variant_of(options, keep, options.bound, options.hidden_from is not None))
         inputs = [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32), bins.bound]
+        inputs.append(view(limits, self.layout.number))
         self.launch_tiles(kernel, bins, inputs, [pixels.view(), *self.view_walk(*saved)])
         return pixels, saved
 

@@ -150,7 +150,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             expect(s, bound, tile, bins, near, k, length)
         return here + vec16(1.0)
 
-    def step(k, splat, dx, dy, block, here, walked, kept_out, s, alphas, t_min, bound):
+    def step(k, splat, dx, dy, block, here, walked, kept_out, s, alphas, t_min, bound, tile, limits):
         fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
         raw = fall * splat.opacity
         alpha = alpha_of(raw, alphas)
@@ -158,6 +158,8 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             row = SKIPPED + block
             s[row] = skipped(raw, alphas[0], splat.color, bound, s[row])
         behind = advance(s[T + block], alpha, t_min)
+        if wp.static(variant.hides):
+            behind = where_less(here, limits[tile, block], behind, wp.min(s[T + block], -s[T + block]))
         w = weight(s[T + block], alpha, behind)
         if wp.static(variant.keep):
             kept_out[k, block] = s[T + block]
@@ -187,6 +189,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         max_steps: int,
         background: wp.array[float],  # [3]
         bound: BoundView,
+        limits: wp.array2d[vec16],  # [T, BLOCKS] instances in front of what hides, if anything does
         # out
         pixels_out: PixelsView,
         final_out: wp.array2d[vec16],  # [T, BLOCKS] transmittance behind the last Gaussian

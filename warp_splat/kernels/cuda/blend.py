@@ -82,6 +82,12 @@ def write_pixel(pixels_out: PixelsView, background: wp.array[float], y: int, x: 
             pixels_out.depth[y, x] = sums[3]
 
 
+@wp.func
+def place_of(lane: int, block: int):
+    """The pixel of a lane in one of its blocks, row by row."""
+    return down_of(lane, block) * TILE + across_of(lane, block)
+
+
 @functools.cache
 def make_blend_block(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
@@ -96,6 +102,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         max_steps: int,
         background: wp.array[float],  # [3]
         bound: BoundView,
+        limits: wp.array2d[float],  # [T, THREADS] instances in front of what hides, if anything does
         # out
         pixels_out: PixelsView,
         final_out: wp.array2d[float],  # [T, THREADS] transmittance behind the last Gaussian
@@ -163,12 +170,13 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
                                 color = wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2])
                                 settled = skip(settled, p, fall * g[OPACITY], alphas[0], color, bound)
                             behind = advance(ts[p], alpha, t_min)
+                            if wp.static(variant.hides):
+                                behind = wp.where(here < limits[tile, place_of(lane, half + p)], behind, -wp.abs(ts[p]))
                             if behind < 0.0:
                                 counts[p] = wp.min(counts[p], here)
                             w = weight(ts[p], alpha, behind)
                             if wp.static(variant.keep):
-                                place = down_of(lane, half + p) * TILE + across_of(lane, half + p)
-                                kept_out[start + first + j, place] = ts[p]
+                                kept_out[start + first + j, place_of(lane, half + p)] = ts[p]
                             reds[p] += g[CHANNEL] * w
                             greens[p] += g[CHANNEL + 1] * w
                             blues[p] += g[CHANNEL + 2] * w
@@ -180,13 +188,11 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             if (votes[0] | votes[WARP]) == 0:
                 break
         for p in range(EACH):
-            across = across_of(lane, half + p)
-            down = down_of(lane, half + p)
-            t = wp.abs(ts[p])
-            final_out[tile, down * TILE + across] = t
-            count_out[tile, down * TILE + across] = int(counts[p])
+            place = place_of(lane, half + p)
+            final_out[tile, place] = wp.abs(ts[p])
+            count_out[tile, place] = int(counts[p])
             shown = wp.vec4(reds[p], greens[p], blues[p], fars[p])
-            write_pixel(pixels_out, background, line + down, column + across, shown, t)
+            write_pixel(pixels_out, background, line + place // TILE, column + place % TILE, shown, final_out[tile, place])
             if wp.static(variant.bound):
                 conclude(settled, p, shown, ts[p], bound, since, bins, tile, lane, half, length)
 
