@@ -192,7 +192,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             final_out[tile, place] = wp.abs(ts[p])
             count_out[tile, place] = int(counts[p])
             shown = wp.vec4(reds[p], greens[p], blues[p], fars[p])
-            write_pixel(pixels_out, background, line + place // TILE, column + place % TILE, shown, final_out[tile, place])
+            write_pixel(pixels_out, background, line + place // TILE, column + place % TILE, shown, wp.abs(ts[p]))
             if wp.static(variant.bound):
                 conclude(settled, p, shown, ts[p], bound, since, bins, tile, lane, half, length)
 
