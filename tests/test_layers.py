@@ -14,7 +14,7 @@ LAYERS = [
     {"kernels", "runtime", "camera", "color"},
     {"raster"},
     {"formats"},
-    {"scene", "evaluation", "gaussians", "tape", "gsplat"},
+    {"scene", "evaluation", "gaussians", "tape", "gsplat", "newton"},
     {"rendering", "sfm", "viewer"},
     {"training"},
     {"pruning"},

@@ -227,3 +227,35 @@ def test_a_body_in_flight_is_fitted_to_pictures(tmp_path, monkeypatch):
     sys.modules.pop("flight")
     assert np.allclose(names["throw"].numpy(), names["THROW"], atol=2e-3)
     assert np.allclose(names["spin"].numpy(), names["SPIN"], atol=2e-3)
+
+
+def test_worlds_are_separate_calls_into_one_array(device):
+    """Two worlds of their own means, the rest in common, each with its camera; and no new arrays for the pictures."""
+    scene, _, weights = scene_of(device)
+    arrays = arrays_of(scene)
+    both = torch.stack([scene.means, scene.means + 0.05])
+    means = wp.from_torch(both, wp.vec3, requires_grad=True)
+    cameras = [scene.camera, make_camera(scene.camera.width, scene.camera.height, seed=3)]
+    shape = (2, scene.camera.height, scene.camera.width)
+    images = wp.zeros(shape, dtype=wp.vec3, device=device, requires_grad=True)
+    alphas = wp.zeros(shape, dtype=float, device=device, requires_grad=True)
+    surface = torch.full(shape, float(scene.means.norm(dim=1).median()), device=device)
+    surface[1] = 0.0  # no surface
+    given = [means, *(arrays[name] for name in ("quats", "scales", "opacities", "sh"))]
+    with wp.Tape() as recorded:
+        found = tape.rasterize_worlds(
+            *given, cameras=cameras, hidden_from=wp.from_torch(surface), out={"image": images, "alpha": alphas}
+        )
+    recorded.backward(grads={images: wp.from_torch(weights[..., :3].expand(2, -1, -1, -1).contiguous(), wp.vec3)})
+    for world, camera in enumerate(cameras):
+        leaf = both[world].clone().requires_grad_()
+        options = RasterOptions(hidden_from=surface[world])
+        expected = warp_splat.rasterize(leaf, *scene.parameters()[1:], camera, options=options)
+        (expected.image * weights[..., :3]).sum().backward()
+        assert torch.equal(wp.to_torch(images, requires_grad=False)[world], expected.image)
+        assert torch.equal(wp.to_torch(found[world].alpha, requires_grad=False), expected.alpha)
+        assert torch.equal(wp.to_torch(means.grad)[world], leaf.grad)
+    with pytest.raises(InputError, match=r"out\['image'\]: expected .* got \[3, 3, 3\]"):
+        tape.rasterize(
+            *(array for array in arrays.values()), scene.camera, out={"image": wp.zeros((3, 3), dtype=wp.vec3)}
+        )

@@ -4,9 +4,9 @@ Warp could not derive the loop over a tile's list (docs/adjoints.md). So the lau
 renderer stands on the tape as one function with its own adjoint, whichever of the four is asked for.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,11 +18,14 @@ from warp_splat.errors import InputError
 from warp_splat.raster import api
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped
+from warp_splat.runtime.launch import open_tape
 from warp_splat.runtime.timers import stage
 
 #: What has a gradient, and the type of its elements.
 PIXELS = {"image": wp.vec3, "alpha": wp.float32, "depth": wp.float32, "features": wp.float32, "normals": wp.vec3}
 PIXELS |= {"median_depth": wp.float32, "strongest_weights": wp.float32}
+#: Dimensions of what one world gives, counting the numbers of an element.
+RANKS = {"means": 2, "quats": 2, "scales": 2, "opacities": 1, "sh": 3, "features": 2, "hidden_from": 2, "twist": 1}
 
 
 @dataclass
@@ -55,6 +58,8 @@ def rasterize(
     twist: wp.array | None = None,
     intrinsics: wp.array | None = None,
     features: wp.array | None = None,
+    hidden_from: wp.array | None = None,
+    out: Mapping[str, wp.array] | None = None,
 ) -> TapeOutput:
     """:func:`warp_splat.rasterize` of Warp's arrays; inside ``with wp.Tape()`` it is recorded, with its adjoint.
 
@@ -75,6 +80,9 @@ def rasterize(
         twist: see :class:`warp_splat.CameraParameters`, 6 numbers, float32 or float64.
         intrinsics: likewise, fx, fy, cx, cy.
         features: any numbers, [N, C].
+        hidden_from: depth of an opaque surface, [H, W]; see :class:`warp_splat.RasterOptions`. No gradient.
+        out: arrays to write into instead of new ones, by the names of :class:`TapeOutput`'s pixels; where an input has
+            a gradient, they need one.
 
     Returns:
         A :class:`TapeOutput`.
@@ -89,7 +97,10 @@ def rasterize(
     more = {"twist": twist, "intrinsics": intrinsics, "features": features}
     given |= {name: array for name, array in more.items() if array is not None}
     named = {name: _checked(name, array) for name, array in given.items()}
-    tape = wp._src.context.runtime.tape  # pyright: ignore[reportAttributeAccessIssue] - the only way to ask for it
+    if hidden_from is not None:
+        surface = wp.to_torch(_checked("hidden_from", hidden_from), requires_grad=False)
+        options = replace(options or RasterOptions(), hidden_from=surface)
+    tape = open_tape()
     recorded = tape is not None and any(array.requires_grad for array in named.values())
     with _torch_on(means.device, recorded):
         with stage("tape"):
@@ -101,7 +112,8 @@ def rasterize(
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
         with stage("tape"):
-            pixels = {name: _array(tensor, PIXELS[name], recorded) for name, tensor in shown.items()}
+            room = out or {}
+            pixels = {name: _array(name, tensor, recorded, room.get(name)) for name, tensor in shown.items()}
             if recorded:
                 wanted = [name for name in named if named[name].requires_grad]
                 reached = [name for name, tensor in shown.items() if tensor.requires_grad]
@@ -164,9 +176,53 @@ def _adjoint(
     return backward
 
 
-def _array(tensor: torch.Tensor, dtype: type, requires_grad: bool) -> wp.array:
-    """An image in the same memory."""
-    return wp.from_torch(tensor.detach().contiguous(), dtype, requires_grad=requires_grad)
+def _array(name: str, tensor: torch.Tensor, requires_grad: bool, room: wp.array | None) -> wp.array:
+    """An image in the same memory; or in ``room``, if there is any."""
+    if room is None:
+        return wp.from_torch(tensor.detach().contiguous(), PIXELS[name], requires_grad=requires_grad)
+    target = wp.to_torch(_checked(f"out[{name!r}]", room), requires_grad=False)
+    if target.shape != tensor.shape or (requires_grad and not room.requires_grad):
+        wanted, found = list(tensor.shape), list(target.shape)
+        raise InputError(f"out[{name!r}]: expected {wanted} numbers, with requires_grad on a tape, got {found}.")
+    target.copy_(tensor.detach())
+    return room
+
+
+def rasterize_worlds(
+    means: wp.array, *gaussians: Any, cameras: Sequence[Camera], out: Mapping[str, wp.array] | None = None, **more: Any
+) -> list[TapeOutput]:
+    """:func:`rasterize` for several worlds, each through its camera.
+
+    Args:
+        means: those of all worlds, or one more dimension in front: [worlds, N]. So may every array.
+        gaussians: quats, scales, opacities and sh, likewise.
+        cameras: one for each world.
+        out: arrays [worlds, H, W] to write into.
+        more: what :func:`rasterize` takes besides; arrays as above.
+
+    Returns:
+        A :class:`TapeOutput` for each world.
+
+    Raises:
+        InputError: as :func:`rasterize` does.
+    """
+    names = ("means", "quats", "scales", "opacities", "sh")
+    given = dict(zip(names, (means, *gaussians), strict=True)) | more
+
+    def of(world: int, name: str, value: Any) -> Any:
+        """What of ``value`` is of one world."""
+        if isinstance(value, tuple):
+            return tuple(of(world, name, part) for part in value)
+        inner = len(getattr(getattr(value, "dtype", None), "_shape_", ()))
+        return value[world] if isinstance(value, wp.array) and value.ndim + inner > RANKS.get(name, 9) else value
+
+    found = []
+    for world, camera in enumerate(cameras):
+        room = {name: array[world] for name, array in (out or {}).items()}
+        found.append(
+            rasterize(**{name: of(world, name, value) for name, value in given.items()}, camera=camera, out=room)
+        )
+    return found
 
 
 @contextmanager

@@ -124,6 +124,19 @@ def launch(
     in_slices(run, bounds)
 
 
+def open_tape() -> wp.Tape | None:
+    """The tape of the caller's that records, if there is one."""
+    return wp._src.context.runtime.tape  # pyright: ignore[reportAttributeAccessIssue] - the only way to ask for it
+
+
+def launch_on_tape(kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Sequence, device: wp.Device) -> None:
+    """The one launch that a caller's tape records; on a GPU on Warp's own stream, without a tape as :func:`launch`."""
+    if open_tape() or device.is_cuda:
+        wp.launch(kernel, dim=dim, inputs=[0, *inputs], outputs=outputs, device=device)
+    else:
+        launch(kernel, dim, inputs, outputs)
+
+
 def launch_in_lanes(
     make: Callable[[int], wp.Kernel],
     lanes: int,

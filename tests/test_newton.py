@@ -1,0 +1,220 @@
+"""Gaussians in Newton's simulations: pictures against float64, meshes between them, gradients, memory."""
+
+import gc
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scenes import C0
+from scipy.spatial.transform import Rotation
+from splat_files import some_splats
+
+from warp_splat import Camera, InputError, RasterOptions
+from warp_splat.compare.oracle import exact_render, sh_basis
+from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.splats import SplatFile, concatenated
+
+newton = pytest.importorskip("newton", reason="newton is not installed")
+from newton.sensors import SensorCamera  # noqa: E402 - behind the question for it
+
+from warp_splat.newton import SensorSplatCamera, camera_of_fov, gaussian_of_file  # noqa: E402
+
+FOV, WIDTH, HEIGHT = 0.9, 40, 32
+BACKGROUND = (0.2, 0.3, 0.1)
+UNSEEN = newton.ModelBuilder.ShapeConfig(is_visible=False, density=0.0, has_shape_collision=False)
+PLACE = (0.3, -0.2, 0.1, *Rotation.from_rotvec([0.2, 0.5, -0.4]).as_quat())  # of the shape on its body
+BODIES = [(0.2, 0.1, 0.4, *Rotation.from_rotvec([0.4, -0.3, 1.2]).as_quat()), (-0.3, 0.2, -0.1, 0, 0, 0, 1)]
+CAMERAS = [(0.1, 0.2, 5.0, *Rotation.from_rotvec([0.05, 0.1, 0.2]).as_quat()), (0.3, 0.0, 4.5, 0, 0, 0, 1)]
+
+
+def small(count, coefficients, seed):
+    """Gaussians in a ball of about 1."""
+    splats = some_splats(count, coefficients, seed)
+    return splats._replace(means=splats.means / 5, scales=splats.scales / 5 - 1.8, sh=splats.sh / 2)
+
+
+@pytest.fixture(scope="module")
+def simulation(tmp_path_factory):
+    """Two worlds, each with a body of Gaussians of degree 3; others of degree 1 stand in both."""
+    folder, parts = tmp_path_factory.mktemp("files"), (small(30, 4, 1), small(25, 16, 2))
+    for number, splats in enumerate(parts):
+        save_gaussians(folder / f"{number}.ply", SplatFile(splats))
+    world, scene = newton.ModelBuilder(), newton.ModelBuilder()
+    body = world.add_body(mass=1.0)
+    world.add_shape_gaussian(
+        body, xform=PLACE, gaussian=gaussian_of_file(folder / "1.ply"), scale=(1.5, 1.5, 1.5), cfg=UNSEEN
+    )
+    scene.add_shape_gaussian(-1, gaussian=gaussian_of_file(folder / "0.ply"), cfg=UNSEEN)
+    scene.replicate(world, 2)
+    model = scene.finalize(device="cpu", requires_grad=True)
+    return SimpleNamespace(model=model, parts=parts, sensor=SensorSplatCamera(model, background=BACKGROUND))
+
+
+def moved(splats, transform, scale=1.0):
+    """In float64, so that differences may be small."""
+    turn = Rotation.from_quat(transform[3:])
+    directions = torch.from_numpy(np.random.default_rng(0).normal(size=(64, 3)))
+    directions /= directions.norm(dim=1, keepdim=True)
+    degree = round(splats.sh.shape[1] ** 0.5) - 1
+    here, there = sh_basis(directions, degree), sh_basis(directions @ torch.from_numpy(turn.as_matrix()), degree)
+    return splats._replace(
+        means=scale * splats.means.astype(float) @ turn.as_matrix().T + transform[:3],
+        sh=np.einsum("jk,nkc->njc", torch.linalg.lstsq(here, there).solution.numpy(), splats.sh),
+        scales=splats.scales + np.log(scale),
+        quats=(turn * Rotation.from_quat(splats.quats.astype(float), scalar_first=True)).as_quat(scalar_first=True),
+    )
+
+
+def seen_exactly(parts, body, camera_transform, **cuts):
+    """The float64 renderer's picture of a world, whose harmonics are turned."""
+    both = [parts[0], moved(moved(parts[1], PLACE, 1.5), body)]
+    means, sh, opacities, scales, quats = (torch.from_numpy(array).double() for array in concatenated(both))
+    turn = np.diag([1.0, -1, -1]) @ Rotation.from_quat(camera_transform[3:]).as_matrix().T
+    fov = camera_of_fov(WIDTH, HEIGHT, FOV)
+    camera = Camera(WIDTH, HEIGHT, fov.fx, fov.fy, fov.cx, fov.cy, turn, -turn @ np.array(camera_transform[:3]))
+    return exact_render(means, quats, scales.exp(), opacities.sigmoid(), sh, camera, BACKGROUND, **cuts)
+
+
+def state_of(simulation, bodies=BODIES):
+    state = simulation.model.state()
+    state.body_q.assign(np.float32(bodies))
+    return state
+
+
+def images(count=2, **kinds):
+    return {
+        name: wp.zeros((count, HEIGHT, WIDTH), dtype=kind, requires_grad=kind != wp.uint32)
+        for name, kind in kinds.items()
+    }
+
+
+def test_pictures_are_those_of_the_float64_renderer(simulation):
+    """Four views of two worlds, in any order; the index is that of the strongest Gaussian's shape."""
+    worlds = [1, 0, 0, 1]
+    transforms = wp.array([CAMERAS[view % 2] for view in range(4)], dtype=wp.transform)
+    made = images(4, rgb_image=wp.vec3, color_image=wp.uint32, forward_depth_image=float, shape_index_image=wp.uint32)
+    simulation.sensor.update(
+        state_of(simulation), transforms, camera_of_fov(WIDTH, HEIGHT, FOV), world_indices=worlds, **made
+    )
+    for view, world in enumerate(worlds):
+        exact = seen_exactly(simulation.parts, BODIES[world], CAMERAS[view % 2])
+        rgb = made["rgb_image"].numpy()[view]
+        np.testing.assert_allclose(rgb, exact.image, atol=1e-4)
+        packed = made["color_image"].numpy()[view].view(np.uint8).reshape(HEIGHT, WIDTH, 4)
+        np.testing.assert_allclose(packed[..., :3], 255 * np.clip(rgb, 0, 1), atol=0.51)
+        indices = made["shape_index_image"].numpy()[view]
+        assert set(np.unique(indices)) <= {0, 1 + world, 2**32 - 1} and (indices == 1 + world).any()
+        assert (made["forward_depth_image"].numpy()[view][exact.alpha > 0.1] > 1).all()
+
+
+def test_gradients_are_those_of_finite_differences(simulation):
+    """Of bodies and cameras, to 1e-4, against differences of the float64 renderer; without cuts, which jump."""
+    cuts = {"alpha_min": 0.0, "t_min": 0.0}
+    sensor = SensorSplatCamera(simulation.model, background=BACKGROUND, options=RasterOptions(**cuts))
+    weights = np.random.default_rng(0).uniform(-1, 1, (2, HEIGHT, WIDTH, 3)).astype(np.float32)
+    state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform, requires_grad=True)
+    made = images(rgb_image=wp.vec3)
+    with wp.Tape() as recorded:
+        sensor.update(state, transforms, camera_of_fov(WIDTH, HEIGHT, FOV), **made)
+    recorded.backward(grads={made["rgb_image"]: wp.array(weights, dtype=wp.vec3)})
+
+    def loss(body, camera):
+        return float((seen_exactly(simulation.parts, body, camera, **cuts).image.numpy() * weights[0]).sum())
+
+    def nudged(transform, axis, step):
+        turn = Rotation.from_rotvec(step * np.eye(3)[axis - 3] if axis >= 3 else np.zeros(3))
+        place = np.array(transform[:3]) + (step * np.eye(3)[axis] if axis < 3 else 0)
+        return (*place, *(turn * Rotation.from_quat(transform[3:])).as_quat())
+
+    for array, which in ((state.body_q, 0), (transforms, 1)):
+        slopes, found = array.grad.numpy()[0].astype(np.float64), []
+        quat = [BODIES[0], CAMERAS[0]][which][3:]
+        for axis in range(6):
+            one = np.eye(3)[axis % 3]
+            change = [*one, 0, 0, 0, 0] if axis < 3 else [0, 0, 0, *half_of_product(one, quat)]  # d(exp(w / 2) q) / dw
+            ends = []
+            for step in (1e-5, -1e-5):
+                pair = [BODIES[0], CAMERAS[0]]
+                pair[which] = nudged(pair[which], axis, step)
+                ends.append(loss(*pair))
+            found.append((slopes @ change, (ends[0] - ends[1]) / 2e-5))
+        found = np.array(found)
+        assert np.linalg.norm(found[:, 0] - found[:, 1]) < 1e-4 * np.linalg.norm(found[:, 1]), found
+
+
+def half_of_product(axis, quat):
+    """Half of the product of (axis, 0) and ``quat``, x y z w."""
+    vector, w = np.array(quat[:3]), quat[3]
+    return 0.5 * np.array([*(w * np.array(axis) + np.cross(axis, vector)), -np.dot(axis, vector)])
+
+
+def test_meshes_hide_splats_and_splats_hide_meshes():
+    """Newton's own picture of a slanted board between three splats that fill the view, against a sum by hand."""
+    depths, opacities = (2.0, 3.0, 5.0), np.float32([0.4, 0.6, 0.9])
+    colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    builder = newton.ModelBuilder()
+    builder.add_shape_gaussian(
+        -1,
+        gaussian=newton.Gaussian(
+            [[0, 0, -z] for z in depths], None, [[900, 900, 1e-3]] * 3, opacities, (colors - 0.5) / C0
+        ),
+        cfg=UNSEEN,
+    )
+    board = (0.6, 0.0, -3.2, *Rotation.from_rotvec([0, 0.9, 0]).as_quat())
+    builder.add_shape_box(-1, xform=board, hx=1.2, hy=0.7, hz=0.01)
+    model = builder.finalize(device="cpu")
+    state, transforms = model.state(), wp.array([(0, 0, 0, 0, 0, 0, 1)], dtype=wp.transform)
+    theirs, rays = SensorCamera(model), SensorCamera.compute_camera_rays_pinhole(WIDTH, HEIGHT, camera_fov=FOV)
+    mesh = images(1, color_image=wp.uint32, forward_depth_image=float, shape_index_image=wp.uint32)
+    theirs.update(state, transforms, rays, **mesh)
+    color, depth = mesh["color_image"].numpy()[0], mesh["forward_depth_image"].numpy()[0].copy()
+    color = color.view(np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3] / 255
+    assert (depth == 0).any() and ((depth > 2) & (depth < 3)).any() and ((depth > 3) & (depth < 5)).any()
+    given = {"mesh_color": "color_image", "mesh_depth": "forward_depth_image", "mesh_index": "shape_index_image"}
+    made = images(1, rgb_image=wp.vec3) | mesh  # their pictures are written over
+    SensorSplatCamera(model).update(
+        state, transforms, camera_of_fov(WIDTH, HEIGHT, FOV), **made, **{a: mesh[b] for a, b in given.items()}
+    )
+    hit = depth > 0
+    image, light, sum_z = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH))
+    shares = []
+    for z, opacity, own in zip(depths, opacities, colors, strict=True):
+        share = np.where(hit & (z >= depth), 0.0, light * opacity)
+        image, light, sum_z = image + share[..., None] * own, light - share, sum_z + share * z
+        shares.append(share)
+    np.testing.assert_allclose(made["rgb_image"].numpy()[0], image + (light * hit)[..., None] * color, atol=3e-4)
+    wanted = np.where(hit, sum_z + light * depth, sum_z / np.maximum(1 - light, 1e-9))
+    np.testing.assert_allclose(made["forward_depth_image"].numpy()[0], wanted, rtol=1e-3)
+    np.testing.assert_array_equal(
+        made["shape_index_image"].numpy()[0], np.where(hit & (light > np.max(shares, 0)), 1, 0)
+    )
+
+
+def test_nothing_piles_up(simulation):
+    state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
+    camera, made = camera_of_fov(WIDTH, HEIGHT, FOV), images(rgb_image=wp.vec3, forward_depth_image=float)
+
+    def arrays_alive():
+        gc.collect()
+        return sum(isinstance(thing, wp.array) for thing in gc.get_objects())
+
+    counts = []
+    for _ in range(3):
+        for _ in range(10):
+            simulation.sensor.update(state, transforms, camera, **made)
+        counts.append(arrays_alive())
+    assert counts[0] == counts[1] == counts[2]
+
+
+def test_refused_in_one_sentence(simulation):
+    empty = newton.ModelBuilder().finalize(device="cpu")
+    with pytest.raises(InputError, match="expected a Gaussian shape"):
+        SensorSplatCamera(empty)
+    state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
+    camera = camera_of_fov(WIDTH, HEIGHT, FOV)
+    with pytest.raises(InputError, match=r"rgb_image: expected shape \(2, 32, 40\), got \(3, 32, 40\)"):
+        simulation.sensor.update(state, transforms, camera, **images(3, rgb_image=wp.vec3))
+    with pytest.raises(InputError, match=r"world_indices: expected 2 of 0..1, got \[0, 2\]"):
+        simulation.sensor.update(state, transforms, camera, world_indices=[0, 2])

@@ -1,0 +1,246 @@
+"""A camera sensor for Newton's simulations: draws the Gaussian shapes of a model, placed by bodies, among its meshes.
+
+The tape of Warp has all of it: :mod:`warp_splat.kernels.place` around :mod:`warp_splat.tape`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_splat import tape
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.stored import sigmoid, unit_quats
+from warp_splat.kernels.place import ShapeView, make_place, name_shapes, put_among_meshes
+from warp_splat.runtime.launch import launch_on_tape, open_tape
+
+
+@dataclass
+class Piece:
+    """A Gaussian shape of a world."""
+
+    shape: int
+    body: int
+    count: int
+    coefficients: int
+    view: ShapeView
+
+
+@dataclass
+class Layout:
+    """What worlds of the same Gaussians share, and room for one view of them."""
+
+    scales: wp.array  # [N] vec3
+    opacities: wp.array  # [N]
+    room: tuple[wp.array, wp.array, wp.array]  # means, quats and colors in a camera's frame
+
+
+class SensorSplatCamera:
+    """Draws all Gaussian shapes of a Newton model: harmonics of all degrees, any number of hits, gradients.
+
+    Shapes of a body follow it; those of no world are part of all, and held once. Whether they are VISIBLE does not
+    matter: with ``is_visible=False``, Newton's own sensor leaves them to this one. Not thread-safe.
+
+    Args:
+        model: the ``newton.Model``.
+        background: RGB behind everything.
+        options: of the renderer; ``depth`` and ``strongest`` are set as images are asked for.
+        adjoint: as in :func:`warp_splat.rasterize`.
+
+    Raises:
+        InputError: if the model has no Gaussian shape, or one with a scale that is not the same along all axes.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        *,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        options: RasterOptions | None = None,
+        adjoint: str = "manual",
+    ):
+        self.model, self.device, self.adjoint = model, model.device, adjoint
+        self.background, self.options = wp.vec3(*background), options or RasterOptions()
+        self._layouts: dict[tuple, Layout] = {}
+        self._pixels: dict[tuple, wp.array] = {}
+        self._owners: dict[int, wp.array] = {}
+        bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()
+        sizes, views = model.shape_scale.numpy(), {}
+        own: dict[int, list[tuple[Piece, tuple]]] = {world: [] for world in range(-1, model.world_count)}
+        for shape, source in enumerate(model.shape_source):
+            if not hasattr(source, "sh_coeffs"):
+                continue
+            size = float(sizes[shape][0])
+            if not (size > 0 and np.allclose(sizes[shape], size)):
+                raise InputError(f"shape {shape}: expected a scale that is positive and the same along all axes.")
+            key = (id(source), size)
+            if key not in views:
+                views[key] = self._view(source, size)
+            piece = Piece(shape, int(bodies[shape]), source.count, views[key].sh.shape[1], views[key])
+            own[int(worlds[shape])].append((piece, (key, source)))
+        if not views:
+            raise InputError("model: expected a Gaussian shape (ModelBuilder.add_shape_gaussian), found none.")
+        self._worlds = []
+        for world in range(max(model.world_count, 1)):
+            pieces = own[-1] + own.get(world, [])
+            self._worlds.append(([piece for piece, _ in pieces], self._layout([source for _, source in pieces])))
+
+    def update(
+        self,
+        state: Any,
+        camera_transforms: wp.array,
+        camera: Camera,
+        *,
+        rgb_image: wp.array | None = None,
+        color_image: wp.array | None = None,
+        forward_depth_image: wp.array | None = None,
+        shape_index_image: wp.array | None = None,
+        mesh_color: wp.array | None = None,
+        mesh_depth: wp.array | None = None,
+        mesh_index: wp.array | None = None,
+        world_indices: Sequence[int] | None = None,
+    ) -> None:
+        """Draw; inside ``with wp.Tape()``, with gradients from ``rgb_image`` and ``forward_depth_image``.
+
+        They go to ``state.body_q``, ``camera_transforms`` and ``model.shape_transform``, where those want them. Images
+        are [views, H, W], as ``newton.sensors.SensorCamera``'s, and those of meshes may be written over.
+
+        Args:
+            state: the ``newton.State``.
+            camera_transforms: [views] transform, world from camera, which looks along -z with y up.
+            camera: size and lens, of all views; its pose does not count.
+            rgb_image: vec3, colors as trained, displayed without a change.
+            color_image: uint32, the same packed as Newton packs RGBA.
+            forward_depth_image: float, expected depth along the axis; 0 where nothing is.
+            shape_index_image: uint32, the shape seen most; 0xFFFFFFFF where nothing is.
+            mesh_color: uint32, ``color_image`` of Newton's sensor: what is seen through the Gaussians.
+            mesh_depth: float, its ``forward_depth_image``: hides Gaussians whose centers are farther.
+            mesh_index: uint32, its ``shape_index_image``.
+            world_indices: world of each view; by default view i is world i.
+
+        Raises:
+            InputError: if an image is of another shape, or a view of no world.
+        """
+        views = len(camera_transforms)
+        shape = (views, camera.height, camera.width)
+        outputs = {"rgb_image": rgb_image, "color_image": color_image, "forward_depth_image": forward_depth_image}
+        outputs |= {"shape_index_image": shape_index_image, "mesh_color": mesh_color, "mesh_depth": mesh_depth}
+        for name, array in {**outputs, "mesh_index": mesh_index}.items():
+            if array is not None and array.shape != shape:
+                raise InputError(f"{name}: expected shape {shape}, got {array.shape}.")
+        chosen = range(views) if world_indices is None else [int(world) for world in world_indices]
+        if len(chosen) != views or not all(0 <= world < len(self._worlds) for world in chosen):
+            raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {list(chosen)}.")
+        camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))
+        options = replace(
+            self.options, depth=forward_depth_image is not None, strongest=int(shape_index_image is not None)
+        )
+        recorded = open_tape() is not None
+        for view, world in enumerate(chosen):
+            pieces, layout = self._worlds[world]
+            gaussians = self._place(view, pieces, layout, state, camera_transforms, recorded)
+            of = lambda array: None if array is None else array[view]  # noqa: B023, E731 - called at once
+            surface = of(mesh_depth)
+            room = {} if recorded else {name: self._room(name, shape[1:]) for name in ("image", "alpha")}
+            if options.depth and not recorded:
+                room["depth"] = self._room("depth", shape[1:])
+            means, quats, sh = gaussians
+            seen = tape.rasterize(
+                *(means, quats, layout.scales, layout.opacities, sh, camera),
+                **{"adjoint": self.adjoint, "options": options, "hidden_from": surface, "out": room},
+            )
+            rgb = of(rgb_image) if rgb_image is not None else self._room("rgb", shape[1:])
+            inputs = [seen.image, seen.alpha, seen.depth, self.background, of(mesh_color), surface]
+            made = [rgb, of(color_image), of(forward_depth_image)]
+            pixels = camera.height * camera.width
+            launch_on_tape(put_among_meshes, pixels, inputs, made, self.device)
+            if shape_index_image is not None:
+                inputs = [seen.strongest, seen.strongest_weights, seen.alpha, self._owners_of(world), surface]
+                made = [of(shape_index_image)]
+                launch_on_tape(name_shapes, pixels, [*inputs, of(mesh_index)], made, self.device)
+
+    def _place(self, view: int, pieces: list[Piece], layout: Layout, state, camera_transforms, recorded: bool) -> tuple:
+        """Means, quats and colors of a world's Gaussians in the camera's frame; on a tape, in arrays of their own."""
+        made = layout.room
+        if recorded:
+            made = tuple(wp.empty_like(array, requires_grad=True) for array in layout.room)
+        begin = 0
+        for piece in pieces:
+            where = wp.vec4i(view, piece.body, piece.shape, begin)
+            inputs = [where, piece.view, self.model.shape_transform, state.body_q, camera_transforms]
+            launch_on_tape(make_place(piece.coefficients), piece.count, inputs, made, self.device)
+            begin += piece.count
+        return made
+
+    def _view(self, source: Any, size: float) -> ShapeView:
+        """The arrays of a ``newton.Gaussian``, whose coefficients are in the order of PLY files."""
+        view, count = ShapeView(), source.count
+        coefficients = next(k for k in (16, 9, 4, 1) if source.sh_coeffs.shape[1] >= 3 * k)
+        rest = source.sh_coeffs[:, 3 : 3 * coefficients].reshape(count, 3, coefficients - 1).transpose(0, 2, 1)
+        sh = np.concatenate([source.sh_coeffs[:, None, :3], rest], 1)
+        view.means = wp.array(size * source.positions, dtype=wp.vec3, device=self.device)
+        view.quats = wp.array(source.rotations, dtype=wp.quat, device=self.device)
+        view.sh = wp.array(sh, dtype=wp.vec3, device=self.device)
+        return view
+
+    def _layout(self, sources: list[tuple]) -> Layout:
+        """Of the Gaussians of a world."""
+        key = tuple(key for key, _ in sources)
+        if key not in self._layouts:
+            scales = [size * source.scales for (_, size), source in sources]
+            opacities = [source.opacities for _, source in sources]
+            scales, opacities = (np.concatenate(arrays) for arrays in (scales, opacities))
+            new = {"device": self.device}
+            room = [wp.empty(len(opacities), dtype=kind, **new) for kind in (wp.vec3, wp.quat)]
+            room.append(wp.empty((len(opacities), 1), dtype=wp.vec3, **new))
+            self._layouts[key] = Layout(
+                wp.array(scales, dtype=wp.vec3, **new), wp.array(opacities, dtype=float, **new), tuple(room)
+            )
+        return self._layouts[key]
+
+    def _room(self, name: str, shape: tuple[int, ...]) -> wp.array:
+        """An image that is used again."""
+        if (name, shape) not in self._pixels:
+            kind = wp.vec3 if name in ("image", "rgb") else wp.float32
+            self._pixels[name, shape] = wp.empty(shape, dtype=kind, device=self.device)
+        return self._pixels[name, shape]
+
+    def _owners_of(self, world: int) -> wp.array:
+        """The shape of each Gaussian."""
+        if world not in self._owners:
+            pieces, _ = self._worlds[world]
+            shapes = np.repeat([piece.shape for piece in pieces], [piece.count for piece in pieces])
+            self._owners[world] = wp.array(shapes.astype(np.uint32), dtype=wp.uint32, device=self.device)
+        return self._owners[world]
+
+
+def camera_of_fov(width: int, height: int, camera_fov: float) -> Camera:
+    """The pinhole of Newton's ``compute_camera_rays_pinhole``; ``camera_fov`` is vertical, in radians."""
+    focal = 0.5 * height / math.tan(0.5 * camera_fov)
+    return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(3), np.zeros(3))
+
+
+def gaussian_of_file(path: str | Path, **more: Any) -> Any:
+    """A ``newton.Gaussian`` of a file of any of our formats, in the axes of its training: y down, z forward.
+
+    ``more`` goes to its constructor.
+
+    Raises:
+        InputError: if the file cannot be read, or the package newton is not installed.
+    """
+    try:
+        import newton  # noqa: PLC0415 - optional
+    except ImportError as error:
+        raise InputError("newton: expected the package newton; `pip install 'newton>=1.8'`.") from error
+    means, sh, opacities, scales, quats = load_gaussians(path).splats
+    coefficients = np.concatenate([sh[:, 0], sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)], 1)
+    return newton.Gaussian(
+        means, unit_quats(quats)[:, [1, 2, 3, 0]], np.exp(scales), sigmoid(opacities), coefficients, **more
+    )
