@@ -13,10 +13,10 @@ import torch
 from PIL import Image
 
 from warp_splat.audit.judged import LEVEL, SceneRow, exact_image, in_eight_bits, measure, smallest
+from warp_splat.audit.program import stored, write_files
 from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
-from warp_splat.audit.program import stored, write_files
 from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
