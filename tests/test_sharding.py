@@ -1,5 +1,6 @@
 """Gaussians in blocks on several processes: every answer is that of the whole, to the bit, and so is the model."""
 
+import math
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.blocks import load_own, save_in_blocks
 from warp_splat.formats.checkpoint import save_checkpoint
 from warp_splat.formats.curve import along_curve, keys_of
+from warp_splat.runtime import watch
 from warp_splat.runtime.rows import Rows
 from warp_splat.runtime.shards import Shards
 from warp_splat.training.options import TrainConfig
@@ -181,3 +183,17 @@ def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):
 def test_what_needs_whole_models_is_refused(options, scene):
     with pytest.raises(InputError, match="--shard: expected a training without --"):
         Trainer(scene, TrainConfig(device="cpu", **options), Shards(0, 1))
+
+
+def test_a_process_without_signs_is_named(monkeypatch):
+    """Of three, the last leaves no sign, and the second one has left as it should."""
+    monkeypatch.setattr(watch, "GONE", 1.5)
+    store = torch.distributed.HashStore()
+    for name, sign in {"sign/0": "0", "sign/1": watch.LEFT, "sign/2": "5"}.items():
+        store.set(name, sign)
+    one = watch.Watch(0, 3, store, math.inf)
+    thread = threading.Thread(target=one.look, daemon=True)
+    thread.start()
+    assert one.silent() == [2]
+    one.stopped.set()
+    thread.join(5)

@@ -19,6 +19,7 @@ from warp_splat.errors import InputError
 from warp_splat.runtime.devices import is_out_of_memory
 from warp_splat.runtime.rows import Rows
 from warp_splat.runtime.timers import stage
+from warp_splat.runtime.watch import Watch, watching
 
 T = TypeVar("T")
 PATIENCE = timedelta(minutes=5)  # with a process that is silent: it may be evaluating, or compiling kernels
@@ -43,6 +44,7 @@ class Processes(Rows):
     """
 
     lost = False
+    watch: Watch | None = None
 
     def __init__(self, rank: int = 0, count: int = 1, local_count: int = 1, images: int = 0):
         self.rank, self.count, self.local_count, self.images = rank, count, local_count, images or count
@@ -131,9 +133,11 @@ class Processes(Rows):
             self.lost = True
             silent = any(words in str(error).lower() for words in ("timed out", "timeout"))
             what = f"was silent for {PATIENCE.seconds // 60} minutes" if silent else "has ended"
+            gone = self.watch.silent() if self.watch else []
+            which = f" (no sign of process {', '.join(map(str, gone))})" * bool(gone)
             raise GroupError(
-                f"Process {self.rank}: expected an answer from all {self.count} processes, but one {what}; see which "
-                "one, and why, in its own message or in torchrun's report."
+                f"Process {self.rank}: expected an answer from all {self.count} processes, but one {what}{which}; see "
+                "which one, and why, in its own message or in torchrun's report."
             ) from error
 
 
@@ -189,6 +193,9 @@ def join(device: str, images: int = 0, kind: type[Processes] = Processes) -> Ite
             f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges ({str(error).splitlines()[0]})."
         ) from error
     try:
-        yield kind(rank, count, local_count, images)
+        with watching(rank, count, ends=kind.sharded) as watch:
+            processes = kind(rank, count, local_count, images)
+            processes.watch = watch
+            yield processes
     finally:
         dist.destroy_process_group()
