@@ -15,6 +15,7 @@ from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.compare.oracle import exact_render, sh_basis
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
+from warp_splat.runtime import pool
 
 newton = pytest.importorskip("newton", reason="newton is not installed")
 from newton.sensors import SensorCamera  # noqa: E402 - behind the question for it
@@ -218,3 +219,18 @@ def test_refused_in_one_sentence(simulation):
         simulation.sensor.update(state, transforms, camera, **images(3, rgb_image=wp.vec3))
     with pytest.raises(InputError, match=r"world_indices: expected 2 of 0..1, got \[0, 2\]"):
         simulation.sensor.update(state, transforms, camera, world_indices=[0, 2])
+
+
+def test_any_number_of_threads_gives_the_same_bytes(simulation):
+    """As many pixels as threads share."""
+    state, transforms, camera = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform), camera_of_fov(160, 96, FOV)
+    kinds, found = {"rgb_image": wp.vec3, "color_image": wp.uint32, "shape_index_image": wp.uint32}, []
+    before = pool.get_threads()
+    for threads in (1, 3):
+        made = {name: wp.zeros((2, 96, 160), dtype=kind) for name, kind in kinds.items()}
+        pool.set_threads(threads)
+        simulation.sensor.update(state, transforms, camera, **made)
+        found.append([array.numpy() for array in made.values()])
+    pool.set_threads(before)
+    assert found[0][0].std() > 0.05
+    assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))

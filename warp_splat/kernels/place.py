@@ -85,8 +85,8 @@ def put_among_meshes(
     color_out: wp.array2d[wp.uint32],  # [H, W] or empty, as what follows
     depth_out: wp.array2d[float],  # [H, W]
 ):
-    y = first + wp.tid() // image.shape[1]
-    x = wp.tid() % image.shape[1]
+    y = (first + wp.tid()) // image.shape[1]
+    x = (first + wp.tid()) % image.shape[1]
     through = 1.0 - alpha[y, x]
     behind = background
     far = float(0.0)
@@ -120,8 +120,8 @@ def name_shapes(
     # out
     index_out: wp.array2d[wp.uint32],  # [H, W] shape that is seen most
 ):
-    y = first + wp.tid() // alpha.shape[1]
-    x = wp.tid() % alpha.shape[1]
+    y = (first + wp.tid()) // alpha.shape[1]
+    x = (first + wp.tid()) % alpha.shape[1]
     index = NOTHING
     share = float(0.0)
     if mesh_index.shape[0] > 0:
