@@ -22,6 +22,7 @@ from warp_splat.formats.png import save_png
 from warp_splat.text import table_of
 
 ALL = {**OURS, **OTHERS}
+NEARLY = 0.03  # eight levels of a screen
 USUAL = 1e-2  # the first scene is pictured where more than this share of the pixels is off
 
 
@@ -53,6 +54,7 @@ def summary(facts: dict) -> dict:
     }
     return facts | {
         "right": f"{sum(row['off'] == 0 for row in drawn)} of {len(rows)}",
+        "near": sum(row["largest"] <= NEARLY for row in drawn),
         "by_rules": sum(row["own"] == 0 for row in drawn),
         "failed": len(rows) - len(drawn),
         "mean": float(np.mean([row["mean"] for row in drawn])) if drawn else None,
@@ -70,6 +72,7 @@ def write_summary(out: Path) -> None:
         "version": "{version}",
         "SH": "{degree}",
         "scenes right": "{right}",
+        "within 3 %": "{near}",
         "by its own rules": "{by_rules}",
         "mean error": "{mean:.1e}",
         "gradients, median": "{gradient:.1e}",

@@ -24,9 +24,16 @@ export function placed(camera, entry) {
   return camera;
 }
 
-export const frames = async (count, draw) => {
-  for (let i = 0; i < count; i++) {
+// Draws until the canvas has not changed for six frames, and shows something; for blank ones, 40 frames at most.
+export async function settled(canvas, draw) {
+  const paper = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+  for (let i = 0, same = 0, last = ""; i < 40 && same < 6; i++) {
     await new Promise((resolve) => setTimeout(() => requestAnimationFrame(resolve), 40));
     await draw?.();
+    paper.clearRect(0, 0, canvas.width, canvas.height);
+    paper.drawImage(canvas, 0, 0);
+    const pixels = paper.getImageData(0, 0, canvas.width, canvas.height).data;
+    const shown = pixels.some((value, index) => index % 4 < 3 && value > 0) ? pixels.join() : "";
+    [same, last] = [shown && shown === last ? same + 1 : 0, shown];
   }
-};
+}

@@ -15,6 +15,7 @@ import torch
 
 from warp_splat.audit.renderer import Answer
 from warp_splat.audit.small_scenes import balls, on_all_pixels
+from warp_splat.color import from_srgb, to_srgb
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import make_camera, tensors
 from warp_splat.compare.workloads import Workload
@@ -32,15 +33,13 @@ KNOWN = {"1/255": 1 / 255, "1/512": 1 / 512} | {
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """Encoded for a screen (IEC 61966-2-1)."""
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    """Encoded for a screen."""
+    return to_srgb(np.clip(linear, 0, 1), np.where)
 
 
 def decoded_srgb(shown: np.ndarray) -> np.ndarray:
     """The inverse of :func:`srgb`."""
-    shown = np.clip(shown, 0, 1)
-    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    return from_srgb(np.clip(shown, 0, 1), np.where)
 
 
 def named_between(low: float, high: float) -> tuple[float, str]:
