@@ -25,7 +25,7 @@ def draw(means, quats, scales, opacities, sh, camera, background):
         "w": camera.width,
         "h": camera.height,
     }
-    places |= {"px": camera.width / 2 - camera.cx, "py": camera.cy - camera.height / 2}
+    places |= {"px": camera.width / 2 - camera.cx, "py": camera.height / 2 - camera.cy}
     places |= {"fx": camera.fx, "fy": camera.fy, "hidden": text(camera.center - 100 * camera.rotation[2])}
     model = mujoco.MjModel.from_xml_string(MODEL.format(**places))
     data = mujoco.MjData(model)
