@@ -15,6 +15,7 @@ from filelock import FileLock
 from warp_splat import get_threads, set_threads
 from warp_splat.cli import main
 from warp_splat.config import RasterOptions
+from warp_splat.export_html import command, pack
 from warp_splat.kernels import ssim
 from warp_splat.kernels.cpu.adjoint import make_reverse
 from warp_splat.kernels.cpu.blend import make_blend
@@ -117,3 +118,10 @@ def fake_viser(monkeypatch):
     module = ModuleType("viser")
     module.ViserServer = FakeServer
     monkeypatch.setitem(sys.modules, "viser", module)
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    """10,000 Gaussians are three parts, after one of 4,096 that stand for them."""
+    monkeypatch.setattr(pack, "CHUNK", 4096)
+    monkeypatch.setattr(command, "MOST_MOVING", 4096)

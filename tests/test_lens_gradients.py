@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from learned_cameras import LENS_ERROR, exact_render, gradients_of, learned
 from scenes import LENSES, SCENES
-from test_camera_gradients import LENS_ERROR, exact_render, gradients_of, learned
 
 from warp_splat import CameraParameters, Lens, RasterOptions
 from warp_splat.compare import exact_lenses, oracle, truth
