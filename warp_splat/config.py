@@ -107,7 +107,7 @@ class RasterOptions:
     hidden_from: torch.Tensor | None = None
 
 
-@dataclass
+@dataclass(kw_only=True)
 class OnDevice:
     """Where it is computed."""
 
