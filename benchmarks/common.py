@@ -10,6 +10,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import torch
+import warp as wp
 
 from warp_splat.evaluation.report import machine
 from warp_splat.runtime import pool
@@ -88,6 +89,15 @@ def write_table(
         out.mkdir(parents=True, exist_ok=True)
         (out / f"{name}.md").write_text(f"{table}\n\n{note} Measured by `benchmarks/{name}.py` on {machine()}.\n")
         (out / f"{name}.json").write_text(json.dumps(measured, indent=1) + "\n")
+
+
+def versions() -> str:
+    """Of torch and Warp, of CUDA in both, and of the driver: they decide what code a GPU gets."""
+    wp.init()
+    dotted = lambda version: ".".join(map(str, version)) if version else "none"  # noqa: E731
+    toolkit, driver = map(dotted, (wp.get_cuda_toolkit_version(), wp.get_cuda_driver_version()))
+    built = f"torch {torch.__version__} (CUDA {torch.version.cuda}), Warp {wp.__version__} (CUDA {toolkit})"
+    return f"{built}, driver for CUDA {driver}"
 
 
 def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 import warp as wp
-from common import parse, write_table
+from common import parse, versions, write_table
 
 from warp_splat.config import ADJOINTS, STRONGEST_MOST
 from warp_splat.kernels import sh_colors
@@ -177,6 +177,7 @@ def main() -> None:
     headers = ("module", "kernel", "threads", "registers", "stack", "static B", "dynamic B", "loop")
     headers = (*headers, *(f"sm_{arch} %" for arch in LIMITS))
     note = "The most of any architecture; occupancy in percent. Loop: instructions of the longest that holds no other."
+    note += f" {versions()}."
     write_table("cubins", arguments.out, headers, rows, note, {"records": records})
 
 

@@ -6,11 +6,13 @@
                                                          # on a machine whose Warp was built without them; of the
                                                          # small case, if the file is called gpu_expected.npz
 
-Checks: the self-test, every mode against the CPU's results (of a small case they lie in gpu_expected.npz), two runs bit
-for bit, a small case under compute-sanitizer's memcheck, racecheck and synccheck, pytest. On a card each check and each
-measurement has a process of its own: one that ends by an illegal address ends no other.
-Measures: training steps by stage and as a whole against the sum of stages and of kernels; the two blends' share of the
-card's bandwidth and arithmetic; slots against atomics; an orbit with and without the thesis's loop cap; all adjoints,
+In this order. Checks: ``rasterize`` as a process's first call; the self-test; a small case under compute-sanitizer's
+memcheck, racecheck and synccheck; every mode's two runs bit for bit, and against the CPU's results (of a small case
+they lie in gpu_expected.npz). On a card each check and each measurement has a process of its own: one that ends by an
+illegal address ends no other.
+Measures: training steps by stage and as a whole against the sum of stages and of kernels; the longest tile's share of
+the adjoint. Then pytest, a larger case against the CPU, and the other tables: the two blends' share of the card's
+bandwidth and arithmetic; slots against atomics; an orbit with and without the thesis's loop cap; all adjoints,
 error against time; what the host needs for a step; whole training against the CPU's; gsplat beside ours, if it can be
 imported; kernels by ncu, if it is installed. Times are medians. What the time does not suffice for is listed.
 """
@@ -27,7 +29,7 @@ import numpy as np
 import torch
 import warp as wp
 from common import option, parse
-from gpu_blends import measure_blends
+from gpu_blends import blends_of, measure_blends, measure_longest
 from gpu_results import Results
 from gpu_steps import measure_errors, measure_modes, measure_orbit, measure_step
 from gpu_training import NOISE, measure_gsplat, measure_training, profile_by_ncu
@@ -98,6 +100,17 @@ def test_itself(results: Results, device: str) -> None:
     results.judge("self-test", "right", True)
 
 
+FIRST_CALL = """
+import numpy, torch
+from warp_splat import Camera, rasterize
+means, scales, sh = torch.zeros(1, 3), torch.full((1, 3), 0.5), torch.ones(1, 1, 3)
+given = [tensor.to("DEVICE") for tensor in (means, torch.eye(4)[:1], scales, torch.full((1,), 0.9), sh)]
+camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, numpy.eye(3), numpy.array([0.0, 0.0, 3.0]))
+middle = rasterize(*given, camera).image[12, 16].cpu()
+assert 0.6 < middle.min() < 0.8, middle  # 0.9 (0.5 + 0.282), and a little beside the middle
+"""
+
+
 def run_checked(results: Results, what: str, command: Sequence) -> None:
     """A program that says by its exit code whether all is well."""
     if shutil.which(command[0]) is None:
@@ -113,18 +126,15 @@ def run_checked(results: Results, what: str, command: Sequence) -> None:
     )
 
 
-def check_by_programs(results: Results) -> None:
-    """A small case under compute-sanitizer, and the tests that run for CUDA."""
+def check_by_sanitizer(results: Results) -> None:
+    """A small case under each of compute-sanitizer's tools."""
     for tool in TOOLS:
         command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", sys.executable, __file__, "--small"]
         results.attempt(tool, lambda tool=tool, command=command: run_checked(results, tool, command), 30)
-    tests = [sys.executable, "-m", "pytest", "-q", "-k", "cuda", Path(__file__).parents[1] / "tests/test_rasterize.py"]
-    results.attempt("pytest", lambda: run_checked(results, "pytest", tests), 60)
 
 
-def measure(results: Results, device: str) -> None:
-    """What matters most first: one million Gaussians, then small, large and huge ones."""
-    real = device == "cuda"
+def measure(results: Results, device: str, real: bool, check_more: Callable[[], None]) -> None:
+    """What matters most first: one million Gaussians, then small, large and huge ones; few if it is not ``real``."""
     count, size, large = (COUNT, SMALL, LARGE) if real else (1000, (98, 54), (192, 108))
 
     def step(count: int, size: tuple[int, int]) -> None:
@@ -133,8 +143,13 @@ def measure(results: Results, device: str) -> None:
         if kernels and (count, size) == (COUNT, SMALL):
             results.add("Kernels of a step", [(name[:90], f"{spent:.4f}") for name, spent in kernels])
 
+    def longest(make: Callable, size: tuple[int, int], scene: str) -> None:
+        row = measure_longest(blends_of(make(count, device), *size), device, 20 if real else 1)
+        results.add("Longest tile", [[scene, *row]])
+
     def blends(make: Callable, size: tuple[int, int], scene: str) -> None:
-        shares, ways, error = measure_blends(make(count, device), *size, device, 20 if real else 1)
+        made = blends_of(make(count, device), *size)
+        shares, ways, error = measure_blends(made, "{} x {}".format(*size), device, 20 if real else 1)
         results.judge(f"atomics against slots, {scene}", f"{error:.1e}", error < LIMIT)
         results.add("Share of the card", [[f"{name}, {scene}", *rest] for name, *rest in shares])
         results.add("Slots against atomics", ways)
@@ -158,9 +173,12 @@ def measure(results: Results, device: str) -> None:
 
     attempt = results.attempt
     attempt("step", lambda: step(count, size), 20)
+    attempt("longest tile, ball", lambda: longest(make_gaussians, size, "ball"), 20)
+    attempt("longest tile, crowd", lambda: longest(make_crowd, large, "crowd"), 20)
+    check_more()
     attempt("blends, ball", lambda: blends(make_gaussians, size, "ball"), 20)
     attempt("blends, crowd", lambda: blends(make_crowd, large, "crowd"), 20)
-    attempt("orbit", lambda: results.add("Orbit", measure_orbit(count, device, 100 if real else 3)), 20)
+    attempt("orbit", lambda: results.add("Orbit", measure_orbit(count, device, 100 if real else 3, real)), 20)
     attempt("modes", lambda: modes(count, size), 20)
     attempt("errors", errors, 60)
     attempt("host", lambda: step(100, (64, 64)), 10)  # hardly any arithmetic: what the host does, at most
@@ -184,6 +202,7 @@ def main() -> None:
         option("--expected", type=Path, help="compare with the results in this file"),
         option("--only", default="", help="one check or measurement, by its name; prints rows for its parent"),
         option("--small", action="store_true", help="one small case and nothing else, for the sanitizer"),
+        option("--dry", action="store_true", help="the sizes of a dry run, in one process, on any device"),
     )
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler tells when it starts and stops
     device, case = arguments.device, CHECKED
@@ -201,20 +220,28 @@ def main() -> None:
         for mode in ADJOINTS:
             differentiate(2000, 100, 70, device, mode)
         return
-    apart = ()
-    if device == "cuda" and not arguments.only:
+    apart, real = (), device == "cuda" and not arguments.dry
+    if real and not arguments.only:
         apart = [sys.executable, __file__, "--device", device]
         apart += ["--expected", arguments.expected] if arguments.expected else []
     results, driver = Results(arguments.out, device, arguments.seconds, arguments.only, apart), nullcontext()
     if device == "cpu":  # the kernels of a GPU, in fibers
         driver, wp.config.enable_cpu_blocks = using(CUDA), True
+    first = [sys.executable, "-c", FIRST_CALL.replace("DEVICE", device)]
+    tests = [sys.executable, "-m", "pytest", "-q", "-k", "cuda", Path(__file__).parents[1] / "tests/test_rasterize.py"]
+
+    def check_more() -> None:
+        if real:
+            results.attempt("pytest", lambda: run_checked(results, "pytest", tests), 60)
+            check(results, device, case, {} if apart else expectation(arguments.expected, case))
+
+    results.attempt("first call", lambda: run_checked(results, "first call", first), 10)
     with driver:
         results.attempt("self-test", lambda: test_itself(results, device), 10)
-        check(results, device, STORED, expectation(EXPECTED, STORED))
         if device == "cuda":
-            check_by_programs(results)
-            check(results, device, case, {} if apart else expectation(arguments.expected, case))
-    measure(results, device)
+            check_by_sanitizer(results)
+        check(results, device, STORED, expectation(EXPECTED, STORED))
+    measure(results, device, real, check_more)
     if results.wrong and not results.only:  # else its parent says so
         raise SystemExit(f"Wrong: {', '.join(results.wrong)}.")
 

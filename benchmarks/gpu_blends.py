@@ -4,6 +4,7 @@ Slots: each tile instance has a row of its own, ``gather`` sums a Gaussian's row
 kernel adds into the Gaussian's row at once; no rows per instance, no second kernel, another sum in every run.
 """
 
+import copy
 import functools
 import inspect
 import linecache
@@ -36,6 +37,7 @@ ATOMIC_HEADERS = (
     *("size", "Gaussians", "instances", "rows", "upstream ms", "adjoint ms", "gather ms", "sum ms"),
     "two runs alike",
 )
+LONGEST_HEADERS = ("scene", "tiles", "instances of a tile", "of the longest", "adjoint ms", "longest alone ms", "share")
 
 
 @wp.kernel(enable_backward=False)
@@ -103,6 +105,13 @@ class Blends:
     def into_slots(self) -> None:
         self.reverse(adjoint.make_reverse_block("manual", variant_of(self.options)), self.slots)
 
+    def longest_alone(self) -> "Blends":
+        """The same with nothing to walk in all tiles but the one with most."""
+        alone = copy.copy(self)
+        alone.steps = torch.zeros_like(self.steps)
+        alone.steps[self.steps.argmax()] = self.steps.max()
+        return alone
+
     def gather(self) -> list[torch.Tensor]:
         return CUDA.gather(self.bins, self.slots)[:4]  # all but those of the depths
 
@@ -118,24 +127,33 @@ class Blends:
         return found
 
 
-def card_rates(device: str, count: int) -> tuple[float, float]:
+def card_rates(device: str, count: int, rounds: int) -> tuple[float, float]:
     """Bytes that torch's copy of 16 times ``count`` reads and writes, and operations of multiply-adds, per second."""
     source = torch.ones(count, 4, device=device)
     target = torch.empty_like(source)
     copying = milliseconds(lambda: target.copy_(source), device, 10)
-    threads, rounds = min(count, 2**20), ROUNDS if device == "cuda" else 1
+    threads = min(count, 2**20)
     values = [view(source, wp.vec4)]
     adding = milliseconds(lambda: launch(multiply_add, threads, [rounds, 0.5], values, device=device), device, 10)
     return 32e3 * count / copying, 2e3 * CHAINS * UNROLLED * rounds * threads / adding
 
 
-def measure_blends(
-    model: GaussianModel, width: int, height: int, device: str, repeats: int
-) -> tuple[list[list], list[list], float]:
-    """Rows of shares and of slots against atomics, and by how much these two differ, relative."""
+def blends_of(model: GaussianModel, width: int, height: int) -> Blends:
     with torch.no_grad():
-        blends = Blends(model.activated(), cameras(width, height, 1)[0])
-    bandwidth, arithmetic = card_rates(device, 2**24 if device == "cuda" else 2**16)
+        return Blends(model.activated(), cameras(width, height, 1)[0])
+
+
+def measure_longest(blends: Blends, device: str, repeats: int) -> list:
+    """How much of the adjoint's time the tile with the longest list takes, alone on the card."""
+    whole, alone = (milliseconds(b.into_slots, device, repeats) for b in (blends, blends.longest_alone()))
+    steps = blends.steps.double()
+    mean, most = float(steps.mean()), int(steps.max())
+    return [len(steps), f"{mean:.0f}", most, f"{whole:.3f}", f"{alone:.3f}", f"{100 * alone / whole:.0f} %"]
+
+
+def measure_blends(blends: Blends, size: str, device: str, repeats: int) -> tuple[list[list], list[list], float]:
+    """Rows of shares and of slots against atomics, and by how much these two differ, relative."""
+    bandwidth, arithmetic = card_rates(device, *((2**24, ROUNDS) if repeats > 1 else (2**16, 1)))
     runs = {
         "forward": blends.forward,
         "upstream": lambda: blends.upstream(blends.slots),
@@ -158,7 +176,7 @@ def measure_blends(
     ]  # fmt: skip
     shares += [["copy", "", f"{bandwidth / 1e9:.0f} per s", "100", "", ""]]
     shares += [["multiply-add", "", "", "", f"{arithmetic / 1e9:.0f} per s", "100"]]
-    return shares, *_against_atomics(blends, times, f"{width} x {height}")
+    return shares, *_against_atomics(blends, times, size)
 
 
 def _against_atomics(blends: Blends, times: dict[str, float], size: str) -> tuple[list[list], float]:

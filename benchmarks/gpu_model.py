@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from common import option, parse
+from common import option, parse, versions
 from gpu_counts import LAUNCHES, OPERATIONS, REST, WAITS, Scene, count_scene, count_step
 from gpu_steps import STAGES
 from made_up import cameras, make_crowd, make_gaussians
@@ -207,7 +207,8 @@ def main() -> None:
         headers = ("scene", "stage", "measured ms", "modeled ms", "ratio")
         tables.append((headers, rows, f"Measured on an {arguments.card}."))
     parts = [f"{format_table(headers, rows)}\n\n{note}" for headers, rows, note in tables]
-    text = "\n\n".join([*parts, f"Modeled by `benchmarks/gpu_model.py` on {machine()}; no GPU was measured."])
+    where = f"Modeled by `benchmarks/gpu_model.py` on {machine()}; no GPU was measured. {versions()}."
+    text = "\n\n".join([*parts, where])
     print(text)
     if arguments.out:
         (arguments.out / "gpu_model.md").write_text(f"{text}\n")

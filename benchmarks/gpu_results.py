@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
-import warp as wp
-from gpu_blends import ATOMIC_HEADERS, SHARE_HEADERS
+from common import versions
+from gpu_blends import ATOMIC_HEADERS, LONGEST_HEADERS, SHARE_HEADERS
 from gpu_steps import STEP_HEADERS
 from gpu_training import GSPLAT_HEADERS, NCU_HEADERS, TRAINING_HEADERS
 
@@ -23,6 +23,7 @@ HEADERS = {
     "Checks": ("check", "found"),
     "Training step": STEP_HEADERS,
     "Kernels of a step": ("kernel", "ms per step"),
+    "Longest tile": LONGEST_HEADERS,
     "Share of the card": SHARE_HEADERS,
     "Slots against atomics": ATOMIC_HEADERS,
     "Orbit": ("size", "Gaussians", "loop cap", "frames per second"),
@@ -44,7 +45,7 @@ class Results:
         self.tables: dict[str, list[Sequence]] = {}
         self.wrong: list[str] = []
         card = torch.cuda.get_device_name() if device == "cuda" else "Dry run on the CPU, which says nothing of a GPU"
-        self.where = f"{card}; {machine()}; torch {torch.__version__}, Warp {wp.__version__}"
+        self.where = f"{card}; {machine()}; {versions()}"
 
     @property
     def left(self) -> float:

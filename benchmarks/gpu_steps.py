@@ -69,6 +69,8 @@ def _whole_step(step, device: str, steps: int) -> float:
 
 def kernel_times(step, steps: int) -> dict[str, float]:
     """Milliseconds per step of each kernel and copy on the GPU, Warp's and torch's, by name; empty without CUPTI."""
+    if torch.profiler.ProfilerActivity.CUDA not in torch.profiler.supported_activities():
+        return {}
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         for _ in range(steps):
             step()
@@ -80,10 +82,10 @@ def kernel_times(step, steps: int) -> dict[str, float]:
     return found
 
 
-def measure_orbit(count: int, device: str, frames: int) -> list[list]:
+def measure_orbit(count: int, device: str, frames: int, real: bool) -> list[list]:
     """Frames per second, without and with the cap, of pictures on the host, as ``warp-splat render --orbit`` counts."""
     rows, model, path = [], make_gaussians(count, device), cameras(*ORBIT_SIZE, frames)
-    if device == "cpu":
+    if not real:
         path = [camera.resized(98, 54) for camera in path]
     for cap in (None, CAP):
         picture = make_picture(model, False, RasterOptions(max_steps=cap))

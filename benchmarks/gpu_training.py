@@ -80,9 +80,10 @@ def _gsplat(device: str):
         return None
     try:
         from gsplat import rasterization  # noqa: PLC0415 - may be missing
+        from gsplat.cuda._backend import _C  # noqa: PLC0415 - None where its kernels are not compiled
     except ImportError:
         return None
-    return rasterization
+    return rasterization if _C else None
 
 
 def profile_by_ncu(seconds: float) -> list[list] | None:

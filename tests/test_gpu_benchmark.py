@@ -13,7 +13,7 @@ import made_up
 import pytest
 import torch
 import warp as wp
-from commands import python
+from commands import ROOT, python
 from gpu_counts import LAUNCHES, OPERATIONS, REST, WAITS
 from made_up import cameras, make_gaussians
 
@@ -26,6 +26,8 @@ from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
+
+PRETENDING = {"cuda": f"{ROOT / 'tests/pretend_cuda'}:{ROOT}", "cpu": str(ROOT)}
 
 
 @pytest.fixture
@@ -160,11 +162,19 @@ def test_lines_of_ncu():
 
 
 @pytest.mark.slow
-def test_dry_run(tmp_path):
-    python("benchmarks/gpu.py", "--device", "cpu", "--out", tmp_path)
-    tables = json.loads((tmp_path / "gpu.json").read_text())["tables"]
-    assert set(tables) == set(gpu_results.HEADERS) - {"Left out", "Kernels of a step", "Kernels by ncu"}
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.long)])
+def test_dry_run(device, tmp_path):
+    """All of it, at small sizes: on a GPU that is pretended, or with its kernels in fibers."""
+    python("benchmarks/gpu.py", "--device", device, "--dry", "--out", tmp_path, PYTHONPATH=PRETENDING[device])
+    found = json.loads((tmp_path / "gpu.json").read_text())
+    tables = found["tables"]
+    assert set(tables) == set(gpu_results.HEADERS) - {"Left out", "Kernels of a step", "Kernels by ncu"} or (
+        device == "cuda" and {row["what"] for row in tables["Left out"]} == {*gpu.TOOLS}
+    )
     assert {row["size"] for row in tables["Training step"]} == {"64 x 64", "98 x 54", "192 x 108"}
+    assert next(iter(tables)) == "Checks" and tables["Checks"][0]["check"] == "first call"
+    assert all(0 < float(row["share"].split()[0]) for row in tables["Longest tile"])
+    assert f"torch {torch.__version__} (CUDA {torch.version.cuda})" in found["where"] and "driver" in found["where"]
 
 
 @pytest.mark.slow

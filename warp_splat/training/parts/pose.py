@@ -65,7 +65,7 @@ class Pose:
         self.motions = torch.from_numpy(np.stack(self.gauge)).to(self.device)
 
     def _read_later(self) -> Callable[[], list] | None:
-        """The numbers, for the host of a GPU: it uses them two steps late, when they have come without waiting."""
+        """The numbers, for the host of a GPU: it uses them a step late, when they have come without waiting."""
         numbers = [self.moves.detach().flatten(), self.stretches.detach().flatten()]
         return None if driver_of(self.device).peeks else read_later(torch.cat(numbers))
 
