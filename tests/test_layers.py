@@ -18,7 +18,7 @@ LAYERS = [
     {"rendering", "sfm", "viewer"},
     {"training"},
     {"pruning"},
-    {"compare", "inspect", "export_html"},
+    {"compare", "inspect", "export_html", "meshing"},
     {"audit"},
     {"cli", "__init__", "__main__"},
 ]

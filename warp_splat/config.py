@@ -232,6 +232,17 @@ class CleanConfig(FinishedModel):
 
 
 @dataclass
+class MeshConfig(FinishedModel):
+    """A model as a surface of triangles."""
+
+    output: str = argument("the mesh to write, *.glb, *.ply or *.obj")
+    voxel: float = flag(0.0, "edge of a voxel [world units]; 0: two pixels at their median depth")
+    memory: float = flag(0.0, "views and voxels take at most so many GB; 0: a quarter of what is free")
+    triangles: int = flag(0, "simplify to so many; 0: all")
+    collision: int = flag(0, "also write at most so many convex pieces around it, for simulators")
+
+
+@dataclass
 class ExportHtmlConfig:
     """A model as a page that shows it."""
 

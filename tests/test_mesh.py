@@ -1,0 +1,145 @@
+"""Surfaces against a sphere of known depths, and of a model of Gaussians on one."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from warp_splat.camera import Camera
+from warp_splat.cli import main
+from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.meshing.command import without_islands
+from warp_splat.meshing.fusion import Seen, Surface, agreed, footprint, fused, surface_of, voxels_of
+from warp_splat.runtime import pool
+
+trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
+VOXEL, VIEWS, DISTANCE = 0.08, 24, 4.0
+
+
+def camera_at(index):
+    """One of ``VIEWS`` around the origin, which it looks at (Fibonacci's sphere)."""
+    z = 1 - (2 * index + 1) / VIEWS
+    angle = index * np.pi * (3 - np.sqrt(5))
+    back = np.array([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])
+    rotation = Rotation.align_vectors([[0, 0, -1]], [back])[0].as_matrix()
+    return Camera(80, 60, 90, 95, 41, 29, rotation, np.array([0, 0, DISTANCE]))
+
+
+def ball(index, radius=1.0):
+    """What a camera sees of a ball around the origin: depths in closed form."""
+    camera = camera_at(index)
+    x, y = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    along = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    squared = (along**2).sum(-1)
+    under = DISTANCE**2 - squared * (DISTANCE**2 - radius**2)
+    depth = np.where(under > 0, (DISTANCE - np.sqrt(under.clip(0))) / squared, 0)
+    image = np.broadcast_to(np.float32([0.2, 0.5, 0.8]), (60, 80, 3)).copy()
+    return Seen(camera, torch.from_numpy(depth.astype(np.float32)), torch.from_numpy(image))
+
+
+def surface(views):
+    voxels = voxels_of(views, VOXEL)
+    return surface_of(voxels, *fused(views, voxels, VOXEL), VOXEL)
+
+
+def test_a_ball():
+    found = surface([ball(index) for index in range(VIEWS)])
+    mesh = trimesh.Trimesh(found.vertices, found.faces, process=False)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03)  # outwards: it is positive
+    assert np.abs(np.linalg.norm(found.vertices, axis=1) - 1).max() < 0.5 * VOXEL
+    np.testing.assert_allclose(found.colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(found.colors), 0), atol=1e-5)
+
+
+def test_any_number_of_threads():
+    views = [ball(index) for index in range(4)]
+    found = []
+    for count in (1, 3):
+        pool.set_threads(count)
+        found.append(surface(agreed(views)))
+    pool.set_threads(2)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_depths_that_others_do_not_see():
+    """Of a view that is wrong, and of one alone."""
+    views = [ball(index) for index in range(VIEWS)]
+    wrong = views[0]._replace(depth=torch.where(views[0].depth > 0, views[0].depth - 0.5, 0.0))
+    kept = agreed([wrong, *views[1:]])
+    assert not kept[0].depth.any()
+    assert (kept[1].depth > 0).sum() > 0.5 * (views[1].depth > 0).sum()
+    assert np.isnan(footprint(agreed(views[:1])[0]))
+
+
+def test_holes_stay_holes():
+    mesh = surface([ball(0)])
+    assert not trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight
+    assert (mesh.vertices @ camera_at(0).rotation[2] < 0.3).all()  # nothing behind what is seen
+
+
+def test_islands():
+    large, small = (trimesh.creation.icosphere(subdivisions) for subdivisions in (4, 0))
+    both = trimesh.util.concatenate([large, small.apply_translation([5, 0, 0])])
+    found = without_islands(Surface(both.vertices, both.faces, np.zeros_like(both.vertices)))
+    assert len(found.faces) == len(large.faces) and len(found.vertices) == len(found.colors) == len(large.vertices)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """Flat Gaussians on a ball that the embedded scene's cameras look at."""
+    count, radius, center = 4000, 0.5, np.array([0, 0, 0.9])
+    index = np.arange(count)
+    z, angle = 1 - (2 * index + 1) / count, index * np.pi * (3 - np.sqrt(5))
+    out = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)
+    turns = [Rotation.align_vectors([normal], [[0, 0, 1]])[0].as_quat(scalar_first=True) for normal in out]
+    splats = SplatArrays(
+        means=(center + radius * out).astype(np.float32),
+        sh=np.ones((count, 1, 3), np.float32),
+        opacities=np.full(count, 4, np.float32),
+        scales=np.log(np.broadcast_to([0.02, 0.02, 0.002], (count, 3))).astype(np.float32),
+        quats=np.array(turns, np.float32),
+    )
+    path = tmp_path_factory.mktemp("ball") / "ball.ply"
+    save_gaussians(path, SplatFile(splats), lambda _: None)
+    return path, radius, center
+
+
+@pytest.mark.parametrize("ending", ["ply", "glb", "obj"])
+def test_the_command(model, tmp_path, capsys, ending):
+    path, radius, center = model
+    output = tmp_path / f"ball.{ending}"
+    assert (
+        main(["mesh", str(path), str(output), "-s", "assets/still_life", "--voxel", "0.04", "--triangles", "900"]) == 0
+    )
+    mesh = trimesh.load(output, force="mesh")
+    vertices = mesh.vertices * ([-1, -1, 1] if ending == "glb" else [1, 1, 1])
+    assert np.abs(np.linalg.norm(vertices - center, axis=1) - radius).max() < 0.04
+    assert len(mesh.faces) <= 900 and mesh.visual.vertex_colors.shape == (len(vertices), 4)
+    assert "triangles" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_convex_pieces(model, tmp_path):
+    pytest.importorskip("vhacdx", reason="no vhacdx: pip install 'warp-splat[mesh]'")
+    path, radius, _center = model
+    arguments = [str(path), str(tmp_path / "ball.obj"), "-s", "assets/still_life", "--triangles", "400"]
+    assert main(["mesh", *arguments, "--collision", "2"]) == 0
+    pieces = trimesh.load(tmp_path / "ball_collision.obj", force="mesh").split()
+    assert 1 <= len(pieces) <= 2 and all(piece.is_convex for piece in pieces)
+    volume = sum(piece.volume for piece in pieces)
+    assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ball.stl"], "expected a name that ends in .ply, .glb, .obj"),
+        (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
+        (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
+        (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen so finely"),
+    ],
+)
+def test_sentences(model, capsys, arguments, said):
+    assert main(["mesh", str(model[0]), *arguments, "-s", "assets/still_life"]) != 0
+    assert said in capsys.readouterr().err

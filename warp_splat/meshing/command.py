@@ -1,0 +1,157 @@
+"""``warp-splat mesh``: a trained model as triangles, .ply, .glb or .obj; and as convex pieces for simulators."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from warp_splat.config import MeshConfig
+from warp_splat.errors import InputError
+from warp_splat.flags import check_numbers
+from warp_splat.formats.atomic import write_bytes
+from warp_splat.gaussians import GaussianModel
+from warp_splat.meshing.fusion import BYTES, Seen, Surface, agreed, as_pinhole, footprint, fused, surface_of, voxels_of
+from warp_splat.pruning.opened import Opened
+from warp_splat.raster.api import render
+from warp_splat.runtime.launch import available_memory
+
+ENDINGS = (".ply", ".glb", ".obj")
+GLTF_AXES = np.diag([-1.0, -1.0, 1.0])  # x left, y up, z forward
+ISLAND = 0.01  # of the largest piece's triangles, below which a piece is left out
+PIXEL = 20  # bytes of a pixel of a view
+PIXELS = 2.0  # edge of a voxel where nothing else is asked for
+COARSER = 1.25  # times the voxel, until there is memory for all
+
+
+def mesh(config: MeshConfig) -> int:
+    """Write the surface of a model as ``config`` says; returns the process's exit code.
+
+    Raises:
+        InputError: if the model, its scene, an option or a needed package is not usable; if there is no surface.
+    """
+    check_numbers(config)
+    output = Path(config.output)
+    if output.suffix.lower() not in ENDINGS:
+        raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
+    for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):
+        if wanted:
+            needed(package)
+    opened = Opened(config)
+    memory = 1e9 * config.memory or available_memory(torch.device("cpu")) / 4
+    views = agreed(seen(opened, memory / 2))
+    natural = PIXELS * _pixel(config, views)
+    voxel, voxels = _grid(config.voxel, natural, views, memory / 2)
+    surface = without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel))
+    found = len(surface.faces)
+    if not found:
+        raise InputError(f"--voxel {voxel:g}: nothing is seen so finely or so coarsely; try {natural:.2g}.")
+    if 0 < config.triangles < found:
+        surface = simplified(surface, config.triangles)
+    write_surface(output, surface)
+    print(f"{output}: {len(surface.faces)} of {found} triangles, voxels of {voxel:.4g}")
+    if config.collision:
+        pieces = convex_pieces(surface, config.collision)
+        place = output.with_name(f"{output.stem}_collision{output.suffix}")
+        write_bytes(place, exported(pieces, place.suffix))
+        print(f"{place}: {len(pieces.geometry)} convex pieces")
+    return 0
+
+
+def needed(package: str) -> Any:
+    """The module of a package that meshes need. Raises InputError if it is not installed."""
+    try:
+        return __import__(package)
+    except ImportError as error:
+        raise InputError(f"{package}: a mesh needs this package; pip install 'warp-splat[mesh]'.") from error
+
+
+def seen(opened: Opened, memory: float) -> list[Seen]:
+    """The training views as the model shows them, so small that they fit: depths where half of the light is gone."""
+    setting, found = opened.setting, []
+    options = replace(setting.options, median_depth=True)
+    background = setting.background if setting.background.ndim == 1 else setting.background.new_zeros(3)
+    cameras = [view.camera for view in opened.scene.train]
+    share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
+    with torch.no_grad():
+        gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
+        for camera in cameras:
+            if camera.lens is not None and camera.lens.family.around:
+                raise InputError("mesh: expected views of a plane to fuse, found a panorama; train on cube faces.")
+            smaller = as_pinhole(camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height))))
+            shown = render(gaussians, smaller, background, options)
+            found.append(Seen(smaller, shown.median_depth.cpu().contiguous(), shown.image.cpu().contiguous()))
+    return found
+
+
+def _pixel(config: MeshConfig, views: Sequence[Seen]) -> float:
+    """The median edge of a pixel where something is seen [world units]."""
+    sizes = [size for view in views if not math.isnan(size := footprint(view))]
+    if not sizes:
+        raise InputError(f"{config.model}: its views do not agree on any depth; train longer, or on more photographs.")
+    return float(np.median(sizes))
+
+
+def _grid(asked: float, natural: float, views: Sequence[Seen], memory: float) -> tuple[float, torch.Tensor]:
+    """The edge of a voxel [world units]: what is asked for, or what there is memory for; and the voxels."""
+    voxel = asked or natural
+    while len(voxels := voxels_of(views, voxel)) > memory / BYTES:
+        if asked:
+            wanted = 2 * len(voxels) * BYTES / 1e9
+            raise InputError(f"--voxel {voxel:g}: it takes {wanted:.1f} GB; raise it, or --memory.")
+        voxel *= COARSER
+    return voxel, voxels
+
+
+def without_islands(surface: Surface) -> Surface:
+    """Without connected pieces that are far smaller than the largest."""
+    edges = surface.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    size = len(surface.vertices)
+    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(size, size))
+    piece = connected_components(graph, directed=False)[1][surface.faces[:, 0]]
+    counts = np.bincount(piece, minlength=1)
+    return _with_faces(surface, surface.faces[counts[piece] >= ISLAND * counts.max()])
+
+
+def _with_faces(surface: Surface, faces: np.ndarray) -> Surface:
+    used, faces = np.unique(faces, return_inverse=True)
+    return Surface(surface.vertices[used], faces.reshape(-1, 3), surface.colors[used])
+
+
+def simplified(surface: Surface, triangles: int) -> Surface:
+    """With about so many triangles (quadric errors, Garland and Heckbert 1997); colors are the nearest vertices'."""
+    simplify = needed("fast_simplification").simplify
+    vertices, faces = simplify(surface.vertices, surface.faces, 1 - triangles / len(surface.faces))
+    nearest = cKDTree(surface.vertices).query(vertices)[1]
+    return Surface(vertices.astype(np.float64), faces.astype(np.int64), surface.colors[nearest])
+
+
+def convex_pieces(surface: Surface, most: int) -> Any:
+    """A trimesh scene of at most so many convex pieces around the surface (Mamou's V-HACD)."""
+    trimesh = needed("trimesh")
+    whole = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    return trimesh.Scene(whole.convex_decomposition(maxConvexHulls=most))
+
+
+def write_surface(path: Path, surface: Surface) -> None:
+    """As .ply, .glb or .obj, with colors on vertices."""
+    colors = np.rint(255 * surface.colors.clip(0, 1)).astype(np.uint8)
+    made = needed("trimesh").Trimesh(surface.vertices, surface.faces, vertex_colors=colors, process=False)
+    write_bytes(path, exported(made, path.suffix))
+
+
+def exported(shape: Any, suffix: str) -> bytes:
+    """The bytes of a file of what trimesh holds; .glb in glTF's axes, as Gaussians are written."""
+    if suffix.lower() == ".glb":
+        axes = np.eye(4)
+        axes[:3, :3] = GLTF_AXES
+        shape = shape.copy()
+        shape.apply_transform(axes)
+    data = shape.export(file_type=suffix.lower()[1:])
+    return data.encode() if isinstance(data, str) else data

@@ -1,0 +1,137 @@
+"""The surface that the depths of many views agree on: a distance field around them, and its marching cubes.
+
+Only blocks of voxels that some depth falls into exist. A depth counts where its pixel is at most ``COARSEST`` voxels
+wide: what lies far behind a scene, seen from afar, has no surface of this resolution.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+from warp.geometry import IsoSurfaceMarchingCubes, sparse_marching_cubes_from_cells
+
+from warp_splat.camera import Camera
+from warp_splat.kernels.fusion import agree, fuse
+from warp_splat.runtime import launch
+
+EDGE = 8  # voxels of a block
+COARSEST = 3.0  # voxels that a pixel of a depth may span
+TRUNCATION = 3.0  # voxels
+AGREEING = 0.2  # share of the views asked that see a place where a pixel sees it, or its depth does not count
+TOLERANCE = 0.01  # of the depth, within which that is the same place
+OTHERS = 40  # views that are asked, those that are nearest
+HALF = 1 << 20  # places on the grid lie between -HALF and HALF
+BYTES = 60  # of a voxel, with those of the search
+
+
+class Seen(NamedTuple):
+    """A view of the surface."""
+
+    camera: Camera  # a pinhole
+    depth: torch.Tensor  # [H, W] world units; 0: none
+    image: torch.Tensor  # [H, W, 3]
+
+
+class Surface(NamedTuple):
+    """Triangles with colors."""
+
+    vertices: np.ndarray  # [V, 3] float64, world units
+    faces: np.ndarray  # [F, 3] int64
+    colors: np.ndarray  # [V, 3] float32, 0 to 1
+
+
+def as_pinhole(camera: Camera) -> Camera:
+    """The camera without its lens's distortion and shutter: depths are drawn through it, not taken from photographs."""
+    return replace(camera, lens=None, shutter=None)
+
+
+def lens_of(camera: Camera) -> wp.vec4:
+    """Of a pinhole."""
+    return wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def agreed(views: Sequence[Seen]) -> list[Seen]:
+    """The views without the depths that too few of the others see, of those nearest to them."""
+    centers, found = np.stack([view.camera.center for view in views]), []
+    for i, view in enumerate(views):
+        nearest = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")[: OTHERS + 1]
+        agreeing = torch.zeros(view.depth.numel(), dtype=torch.int32)
+        for other in (views[j] for j in nearest if j != i):
+            rotation = other.camera.rotation @ view.camera.rotation.T
+            translation = other.camera.translation - rotation @ view.camera.translation
+            pose = wp.mat33(*rotation.ravel()), wp.vec3(*translation)
+            depths = [launch.view(seen.depth, wp.float32) for seen in (view, other)]
+            inputs = [TOLERANCE, *pose, lens_of(view.camera), lens_of(other.camera), *depths]
+            launch.launch(agree, len(agreeing), inputs, [launch.view(agreeing, wp.int32)])
+        enough = agreeing.view_as(view.depth) >= max(AGREEING * (len(nearest) - 1), 1)
+        found.append(view._replace(depth=torch.where(enough, view.depth, 0.0)))
+    return found
+
+
+def footprint(view: Seen) -> float:
+    """Edge of a pixel at the view's median depth [world units]; not a number if it has none."""
+    found = view.depth[view.depth > 0]
+    return float(found.median()) / view.camera.fx if len(found) else float("nan")
+
+
+def voxels_of(views: Sequence[Seen], voxel: float) -> torch.Tensor:
+    """Places on the grid [V, 3] int32 of the voxels of all blocks that depths fall into, or a truncation beside."""
+    blocks = torch.empty(0, dtype=torch.int64)
+    for view in views:
+        camera, depth = view.camera, view.depth.double()
+        ys, xs = torch.nonzero((depth > 0) & (depth < COARSEST * voxel * camera.fx), as_tuple=True)
+        z = depth[ys, xs]
+        ray = torch.stack(
+            [(xs + 0.5 - camera.cx) / camera.fx, (ys + 0.5 - camera.cy) / camera.fy, torch.ones_like(z)], 1
+        )
+        rotation, center = torch.from_numpy(camera.rotation.copy()), torch.from_numpy(camera.center)
+        for offset in (-TRUNCATION, 0.0, TRUNCATION):
+            points = (ray * (z + offset * voxel)[:, None]) @ rotation + center
+            places = torch.floor(points / (voxel * EDGE)).long()
+            blocks = torch.unique(torch.cat([blocks, torch.unique(code(places))]))
+    inside = torch.cartesian_prod(*[torch.arange(EDGE)] * 3)
+    corners = torch.stack([(blocks >> shift & 2 * HALF - 1) - HALF for shift in (42, 21, 0)], 1)
+    return (corners[:, None] * EDGE + inside).reshape(-1, 3).int()
+
+
+def code(places: torch.Tensor) -> torch.Tensor:
+    """Of places on the grid, [M, 3], one number each, in the order of x, y, z."""
+    x, y, z = (places.long() + HALF).unbind(1)
+    return (x << 42) | (y << 21) | z
+
+
+def fused(views: Sequence[Seen], voxels: torch.Tensor, voxel: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """The distance at each voxel over the truncation, NaN where no view sees it, [V]; its color [V, 3]."""
+    sums, colors = torch.zeros(len(voxels), 2), torch.zeros(len(voxels), 4)
+    places = launch.view(voxels, wp.vec3i)
+    for view in views:
+        camera = view.camera
+        pose = wp.mat33(*camera.rotation.ravel()), wp.vec3(*camera.translation)
+        pictures = launch.view(view.depth, wp.float32), launch.view(view.image, wp.vec3)
+        made = [launch.view(sums, wp.vec2), launch.view(colors, wp.vec4)]
+        launch.launch(fuse, len(voxels), [voxel, TRUNCATION * voxel, *pose, lens_of(camera), places, *pictures], made)
+    distance = torch.where(sums[:, 1] > 0, sums[:, 0] / sums[:, 1], torch.nan)
+    return distance, colors[:, :3] / colors[:, 3:].clamp_min(1.0)
+
+
+def surface_of(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor, voxel: float) -> Surface:
+    """Marching cubes in the cells of which all corners are seen: holes stay holes."""
+    known = ~torch.isnan(distances)
+    voxels, distances, colors = voxels[known], distances[known], colors[known]
+    codes, order = torch.sort(code(voxels))
+    voxels, distances, colors = voxels[order], distances[order], colors[order]
+    corners = []
+    for offset in IsoSurfaceMarchingCubes.CUBE_CORNER_OFFSETS:
+        wanted = code(voxels + torch.tensor(offset, dtype=torch.int32))
+        found = torch.searchsorted(codes, wanted).clamp_max(len(codes) - 1)
+        corners.append(torch.where(codes[found] == wanted, distances[found], torch.nan))
+    values = torch.stack(corners, 1)
+    cells = (values.amin(1) < 0) & (values.amax(1) >= 0)  # false where one is not a number
+    places, values = voxels[cells].numpy(), values[cells].numpy()
+    points, faces = sparse_marching_cubes_from_cells(places, values, device="cpu")
+    points = points.numpy().astype(np.float64)
+    nearest = torch.searchsorted(codes, code(torch.from_numpy(np.rint(points)).int())).clamp_max(len(codes) - 1)
+    return Surface(voxel * points, faces.numpy().reshape(-1, 3).astype(np.int64), colors[nearest].numpy())
