@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from warp_splat.config import MeshConfig
 from warp_splat.errors import InputError
@@ -128,7 +128,7 @@ def simplified(surface: Surface, triangles: int) -> Surface:
     """With about so many triangles (quadric errors, Garland and Heckbert 1997); colors are the nearest vertices'."""
     simplify = needed("fast_simplification").simplify
     vertices, faces = simplify(surface.vertices, surface.faces, 1 - triangles / len(surface.faces))
-    nearest = cKDTree(surface.vertices).query(vertices)[1]
+    nearest = KDTree(surface.vertices).query(vertices)[1]
     return Surface(vertices.astype(np.float64), faces.astype(np.int64), surface.colors[nearest])
 
 
