@@ -14,7 +14,7 @@ import warp as wp
 from warp.geometry import IsoSurfaceMarchingCubes, sparse_marching_cubes_from_cells
 
 from warp_splat.camera import Camera
-from warp_splat.kernels.fusion import agree, fuse
+from warp_splat.kernels.distance_field import agree, fuse
 from warp_splat.runtime import launch
 
 EDGE = 8  # voxels of a block
