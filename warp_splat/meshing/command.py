@@ -45,7 +45,7 @@ def mesh(config: MeshConfig) -> int:
             needed(package)
     opened = Opened(config)
     memory = 1e9 * config.memory or available_memory(torch.device("cpu")) / 4
-    views = agreed(seen(opened, memory / 2))
+    views = agreed(drawn_views(opened, memory / 2))
     natural = PIXELS * _pixel(config, views)
     voxel, voxels = _grid(config.voxel, natural, views, memory / 2)
     surface = without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel))
@@ -72,7 +72,7 @@ def needed(package: str) -> Any:
         raise InputError(f"{package}: a mesh needs this package; pip install 'warp-splat[mesh]'.") from error
 
 
-def seen(opened: Opened, memory: float) -> list[Seen]:
+def drawn_views(opened: Opened, memory: float) -> list[Seen]:
     """The training views as the model shows them, so small that they fit: depths where half of the light is gone."""
     setting, found = opened.setting, []
     options = replace(setting.options, median_depth=True)
