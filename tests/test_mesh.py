@@ -10,7 +10,7 @@ from warp_splat.cli import main
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.meshing.command import without_islands
-from warp_splat.meshing.fusion import Seen, Surface, agreed, footprint, fused, surface_of, voxels_of
+from warp_splat.meshing.fusion import Drawn, Surface, agreed, footprint, fused, surface_of, voxels_of
 from warp_splat.runtime import pool
 
 trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
@@ -35,7 +35,7 @@ def ball(index, radius=1.0):
     under = DISTANCE**2 - squared * (DISTANCE**2 - radius**2)
     depth = np.where(under > 0, (DISTANCE - np.sqrt(under.clip(0))) / squared, 0)
     image = np.broadcast_to(np.float32([0.2, 0.5, 0.8]), (60, 80, 3)).copy()
-    return Seen(camera, torch.from_numpy(depth.astype(np.float32)), torch.from_numpy(image))
+    return Drawn(camera, torch.from_numpy(depth.astype(np.float32)), torch.from_numpy(image))
 
 
 def surface(views):

@@ -17,7 +17,7 @@ from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
 from warp_splat.formats.atomic import write_bytes
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import BYTES, Seen, Surface, agreed, as_pinhole, footprint, fused, surface_of, voxels_of
+from warp_splat.meshing.fusion import BYTES, Drawn, Surface, agreed, as_pinhole, footprint, fused, surface_of, voxels_of
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
 from warp_splat.runtime.launch import available_memory
@@ -72,7 +72,7 @@ def needed(package: str) -> Any:
         raise InputError(f"{package}: a mesh needs this package; pip install 'warp-splat[mesh]'.") from error
 
 
-def drawn_views(opened: Opened, memory: float) -> list[Seen]:
+def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     """The training views as the model shows them, so small that they fit: depths where half of the light is gone."""
     setting, found = opened.setting, []
     options = replace(setting.options, median_depth=True)
@@ -86,11 +86,11 @@ def drawn_views(opened: Opened, memory: float) -> list[Seen]:
                 raise InputError("mesh: expected views of a plane to fuse, found a panorama; train on cube faces.")
             smaller = as_pinhole(camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height))))
             shown = render(gaussians, smaller, background, options)
-            found.append(Seen(smaller, shown.median_depth.cpu().contiguous(), shown.image.cpu().contiguous()))
+            found.append(Drawn(smaller, shown.median_depth.cpu().contiguous(), shown.image.cpu().contiguous()))
     return found
 
 
-def _pixel(config: MeshConfig, views: Sequence[Seen]) -> float:
+def _pixel(config: MeshConfig, views: Sequence[Drawn]) -> float:
     """The median edge of a pixel where something is seen [world units]."""
     sizes = [size for view in views if not math.isnan(size := footprint(view))]
     if not sizes:
@@ -98,7 +98,7 @@ def _pixel(config: MeshConfig, views: Sequence[Seen]) -> float:
     return float(np.median(sizes))
 
 
-def _grid(asked: float, natural: float, views: Sequence[Seen], memory: float) -> tuple[float, torch.Tensor]:
+def _grid(asked: float, natural: float, views: Sequence[Drawn], memory: float) -> tuple[float, torch.Tensor]:
     """The edge of a voxel [world units]: what is asked for, or what there is memory for; and the voxels."""
     voxel = asked or natural
     while len(voxels := voxels_of(views, voxel)) > memory / BYTES:

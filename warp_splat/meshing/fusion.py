@@ -27,7 +27,7 @@ HALF = 1 << 20  # places on the grid lie between -HALF and HALF
 BYTES = 60  # of a voxel, with those of the search
 
 
-class Seen(NamedTuple):
+class Drawn(NamedTuple):
     """A view of the surface."""
 
     camera: Camera  # a pinhole
@@ -53,7 +53,7 @@ def lens_of(camera: Camera) -> wp.vec4:
     return wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def agreed(views: Sequence[Seen]) -> list[Seen]:
+def agreed(views: Sequence[Drawn]) -> list[Drawn]:
     """The views without the depths that too few of the others see, of those nearest to them."""
     centers, found = np.stack([view.camera.center for view in views]), []
     for i, view in enumerate(views):
@@ -71,13 +71,13 @@ def agreed(views: Sequence[Seen]) -> list[Seen]:
     return found
 
 
-def footprint(view: Seen) -> float:
+def footprint(view: Drawn) -> float:
     """Edge of a pixel at the view's median depth [world units]; not a number if it has none."""
     found = view.depth[view.depth > 0]
     return float(found.median()) / view.camera.fx if len(found) else float("nan")
 
 
-def voxels_of(views: Sequence[Seen], voxel: float) -> torch.Tensor:
+def voxels_of(views: Sequence[Drawn], voxel: float) -> torch.Tensor:
     """Places on the grid [V, 3] int32 of the voxels of all blocks that depths fall into, or a truncation beside."""
     blocks = torch.empty(0, dtype=torch.int64)
     for view in views:
@@ -103,7 +103,7 @@ def code(places: torch.Tensor) -> torch.Tensor:
     return (x << 42) | (y << 21) | z
 
 
-def fused(views: Sequence[Seen], voxels: torch.Tensor, voxel: float) -> tuple[torch.Tensor, torch.Tensor]:
+def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> tuple[torch.Tensor, torch.Tensor]:
     """The distance at each voxel over the truncation, NaN where no view sees it, [V]; its color [V, 3]."""
     sums, colors = torch.zeros(len(voxels), 2), torch.zeros(len(voxels), 4)
     places = launch.view(voxels, wp.vec3i)
