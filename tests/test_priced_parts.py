@@ -111,7 +111,7 @@ def test_exr_needs_no_parameters_and_masks_count(mapped):
     (folder / PARAMETERS).unlink()
     mask = np.ones((31, 33), np.uint8)
     mask[5] = 0
-    masked = replace(scene, train=[replace(view, mask=mask) for view in scene.train])
+    masked = replace(scene, train=[replace(view, photograph=view.pixels._replace(mask=mask)) for view in scene.train])
     for given, unknown in ((scene, [2]), (masked, [2, 5])):
         expected = numbers.copy()
         expected[unknown] = -1

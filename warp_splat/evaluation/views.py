@@ -1,6 +1,6 @@
 """Renders beside photographs, in the reference's folders, and their metrics: as numbers, a table and a sheet."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +10,8 @@ from warp_splat.camera import Camera
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import Metric, psnr, write_results
 from warp_splat.formats.atomic import write_text
-from warp_splat.formats.png import save_png
+from warp_splat.formats.png import load_png, save_png
+from warp_splat.scene.stored import in_turn
 from warp_splat.scene.types import View
 from warp_splat.text import format_table
 
@@ -21,33 +22,32 @@ Picture = Callable[[Camera, str], np.ndarray]
 TOLD = 10  # views, at most, in the table that is printed
 
 
-def write_views(picture: Picture, views: list[View], folder: Path) -> list[np.ndarray]:
+def write_views(picture: Picture, views: list[View], folder: Path) -> Iterator[tuple[View, np.ndarray]]:
     """Write ``renders/00000.png``, ``gt/00000.png`` and, of views with one, ``masks/00000.png`` ... in ``folder``.
 
-    Returns the renders. Surplus images of an earlier run are removed: metrics are taken over all that lie there.
+    One after another: each view, in memory, and its render. At the end, surplus images of an earlier run are removed:
+    metrics are taken over all that lie there.
     """
-    renders = []
     kept = set()
-    for index, view in enumerate(views):
-        renders.append(picture(view.camera, view.name))
-        pictures = {"renders": renders[-1], "gt": view.picture}
+    for index, view in enumerate(in_turn(views)):
+        render = picture(view.camera, view.name)
+        pictures = {"renders": render, "gt": view.picture}
         if view.mask is not None:
             pictures["masks"] = np.repeat(255 * view.mask[..., None], 3, axis=2)
         for name, pixels in pictures.items():
             save_png(folder / name / f"{index:05d}.png", pixels)
             kept.add(folder / name / f"{index:05d}.png")
+        yield view, render
     for old in [path for name in ("renders", "gt", "masks") for path in folder.glob(f"{name}/*.png")]:
         if old.stem.isdigit() and old not in kept:
             old.unlink()
-    return renders
 
 
 class Comparison(NamedTuple):
     """One view, seen and rendered."""
 
-    name: str
-    photo: np.ndarray  # [H, W, 3] uint8
-    render: np.ndarray  # of the same size
+    view: View
+    render: Path  # of the same size
     values: dict[str, float]  # of each metric
 
 
@@ -71,14 +71,13 @@ def evaluate_views(
     Raises:
         InputError: if a file cannot be written.
     """
-    compared = []
-    renders = write_views(picture, views, model_folder / split / f"ours_{iteration}")
-    for view, render in zip(views, renders, strict=True):
+    compared, folder = [], model_folder / split / f"ours_{iteration}"
+    for index, (view, render) in enumerate(write_views(picture, views, folder)):
         photo, mask = view.picture, view.mask
         values = {name: measure(render, photo, mask) for name, measure in metrics.items()}
         if where_taken:
             values[POSE] = psnr(picture(where_taken(view), view.name), photo, mask)
-        compared.append(Comparison(view.name, photo, render, values))
+        compared.append(Comparison(views[index], folder / "renders" / f"{index:05d}.png", values))
     per_view = {
         name: {f"{index:05d}.png": view.values[name] for index, view in enumerate(compared)}
         for name in compared[0].values
@@ -99,7 +98,7 @@ def show_views(
         InputError: if a file cannot be written.
     """
     ranked = sorted(compared, key=lambda view: view.values["PSNR"])
-    portrait = compared[0].photo.shape[0] > compared[0].photo.shape[1]
+    portrait = compared[0].view.camera.height > compared[0].view.camera.width
     columns, each = (2, 4) if portrait else (1, 3)  # whole lines
     what = f"{len(compared)} {split} views after {iteration} iterations"
     if len(ranked) <= 2 * each:
@@ -107,8 +106,8 @@ def show_views(
     else:
         sections = {f"the worst of {what}": ranked[:each], "the best": ranked[: -each - 1 : -1]}
     rows = {
-        title: [(view.name, view.photo, view.render, metrics_line(view.values)) for view in views]
-        for title, views in sections.items()
+        title: [(one.view.name, one.view.picture, load_png(one.render), metrics_line(one.values)) for one in some]
+        for title, some in sections.items()
     }
     report.contact_sheet(folder / "contact_sheet.png", rows, columns)
     write_text(folder / "per_view.md", f"{what}:\n\n{_table(compared)}\n")
@@ -125,7 +124,7 @@ def metrics_line(values: Mapping[str, float]) -> str:
 
 def _table(views: list[Comparison]) -> str:
     names = list(views[0].values)
-    rows = [(view.name, *(_rounded(name, view.values[name]) for name in names)) for view in views]
+    rows = [(view.view.name, *(_rounded(name, view.values[name]) for name in names)) for view in views]
     return format_table(("view", *names), rows)
 
 

@@ -16,6 +16,7 @@ from warp_splat.presets import PRESETS
 from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
 from warp_splat.scene.images import target_size
 from warp_splat.scene.photos import READABLE, find_files
+from warp_splat.scene.stored import SHARE
 from warp_splat.text import few
 from warp_splat.training.memory import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
 from warp_splat.training.options import LearnOptions, ModelOptions
@@ -172,7 +173,8 @@ def forecast(
     coefficients = (ModelOptions.sh_degree + 1) ** 2
     step = step_memory(gaussians, coefficients, INSTANCES * gaussians, max(areas), per_pixel=per_pixel)
     photographs = sum(areas) * ((3 * FLOAT if linear else 3) + masked + alpha)
-    needed, available = BASE + photographs + step, psutil.virtual_memory().available
+    available = psutil.virtual_memory().available
+    needed = BASE + min(photographs, SHARE * available) + step
     seconds = sum(areas) / len(areas) * SECONDS_PER_PIXEL / CORES
     times = ", ".join(f"{_span(steps * seconds)} for {name} ({steps} iterations)" for name, steps in RUNS.items())
     text = (

@@ -73,7 +73,8 @@ def render_model(config: RenderConfig) -> int:
                 say(sentence)
             if scene.train and not config.skip_train:
                 written = folder / "train" / f"ours_{iteration}"
-                write_views(picture, scene.train, written)
+                for _ in write_views(picture, scene.train, written):
+                    pass
                 print(f"  train  {len(scene.train)} views in {written}")
                 _certify(config, maps, scene.train, written)
             if scene.test and not config.skip_test:

@@ -19,6 +19,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.expose import expose
 from warp_splat.scene import load_scene
+from warp_splat.scene.stored import photo_memory
 from warp_splat.scene.types import Scene, View
 
 
@@ -96,7 +97,7 @@ class Finished:
             raise InputError(f"{self.path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
         flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
         names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
-        return load_scene(source, **names, resolution=resolution, **flags, report=say)
+        return load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
 
     def refined(self, scene: Scene) -> Scene:
         """The scene with the cameras that were learned with the Gaussians; itself, if they were not.

@@ -35,6 +35,7 @@ def load_scene(
     invert_masks: bool = False,
     start: str = "",
     lens: str = "undistort",
+    memory: float | None = None,
     report: Report = print,
 ) -> Scene:
     """Load a folder with a COLMAP model (sparse/), a nerf-synthetic scene (transforms_train.json) or transforms.json.
@@ -50,6 +51,8 @@ def load_scene(
         start: a file of Gaussians to start from instead of the scene's points.
         lens: "undistort" resamples photographs with distortion as pinholes would have taken them; "native" keeps them,
             and their cameras have lenses.
+        memory: bytes for photographs: those that do not fit are decoded whenever they are asked for, and of many even
+            those that do only once they are. None: all are decoded now.
         report: called with a line for each thing that the user should know: undistortion, a choice of models, ...
 
     Returns:
@@ -72,8 +75,8 @@ def load_scene(
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
     from warp_splat.scene.colmap import read_tracks  # noqa: PLC0415  keeps `import warp_splat` light
-    from warp_splat.scene.images import load_views  # noqa: PLC0415
     from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
+    from warp_splat.scene.stored import load_views  # noqa: PLC0415
 
     file, drawn = None, not (start or len(points))
     if start:
@@ -81,20 +84,24 @@ def load_scene(
     elif drawn:
         points, colors = random_points([photo.camera for photo in train])
     require_visible(train, points, start or source)
-    views = load_views(train + test, resolution, white_background, invert_masks)
+    views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
     train_views, test_views = views[: len(train)], views[len(train) :]
-    if any(view.mask is not None for view in views):
+    if any(view.photograph.mask for view in views):
         train_views, test_views = _drop_masked(train_views, source, report), _drop_masked(test_views, source, report)
     if views[0].linear and not start:
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
     require_one_kind([(view.name, view.linear) for view in train_views + test_views], source)
     tracks = partial(read_tracks, Path(source)) if takes_colmap(Path(source)) else dict
-    return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source))
+    return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source), bound)
 
 
 def _drop_masked(views: list[View], source: str | Path, report: Report) -> list[View]:
     """The views with a pixel that counts."""
-    kept = [view for view in views if view.mask is None or view.mask.any()]
+    from warp_splat.scene.stored import in_turn  # noqa: PLC0415  keeps `import warp_splat` light
+
+    kept = [
+        view for view, loaded in zip(views, in_turn(views), strict=True) if loaded.mask is None or loaded.mask.any()
+    ]
     require_unmasked(len(views), len(views) - len(kept), source)
     if len(kept) < len(views):
         report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")

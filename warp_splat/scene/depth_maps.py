@@ -92,7 +92,7 @@ def _fit(entries: dict, name: str) -> Fit:
 
 def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
     """The numbers nearest to each pixel, which no filter mixes over edges."""
-    numbers, (height, width) = read_numbers(path), view.image.shape[:2]
+    numbers, (height, width) = read_numbers(path), (view.camera.height, view.camera.width)
     file = view.original.width, view.original.height
     if not same_shape(numbers.shape[::-1], file):
         raise InputError(
@@ -103,5 +103,5 @@ def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
         (np.arange(n) * 2 + 1) * size // (2 * n) for n, size in zip((height, width), numbers.shape, strict=True)
     )
     found = np.maximum(numbers[rows[:, None], columns], 0.0) * fit.scale + fit.offset
-    known = np.isfinite(found) & (found >= 0.0) & (True if view.mask is None else view.mask > 0)
+    known = np.isfinite(found) & (found >= 0.0) & (True if (mask := view.mask) is None else mask > 0)
     return np.where(known, found, -1.0).astype(np.float32)

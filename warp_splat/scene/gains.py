@@ -14,12 +14,14 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from warp_splat.color import from_srgb
+from warp_splat.scene.stored import in_turn
 from warp_splat.scene.types import Scene
 
 LONG = 480  # px, of the images from which colors are taken: means over several pixels of larger ones
 DARKEST, BRIGHTEST = 0.003, 0.9  # light that counts: the rest is noise, the foot of sRGB's curve, or saturated
 GREEN = 1  # the channel of exposure: white balance is red and blue beside it
 FEWEST = 30  # points of a photograph
+MOST = 300  # photographs that are looked at, evenly among more: each is decoded for it
 ROUNDS, SMALLEST = 12, 0.02  # of the fit; residuals [stops] below which it takes squares
 NEEDED = 0.05  # stops: an unlikeness of gains from which on it is worth to learn them
 
@@ -95,11 +97,10 @@ def _shared(view: np.ndarray, point: np.ndarray, weights: np.ndarray) -> tuple[n
 
 def gains_of(scene: Scene) -> Gains:
     """:func:`fit_gains` of the photographs that train; none if the scene does not say what they saw of its points."""
-    samples = {}
-    for view in scene.train:
-        if seen := scene.tracks.get(view.name):
-            camera = view.camera
-            rays = np.concatenate([seen.slopes, np.ones_like(seen.slopes[:, :1])], 1)
-            places = np.nan_to_num(camera.pixels(rays), nan=-1.0) / (camera.width, camera.height)
-            samples[view.name] = take_sample(view.image, seen.ids, places)
+    samples, views = {}, [view for view in scene.train if scene.tracks.get(view.name)]
+    for view in in_turn(views[:: -(-len(views) // MOST) or 1]):
+        seen, camera = scene.tracks[view.name], view.camera
+        rays = np.concatenate([seen.slopes, np.ones_like(seen.slopes[:, :1])], 1)
+        places = np.nan_to_num(camera.pixels(rays), nan=-1.0) / (camera.width, camera.height)
+        samples[view.name] = take_sample(view.image, seen.ids, places)
     return fit_gains(samples)

@@ -7,7 +7,6 @@ motion saw the pixels as stored.
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ import OpenImageIO as oiio
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, reason_of
-from warp_splat.scene.types import View
+from warp_splat.scene.types import Pixels
 
 THREADS = 2  # OpenImageIO releases the GIL; more threads hold more decoded photographs in memory
 AUTO_WIDTH = 1600  # `-r -1` shrinks wider images to this width (graphdeco, utils/camera_utils.py)
@@ -127,13 +126,27 @@ def read_pixels(path: Path, background: float) -> LoadedImage:
     if not np.isfinite(pixels).all():
         raise _unreadable(path, "pixels that are NaN or infinite")
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    linear = spec.format.basetype in FLOATS or _text(spec.get_string_attribute, "oiio:ColorSpace").startswith("lin")
+    linear = _is_linear(spec)
     if spec.alpha_channel < 0:
         return LoadedImage(color, None, linear)
     alpha = pixels[..., spec.alpha_channel]
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha")
     color = (color * alpha[..., None] if straight else color) + (1 - alpha[..., None]) * np.float32(background)
     return LoadedImage(color, alpha if alpha.min() < 1 else None, linear)
+
+
+def _is_linear(spec: oiio.ImageSpec) -> bool:
+    return spec.format.basetype in FLOATS or _text(spec.get_string_attribute, "oiio:ColorSpace").startswith("lin")
+
+
+def read_kind(path: Path) -> tuple[bool, bool]:
+    """Whether the pixels of a file are in linear light, and whether they may have alpha, from its header.
+
+    Raises:
+        InputError: if the file is not an image that OpenImageIO reads.
+    """
+    spec = _open(path).spec()
+    return _is_linear(spec), spec.alpha_channel >= 0
 
 
 def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
@@ -191,36 +204,36 @@ def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     return _resampled(oiio.ImageBufAlgo.st_warp, padded, width, height, _buffer(st), "catmull-rom")[1:-1, 1:-1]
 
 
-def load_views(photos: list[Photo], resolution: int, white_background: bool, invert_masks: bool = False) -> list[View]:
-    """Decode ``photos`` at the size that ``resolution`` asks for (see :func:`target_size`), in their order.
+def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: bool = False) -> Pixels:
+    """Read a photograph for ``camera``, which is the photo's in any size.
 
     Raises:
-        InputError: if a file cannot be read, or that size is absurd.
+        InputError: if a file cannot be read.
     """
+    size = camera.height, camera.width
+    if photo.sampling is photo.mask is None and (plain := _read_plain(photo.path, size)) is not None:
+        return Pixels(plain)
+    pixels = read_pixels(photo.path, float(white_background))
+    height, width = pixels.color.shape[:2]
+    mask = None if photo.mask is None else read_mask(photo.mask, (width, height), invert_masks)
+    planes = [plane[..., None] for plane in (pixels.alpha, mask) if plane is not None]
+    image = np.concatenate([pixels.color, *planes], axis=2) if planes else pixels.color
+    if photo.sampling is not None:
+        image = undistort(image, photo.sampling())
+    if size != image.shape[:2]:
+        image = _resampled(oiio.ImageBufAlgo.resize, image, camera.width, camera.height)
+    color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
+    alpha = None if pixels.alpha is None else _quantized(image[..., 3])
+    return Pixels(color, alpha, None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8))
 
-    def load(photo: Photo) -> View:
-        camera = photo.camera.resized(*target_size(photo.camera.width, photo.camera.height, resolution))
-        if camera.width * camera.height > PIXELS_MOST:
-            raise InputError(
-                f"{photo.path}: expected at most {PIXELS_MOST} pixels, got {camera.width} x {camera.height} from "
-                f"-r {resolution}, which is a width in px; name a smaller one."
-            )
-        pixels = read_pixels(photo.path, float(white_background))
-        height, width = pixels.color.shape[:2]
-        mask = None if photo.mask is None else read_mask(photo.mask, (width, height), invert_masks)
-        planes = [plane[..., None] for plane in (pixels.alpha, mask) if plane is not None]
-        image = np.concatenate([pixels.color, *planes], axis=2) if planes else pixels.color
-        if photo.sampling is not None:
-            image = undistort(image, photo.sampling())
-        if (camera.height, camera.width) != image.shape[:2]:
-            image = _resampled(oiio.ImageBufAlgo.resize, image, camera.width, camera.height)
-        color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
-        alpha = None if pixels.alpha is None else _quantized(image[..., 3])
-        mask = None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8)
-        return View(photo.name, camera, color, photo.camera, alpha, mask, photo.sampling is not None)
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(load, photos))
+def _read_plain(path: Path, size: tuple[int, int]) -> np.ndarray | None:
+    """A file of this height and width whose bytes are the photograph's: a fourth of the time (19 instead of 88 ms)."""
+    file = _open(path)
+    spec = file.spec()
+    if (spec.height, spec.width) != size or spec.nchannels != 3 or spec.format.basetype != oiio.UINT8:
+        return None
+    return None if _is_linear(spec) or spec.alpha_channel >= 0 else _decoded(path, file, oiio.UINT8)
 
 
 def _quantized(image: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """What a loaded scene is: cameras with their photographs, and what training starts from."""
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -31,27 +32,71 @@ def spread_of(centers: np.ndarray) -> float:
     return largest if largest >= 1e-6 * np.abs(centers).max() else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """One photograph and the camera that took it."""
+class Pixels(NamedTuple):
+    """A photograph in memory."""
 
-    name: str  # as in the scene's files, with sub-folder and extension
-    camera: Camera  # scaled to `image`
     image: np.ndarray  # [H, W, 3] on the background: uint8 as a screen shows it, or float32 in linear light
-    original: Camera  # before the resize of `-r` (after undistortion)
     alpha: np.ndarray | None = None  # [H, W] uint8, where the photograph says it; for other backgrounds
     mask: np.ndarray | None = None  # [H, W] uint8, 1 where the photograph counts; None: everywhere
-    undistorted: bool = False  # from the file, which a lens with distortion took
+
+    def read(self) -> "Pixels":
+        """These."""
+        return self
 
     @property
     def linear(self) -> bool:
         """Whether ``image`` is in linear light."""
         return self.image.dtype != np.uint8
 
-    @cached_property
+
+class Stored(NamedTuple):
+    """A photograph in its file, and what the file's header says."""
+
+    read: Callable[[], Pixels]  # keeps what memory has room for
+    linear: bool
+    alpha: bool  # whether it may have one
+    mask: bool
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph and the camera that took it."""
+
+    name: str  # as in the scene's files, with sub-folder and extension
+    camera: Camera  # scaled to `image`
+    photograph: Pixels | Stored
+    original: Camera  # before the resize of `-r` (after undistortion)
+    undistorted: bool = False  # from the file, which a lens with distortion took
+
+    @property
+    def pixels(self) -> Pixels:
+        """The photograph, decoded anew if it is stored and there was no room to keep it."""
+        return self.photograph.read()
+
+    @property
+    def image(self) -> np.ndarray:
+        """See :class:`Pixels`."""
+        return self.pixels.image
+
+    @property
+    def alpha(self) -> np.ndarray | None:
+        """See :class:`Pixels`; nothing is decoded where there can be none."""
+        return self.pixels.alpha if self.photograph.alpha is not False else None
+
+    @property
+    def mask(self) -> np.ndarray | None:
+        """See :class:`Pixels`; nothing is decoded where there is none."""
+        return self.pixels.mask if self.photograph.mask is not False else None
+
+    @property
+    def linear(self) -> bool:
+        """Whether ``image`` is in linear light."""
+        return self.photograph.linear
+
+    @property
     def picture(self) -> np.ndarray:
         """``image`` as a screen shows it, [H, W, 3] uint8."""
-        return np.rint(255 * to_srgb(self.image.clip(0, 1), np.where)).astype(np.uint8) if self.linear else self.image
+        return as_shown(self.image)
 
 
 class Sightings(NamedTuple):
@@ -60,6 +105,18 @@ class Sightings(NamedTuple):
     ids: np.ndarray  # [M] int64, of the points: the same in every photograph
     points: np.ndarray  # [M, 3] float64, world coordinates
     slopes: np.ndarray  # [M, 2] float64, x / z and y / z in the camera, of the keypoints without the lens's distortion
+
+
+def as_shown(image: np.ndarray) -> np.ndarray:
+    """An image of :class:`Pixels` as a screen shows it, [H, W, 3] uint8."""
+    return image if image.dtype == np.uint8 else np.rint(255 * to_srgb(image.clip(0, 1), np.where)).astype(np.uint8)
+
+
+class PhotoMemory(NamedTuple):
+    """Bytes of photographs."""
+
+    limit: float = math.inf  # of those that training keeps, at the size of its steps
+    later: float = 0.0  # that will be taken by what is not decoded yet
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +131,7 @@ class Scene:
     random_points: bool = False  # drawn, since there were none
     find_tracks: Callable[[], dict[str, Sightings]] = dict  # by the names of views
     source: Path | None = None  # its folder
+    memory: PhotoMemory = field(default_factory=PhotoMemory)
 
     @cached_property
     def tracks(self) -> dict[str, Sightings]:

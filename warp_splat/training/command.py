@@ -55,7 +55,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     config, begun = resolve(config, processes)
     say = speaker(config.report.quiet)
     run = Run(Path(config.report.model_path), time.perf_counter())
-    scene = open_scene(config, begun, say)
+    scene = open_scene(config, begun, say, processes.local_count)
     if config.learn.minutes and not begun:
         config = plan_training(scene, config, processes, say)
     config, weighed = settle_parts(config, scene, processes, say)

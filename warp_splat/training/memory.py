@@ -80,7 +80,7 @@ def describe(trainer: Trainer) -> str:
         adjoint, halves = config.model.adjoint, config.learn.half_moments
         return step_memory(gaussians, coefficients, instances, pixels, adjoint, per_pixel, halves)
 
-    base, needed = psutil.Process().memory_info().rss, step(count)
+    base, needed = psutil.Process().memory_info().rss, step(count) + scene.memory.later
     each = f" in each of {processes} processes" if processes > 1 else ""
     text = f"About {(base + needed) / GIB:.1f} GiB of memory{each} at {count} Gaussians ({reason})"
     if not limit:

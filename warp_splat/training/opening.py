@@ -20,6 +20,7 @@ from warp_splat.runtime import launch, pool
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
+from warp_splat.scene.stored import photo_memory
 from warp_splat.scene.types import Scene
 from warp_splat.training.config_file import load_options, write_config
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
@@ -105,7 +106,7 @@ def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
         raise InputError(f"{folder}: it already holds a training; choose another with -m, or --resume {folder}.")
 
 
-def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene:
+def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processes: int = 1) -> Scene:
     """Read the scene and tell what may surprise."""
     data, learn = config.data, config.learn
     say(f"Scene {data.source_path}")
@@ -116,7 +117,8 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say) -> Scene
         name: getattr(data, name)
         for name in ("images", "resolution", "white_background", "eval", "invert_masks", "lens")
     }
-    scene = load_scene(data.source_path, **same, start=start, report=say)
+    memory = photo_memory(config.machine.photo_memory, processes)
+    scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     if scene.random_points and not begun:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
     if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:

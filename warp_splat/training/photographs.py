@@ -1,7 +1,9 @@
 """Which photograph a step sees; on its device and at its size, which may double from coarse to fine."""
 
 import random
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +14,9 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.runtime.timers import stage
-from warp_splat.scene.types import View
+from warp_splat.scene.images import THREADS
+from warp_splat.scene.stored import AHEAD, in_turn
+from warp_splat.scene.types import Scene, View
 from warp_splat.training.options import LearnOptions, TrainConfig
 
 SAMPLED = 12  # photographs whose frequencies are looked at
@@ -32,43 +36,70 @@ class Photographs:
 
     Args:
         config: says how coarse they are, and where they are kept.
-        views: those to train on.
+        scene: says how many may be kept.
         device: where they are compared.
         with_alpha: whether they bring their transparency along.
     """
 
-    def __init__(self, config: TrainConfig, views: Sequence[View], device: torch.device, with_alpha: bool):
+    def __init__(self, config: TrainConfig, scene: Scene, device: torch.device, with_alpha: bool):
         self.config, self.device, self.with_alpha = config, device, with_alpha
-        self.shares = shares_of_size(config.learn, views)
+        self.shares = shares_of_size(config.learn, scene.train)
         self.kept: dict[View, Photograph] = {}
-        self._shrink = 1  # of those that are kept
+        self._count, self._limit = len(scene.train), scene.memory.limit
+        self._size = 0  # bytes of those that are kept
+        self._shrink = 1  # likewise
+        self._pool = ThreadPoolExecutor(THREADS)
+        self._expected: deque[tuple[View, int]] = deque()
+        self._coming: dict[tuple[View, int], Future[Photograph]] = {}  # by their shrink
 
     @property
     def full_size_from(self) -> float:
         """The step from which photographs have their full size."""
         return self.config.learn.coarse_until_iter * self.shares[-1] if self.shares else 0.0
 
+    @property
+    def lacking(self) -> bool:
+        """Whether some are not kept."""
+        return len(self.kept) < self._count
+
+    def expect(self, views: Iterable[tuple[View, int]]) -> None:
+        """Say which come next, and in which iterations, so that threads decode them ahead."""
+        self._expected = deque(views)
+        self._read_ahead()
+
+    def _read_ahead(self) -> None:
+        while self._expected and len(self._coming) < AHEAD:
+            view, iteration = self._expected.popleft()
+            shrink = shrink_at(self.config.learn, self.shares, iteration)
+            if (view, shrink) not in self._coming and not (shrink == self._shrink and view in self.kept):
+                self._coming[view, shrink] = self._pool.submit(self._made, view, shrink)
+
     def camera_at(self, view: View, iteration: int) -> Camera:
         """The camera of ``view`` at the size of this iteration."""
         shrink = shrink_at(self.config.learn, self.shares, iteration)
         if shrink != self._shrink:
-            self._shrink = shrink
+            self._shrink, self._size = shrink, 0
             self.kept.clear()
-        width, height = (max(size // shrink, 1) for size in (view.camera.width, view.camera.height))
-        return view.camera if shrink == 1 else view.camera.resized(width, height)
+        return view.camera if shrink == 1 else view.camera.resized(*_shrunk(view, shrink))
 
     def at_size(self, view: View, iteration: int) -> tuple[Camera, Photograph]:
         """Camera and photograph of ``view`` at the size of this iteration, the photograph on the device."""
-        camera = self.camera_at(view, iteration)
-        if view not in self.kept:
+        camera, found = self.camera_at(view, iteration), self.kept.get(view)
+        if found is None:
             with stage("photographs"):
-                alpha = view.alpha if self.with_alpha else None
-                planes = [view.image, *(None if p is None else p[..., None] for p in (alpha, view.mask))]
-                self.kept[view] = Photograph(
-                    *(None if p is None else self._resized(p, camera.height, camera.width) for p in planes)
-                )
-        here = (None if p is None else p.to(self.device, non_blocking=True) for p in self.kept[view])
-        return camera, Photograph(*here)
+                coming = self._coming.pop((view, self._shrink), None)
+                self._read_ahead()
+                found = coming.result() if coming else self._made(view, self._shrink)
+            size = sum(plane.nbytes for plane in found if plane is not None)
+            if self._size + size <= self._limit:
+                self.kept[view], self._size = found, self._size + size
+        return camera, Photograph(*(None if p is None else p.to(self.device, non_blocking=True) for p in found))
+
+    def _made(self, view: View, shrink: int) -> Photograph:
+        """Decoded, and resized."""
+        (width, height), (image, alpha, mask) = _shrunk(view, shrink), view.pixels
+        planes = [image, *(None if p is None else p[..., None] for p in (alpha if self.with_alpha else None, mask))]
+        return Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
 
     def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
         kept = torch.from_numpy(pixels).to(self.config.machine.data_device)
@@ -77,6 +108,11 @@ class Photographs:
             means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
             kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
         return kept if kept.device.type == self.device.type else kept.pin_memory()
+
+
+def _shrunk(view: View, shrink: int) -> tuple[int, int]:
+    """Width and height."""
+    return max(view.camera.width // shrink, 1), max(view.camera.height // shrink, 1)
 
 
 class Deck:
@@ -95,6 +131,13 @@ class Deck:
             if self.left[index] not in dealt:  # a new deck holds those of this step again
                 dealt.append(self.left.pop(index))
         return dealt
+
+    def coming(self, count: int, steps: int) -> list[list[View]]:
+        """The views of each of the next steps, which stay to be dealt."""
+        twin = Deck(self.views, 0)
+        twin.left = list(self.left)
+        twin.random.setstate(self.random.getstate())
+        return [twin.deal(count) for _ in range(steps)]
 
     def state(self) -> dict[str, list[int]]:
         """What :meth:`restore` needs, as values of JSON."""
@@ -123,7 +166,8 @@ def shares_of_size(learn: LearnOptions, views: Sequence[View]) -> tuple[float, .
     if learn.coarse_by == "steps" or not levels:
         return tuple((level + 1) / levels for level in range(levels))
     chosen = views[:: -(-len(views) // SAMPLED)]
-    found = np.mean([_shown(view.picture, [learn.coarse >> level for level in range(levels)]) for view in chosen], 0)
+    sizes = [learn.coarse >> level for level in range(levels)]
+    found = np.mean([_shown(view.picture, sizes) for view in in_turn(chosen)], 0)
     return tuple(round(float(share), DIGITS) for share in found)
 
 

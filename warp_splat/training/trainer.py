@@ -29,6 +29,7 @@ from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load
 from warp_splat.runtime.shards import Shards
 from warp_splat.runtime.timers import stage
+from warp_splat.scene.stored import AHEAD, in_turn
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.loss import LOSS_CURVES, image_loss
@@ -93,7 +94,8 @@ class Trainer:
         self.degree = 0
         self.blocks = Blocks(self, processes) if isinstance(processes, Shards) else None
         self.deck = Deck(scene.train, seed)
-        self.photographs = Photographs(config, scene.train, self.device, any(having(self.parts, "reads_alpha")))
+        with_alpha = any(having(self.parts, "reads_alpha"))
+        self.photographs = Photographs(config, scene, self.device, with_alpha)
         self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
         self._radii = self.model.parameters["means"].new_zeros(len(self.model), dtype=torch.int32)  # in the last step
@@ -109,8 +111,11 @@ class Trainer:
         self._set_iteration(iteration)
         self._radii = self._radii.new_zeros(len(self.model))  # largest in any view
         steps = [Step(iteration, view, place) for place, view in enumerate(self.deck.deal(self.processes.images))]
-        own = steps[self.processes.rank :: self.processes.count]
-        losses = self.blocks.differentiate(steps) if self.blocks else [self.differentiate_view(step) for step in own]
+        own = slice(self.processes.rank, None, self.processes.count)
+        if self.photographs.lacking and not self.blocks:
+            coming = enumerate([[step.view for step in steps], *self.deck.coming(len(steps), AHEAD)])
+            self.photographs.expect((view, iteration + k * len(steps)) for k, views in coming for view in views[own])
+        losses = self.blocks.differentiate(steps) if self.blocks else [self.differentiate_view(s) for s in steps[own]]
         loss = sum(losses[1:], losses[0])
         if self.config.learn.optimizer_type == "sparse_adam":
             self.processes.merge(self._radii, largest=True)
@@ -312,5 +317,5 @@ class Trainer:
 
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
-        views = self.refined(views)
-        return float(np.mean([psnr(self.picture(view.camera, view.name), view.picture, view.mask) for view in views]))
+        shown = lambda view: psnr(self.picture(view.camera, view.name), view.picture, view.mask)  # noqa: E731
+        return float(np.mean([shown(view) for view in in_turn(self.refined(views))]))

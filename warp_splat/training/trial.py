@@ -14,7 +14,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import cc_psnr, ssim
 from warp_splat.flags import default_of
 from warp_splat.runtime.distributed import Processes
-from warp_splat.scene.types import Scene
+from warp_splat.scene.types import Scene, as_shown
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import shares_of_size, shrink_at
@@ -141,7 +141,7 @@ def quality(config: TrainConfig, scene: Scene, parts: list[str], steps: int, fol
         camera, photograph = trainer.photographs.at_size(view, steps)
         mask = None if photograph.mask is None else photograph.mask[..., 0].cpu().numpy()
         if mask is None or mask.any():
-            pair = trainer.picture(camera, view.name), replace(view, image=photograph.image.cpu().numpy()).picture
+            pair = trainer.picture(camera, view.name), as_shown(photograph.image.cpu().numpy())
             values.append((cc_psnr(*pair, mask), ssim(*pair, mask)))
     means = np.mean(values, 0) if values else np.zeros(2)
     return float(means[0]), float(means[1])

@@ -113,7 +113,8 @@ class Depth:
         if view not in self.maps:
             return None
         rows, columns = (
-            (np.arange(n) * 2 + 1) * size // (2 * n) for n, size in zip((height, width), view.image.shape, strict=False)
+            (np.arange(n) * 2 + 1) * size // (2 * n)
+            for n, size in ((height, view.camera.height), (width, view.camera.width))
         )
         nearness = np.float32(self.extent) * self.maps[view][rows[:, None], columns]
         return Target(slice(None), torch.from_numpy(nearness.reshape(-1)).to(self.device))
