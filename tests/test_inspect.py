@@ -3,6 +3,7 @@
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -12,7 +13,7 @@ from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, wri
 from test_scene_input import BAD
 
 from warp_splat.cli import main
-from warp_splat.inspect import geometry
+from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.subject import read_subject
 from warp_splat.inspect.verdicts import forecast
 
@@ -193,12 +194,17 @@ def test_other_endings_and_two_kinds_of_light(tmp_path, capsys):
     assert any(found == "error" and "b.png in linear light" in text for found, _, text in findings)
 
 
-def test_the_forecast_knows_what_a_photograph_takes():
-    """float32 in linear light instead of bytes, and a byte for each pixel of masks and of alpha."""
+def test_the_forecast_knows_what_a_photograph_takes(monkeypatch):
+    """float32 in linear light instead of bytes, a byte for each pixel of masks and of alpha; within a bound."""
+    free = [2**40]
+    monkeypatch.setattr(verdicts.psutil, "virtual_memory", lambda: SimpleNamespace(available=free[-1]))
     sizes, told = [(1600, 1000)] * 5000, []
     for kinds in ((False, False, False), (False, True, False), (False, True, True), (True, True, True)):
         told.append(float(re.search(r"about ([\d.]+) GiB", forecast(sizes, 10, *kinds)[0])[1]))
     assert np.diff(told) / (5000 * 1600 * 1000 / 2**30) == pytest.approx([1, 1, 9], abs=0.1)
+    free.append(2**35)
+    bounded, _ = forecast(sizes, 10)
+    assert told[0] - float(bounded.split()[1]) == pytest.approx(5000 * 1600 * 1000 * 3 / 2**30 - 8, abs=0.15)
 
 
 def test_a_model_without_its_points(life, tmp_path, capsys):
