@@ -13,7 +13,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.rendering.camera_paths import ORBIT_RADIUS, ORBIT_SIZE, origin_orbit
-from warp_splat.scene.types import Pixels, Scene, View
+from warp_splat.scene.types import Decoded, Scene, View
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -73,7 +73,7 @@ def make_scene(width: int, height: int, kinds: Sequence[str] = ()) -> Scene:
         if "linear" in kinds:
             image = np.divide(image, 255, dtype=np.float32)
         alpha, mask = (np.ones((height, width), np.uint8) if k in kinds else None for k in ("composited", "masked"))
-        views.append(View(f"{index}", camera, Pixels(image, alpha, mask), camera))
+        views.append(View(f"{index}", camera, Decoded(image, alpha, mask), camera))
     return Scene(views, [], np.eye(4, 3, dtype=np.float32), np.zeros((4, 3), np.uint8))
 
 

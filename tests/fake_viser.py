@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.scene.types import Pixels, Scene, View
+from warp_splat.scene.types import Decoded, Scene, View
 from warp_splat.viewer import watcher
 
 ROTATION = Rotation.from_euler("xyz", (0.3, -0.5, 0.2)).as_matrix()
@@ -109,7 +109,7 @@ def some_scene():
     turned = Rotation.from_rotvec([0, 0.3, 0]).as_matrix()
     cameras = [Camera(60, 60, 70, 70, 30, 30, r, [0, 0, 4.0]) for r in (np.eye(3), turned, turned @ turned)]
     image = np.random.default_rng(6).integers(0, 256, (60, 60, 3)).astype(np.uint8)
-    views = [View(f"{i}.png", camera, Pixels(image), camera) for i, camera in enumerate(cameras)]
+    views = [View(f"{i}.png", camera, Decoded(image), camera) for i, camera in enumerate(cameras)]
     points = np.random.default_rng(7).uniform(-1, 1, (200, 3)).astype(np.float32)
     return Scene(views[:2], views[2:], points, np.full((200, 3), 90, np.uint8))
 

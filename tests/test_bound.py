@@ -22,7 +22,7 @@ from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 from warp_splat.rendering.certificates import write_maps
 from warp_splat.runtime.pool import get_threads, set_threads
-from warp_splat.scene.types import Pixels, View
+from warp_splat.scene.types import Decoded, View
 
 RENDERED = [case for case in cases.CASES if case.build]
 IDEAL = {"alpha_min": 0.0, "t_min": 0.0, "sh_degree": None}
@@ -200,7 +200,7 @@ def test_pictures_of_the_bound(tmp_path):
     gaussians, camera = ordinary()
     out = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True))
     photo = np.zeros((camera.height, camera.width, 3), np.uint8)
-    largest = write_maps("bound", lambda _camera: out.bound, [View("a", camera, Pixels(photo), camera)], tmp_path)
+    largest = write_maps("bound", lambda _camera: out.bound, [View("a", camera, Decoded(photo), camera)], tmp_path)
     assert largest == out.bound.max().item()
     read = oiio.ImageBuf(str(tmp_path / "bound" / "00000.exr")).get_pixels(oiio.FLOAT)
     assert np.array_equal(read[..., 0], out.bound.numpy())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.rendering import camera_paths
-from warp_splat.scene.types import Pixels, Scene, View
+from warp_splat.scene.types import Decoded, Scene, View
 
 TURN = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # looks along the world's +x
 FIELDS = {
@@ -84,7 +84,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def scene_of(cameras):
     image = np.zeros((60, 80, 3), np.uint8)
-    views = [View(f"{index}.png", camera, Pixels(image), camera) for index, camera in enumerate(cameras)]
+    views = [View(f"{index}.png", camera, Decoded(image), camera) for index, camera in enumerate(cameras)]
     points = np.random.default_rng(0).normal(0, 0.2, (50, 3)).astype(np.float32)
     return Scene(views, [], points, np.zeros((50, 3), np.uint8))
 

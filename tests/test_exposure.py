@@ -26,7 +26,7 @@ from warp_splat.rendering.finished import as_photographed, make_renderer
 from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
 from warp_splat.scene.neighbors import guessed
-from warp_splat.scene.types import Pixels
+from warp_splat.scene.types import Decoded
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import save_model
 from warp_splat.training.trial import weigh
@@ -219,7 +219,9 @@ def test_it_learns_gains_to_two_percent_of_light(kind, scene, tmp_path):
     shown, _ = begin(replace(scene, train=few), tmp_path)
     light = [from_srgb(shown.picture(v.camera) / 255, np.where) * 2**gain for v, gain in zip(few, gains, strict=True)]
     images = [np.rint(255 * to_srgb(image, np.where).clip(0, 1)).astype(np.uint8) for image in light]
-    changed = replace(scene, train=[replace(v, photograph=Pixels(image)) for v, image in zip(few, images, strict=True)])
+    changed = replace(
+        scene, train=[replace(v, photograph=Decoded(image)) for v, image in zip(few, images, strict=True)]
+    )
     trainer, run = begin(changed, tmp_path, exposure=kind, iterations=300, **still)
     steps(trainer, run, 300)
     gray = torch.full((1, 1, 3), 0.4)

@@ -8,7 +8,7 @@ import scaling
 from trainings import Pretended
 
 from warp_splat.camera import Camera
-from warp_splat.scene.types import Pixels, Scene, View
+from warp_splat.scene.types import Decoded, Scene, View
 from warp_splat.training import memory
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -17,7 +17,7 @@ from warp_splat.training.trainer import Trainer
 @pytest.fixture
 def scene():
     camera = Camera(600, 400, 500.0, 500.0, 300.0, 200.0, np.eye(3), np.zeros(3))
-    view = View("one.png", camera, Pixels(np.zeros((400, 600, 3), np.uint8)), camera)
+    view = View("one.png", camera, Decoded(np.zeros((400, 600, 3), np.uint8)), camera)
     return Scene([view], [], np.zeros((5000, 3), np.float32), np.zeros((5000, 3), np.uint8))
 
 

@@ -15,7 +15,7 @@ from warp_splat.evaluation.metrics import METRICS, cc_psnr, psnr, ssim, write_re
 from warp_splat.evaluation.perceptual import choose_metrics, flip
 from warp_splat.evaluation.views import evaluate_views
 from warp_splat.formats.png import load_png, save_png
-from warp_splat.scene.types import Pixels, View
+from warp_splat.scene.types import Decoded, View
 
 
 def images(height, width, noise=20, seed=0):
@@ -134,7 +134,7 @@ def test_png_errors(tmp_path):
 def test_views_have_the_metrics_of_the_files_that_are_written(tmp_path):
     pairs = [images(20, 30, 5, seed=1), images(25, 12, 60, seed=2)]
     cameras = [make_camera(31, 17, seed=i) for i in (0, 1)]
-    views = [View(f"{i}.jpg", camera, Pixels(pairs[i][1]), camera) for i, camera in enumerate(cameras)]
+    views = [View(f"{i}.jpg", camera, Decoded(pairs[i][1]), camera) for i, camera in enumerate(cameras)]
     metrics = {"SSIM": ssim, "PSNR": psnr}
     means, compared = evaluate_views(lambda _, name: pairs[int(name[0])][0], views, tmp_path, "test", 7, {}, metrics)
     written = json.loads((tmp_path / "per_view.json").read_text())["ours_7"]

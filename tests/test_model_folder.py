@@ -18,7 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatFile
-from warp_splat.scene.types import Pixels, View
+from warp_splat.scene.types import Decoded, View
 
 ARGUMENTS = {
     "sh_degree": 3,
@@ -85,7 +85,7 @@ def view(name, seed):
     rng = np.random.default_rng(seed)
     rotation = Rotation.random(random_state=seed).as_matrix()
     original = Camera(800, 600, 700, 710, 390, 310, rotation, rng.normal(size=3))
-    return View(name, original.resized(400, 300), Pixels(np.zeros((300, 400, 3), np.uint8)), original)
+    return View(name, original.resized(400, 300), Decoded(np.zeros((300, 400, 3), np.uint8)), original)
 
 
 def test_cameras_test_first_at_original_size(tmp_path):

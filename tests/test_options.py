@@ -12,7 +12,7 @@ from warp_splat.errors import InputError
 from warp_splat.flags import flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.scene import View, load_scene
-from warp_splat.scene.types import Pixels
+from warp_splat.scene.types import Decoded
 from warp_splat.training.config_file import OF_ONE_RUN, read_config, write_config
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import PARTS
@@ -190,7 +190,7 @@ def test_a_size_lasts_as_long_as_its_share_of_the_detail():
     wave = np.repeat(wave[..., None], 3, 2).astype(np.uint8)
     even = np.full((240, 320, 3), 9, np.uint8)
     for image, expected, margin in ((noise, (1 / 16, 1 / 4), 0.02), (wave, (0.0, 1.0), 0.05), (even, (0.25, 0.5), 0.0)):
-        shares = shares_of_size(learn, [View("a", camera, Pixels(image), camera)])
+        shares = shares_of_size(learn, [View("a", camera, Decoded(image), camera)])
         assert shares == pytest.approx(expected, abs=margin)
         steps = [shrink_at(learn, shares, step) for step in range(1001)]
         assert steps == sorted(steps, reverse=True) and steps.count(4) == pytest.approx(1000 * shares[0], abs=1)
@@ -201,7 +201,7 @@ def test_a_coarse_photograph_holds_the_means_of_the_fine_one(scene):
     image = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
     camera = scene.train[0].camera.resized(48, 40)
     _, photograph = Trainer(scene, TrainConfig(device="cpu", coarse=4)).photographs.at_size(
-        View("a", camera, Pixels(image), camera), 1
+        View("a", camera, Decoded(image), camera), 1
     )
     means = image.reshape(10, 4, 12, 4, 3).mean((1, 3))
     assert np.abs(photograph.image.numpy() - means).max() <= 0.5 + 1e-3

@@ -21,7 +21,7 @@ from warp_splat.formats.model_folder import read_cameras, read_cfg_args
 from warp_splat.lenses import Lens
 from warp_splat.raster.api import rasterize
 from warp_splat.scene import load_scene
-from warp_splat.scene.types import Pixels, View, visible
+from warp_splat.scene.types import Decoded, View, visible
 from warp_splat.training.parts.pose import MOST, Pose, factors, gauge, inverses, orthonormal, pose_error, sensitivity
 from warp_splat.viewer.command import _find_scene
 
@@ -153,7 +153,7 @@ def test_a_photograph_is_found_while_the_model_stays():
     turn = Rotation.from_rotvec([0.01, 0.01, -0.01]).as_matrix()
     start = replace(right, rotation=turn, translation=right.translation - 0.012)
     camera = find_pose(
-        lambda learned: rasterize(*gaussians, learned).image, View("a.png", start, Pixels(photo), start), 1.0
+        lambda learned: rasterize(*gaussians, learned).image, View("a.png", start, Decoded(photo), start), 1.0
     )
     degrees, meters, focal = made_cameras.distance(camera, right)
     assert degrees < 0.05 and meters < 1e-3 and focal == 0
@@ -163,7 +163,7 @@ def test_a_model_that_shows_nothing_leads_nowhere_far():
     """Each further radian would be better, up to a hundred."""
     camera = made_cameras.looking()
     white = np.full((camera.height, camera.width, 3), 255, np.uint8)
-    start = View("a.png", camera, Pixels(white), camera)
+    start = View("a.png", camera, Decoded(white), camera)
     found = find_pose(lambda learned: (learned.twist[0] / 100).float().expand(*white.shape), start, 1.0)
     degrees, meters, _ = made_cameras.distance(found, camera)
     assert degrees == pytest.approx(np.degrees(alignment.FARTHEST)) and meters < 1e-9

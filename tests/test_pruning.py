@@ -23,7 +23,7 @@ from warp_splat.pruning.thinning import Thinning, fewer_harmonics
 from warp_splat.raster.api import render
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.scene.types import Pixels, View
+from warp_splat.scene.types import Decoded, View
 
 SIZE = (48, 36)
 OPTIONS = RasterOptions()
@@ -47,7 +47,7 @@ def splats_before(camera, count=40, seed=0, depth=(3, 5), scale=-2.0):
 def views_of(cameras):
     """Black photographs."""
     pictures = [np.zeros((camera.height, camera.width, 3), np.uint8) for camera in cameras]
-    return [View(str(i), c, Pixels(p), original=c) for i, (c, p) in enumerate(zip(cameras, pictures, strict=True))]
+    return [View(str(i), c, Decoded(p), original=c) for i, (c, p) in enumerate(zip(cameras, pictures, strict=True))]
 
 
 def setting_of(cameras, device="cpu", background=(0.2, 0.4, 0.7)):

@@ -23,7 +23,7 @@ from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.rendering.finished import make_picture
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
-from warp_splat.scene.types import Pixels
+from warp_splat.scene.types import Decoded
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import save_model
 from warp_splat.training.trial import weigh
@@ -53,7 +53,7 @@ def test_what_is_saved_looks_as_in_training(trained, scene):
 
 def test_it_is_gray_at_first_and_learns_the_color_of_what_gaussians_do_not_cover(scene, tmp_path):
     trainer, run = begin(scene, tmp_path, parts="sky", sky_lr=0.05, iterations=200)
-    blue = [replace(view, photograph=Pixels(np.full_like(view.image, (30, 90, 200)))) for view in scene.train[:3]]
+    blue = [replace(view, photograph=Decoded(np.full_like(view.image, (30, 90, 200)))) for view in scene.train[:3]]
     trainer.deck.views = blue
     trainer.model.parameters["opacities"].data.fill_(-12.0)  # under what is drawn
     assert (trainer.picture(blue[0].camera) == 128).all()

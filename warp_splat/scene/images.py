@@ -1,6 +1,6 @@
 """Photographs through OpenImageIO: read, composite on the background, undistort, resize, quantize to 8 bit.
 
-Pixels stay float32 until the last step, so 16-bit files keep their precision through the filters. Files of floats, and
+Decoded stay float32 until the last step, so 16-bit files keep their precision through the filters. Files of floats, and
 those that say so, are in linear light and are not quantized. The orientation tag of EXIF is ignored: structure from
 motion saw the pixels as stored.
 """
@@ -17,7 +17,7 @@ import OpenImageIO as oiio
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, reason_of
-from warp_splat.scene.types import Pixels
+from warp_splat.scene.types import Decoded
 
 THREADS = 2  # OpenImageIO releases the GIL; more threads hold more decoded photographs in memory
 AUTO_WIDTH = 1600  # `-r -1` shrinks wider images to this width (graphdeco, utils/camera_utils.py)
@@ -204,7 +204,7 @@ def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
     return _resampled(oiio.ImageBufAlgo.st_warp, padded, width, height, _buffer(st), "catmull-rom")[1:-1, 1:-1]
 
 
-def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: bool = False) -> Pixels:
+def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: bool = False) -> Decoded:
     """Read a photograph for ``camera``, which is the photo's in any size.
 
     Raises:
@@ -212,7 +212,7 @@ def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: b
     """
     size = camera.height, camera.width
     if photo.sampling is photo.mask is None and (plain := _read_plain(photo.path, size)) is not None:
-        return Pixels(plain)
+        return Decoded(plain)
     pixels = read_pixels(photo.path, float(white_background))
     height, width = pixels.color.shape[:2]
     mask = None if photo.mask is None else read_mask(photo.mask, (width, height), invert_masks)
@@ -224,7 +224,7 @@ def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: b
         image = _resampled(oiio.ImageBufAlgo.resize, image, camera.width, camera.height)
     color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
     alpha = None if pixels.alpha is None else _quantized(image[..., 3])
-    return Pixels(color, alpha, None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8))
+    return Decoded(color, alpha, None if mask is None else (image[..., -1] >= 0.5).astype(np.uint8))
 
 
 def _read_plain(path: Path, size: tuple[int, int]) -> np.ndarray | None:

@@ -16,7 +16,7 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.runtime.launch import available_memory
 from warp_splat.scene.images import PIXELS_MOST, THREADS, Photo, decode, read_kind, target_size
-from warp_splat.scene.types import PhotoMemory, Pixels, Stored, View
+from warp_splat.scene.types import Decoded, PhotoMemory, Stored, View
 
 SHARE = 0.25  # of the memory that is free, for photographs
 AHEAD = 4  # photographs that are decoded before they are asked for
@@ -88,5 +88,5 @@ def in_turn(views: Sequence[View]) -> Iterator[View]:
         yield from (_loaded(*each) for each in coming)
 
 
-def _loaded(view: View, read: Future[Pixels]) -> View:
+def _loaded(view: View, read: Future[Decoded]) -> View:
     return replace(view, photograph=read.result())

@@ -32,14 +32,14 @@ def spread_of(centers: np.ndarray) -> float:
     return largest if largest >= 1e-6 * np.abs(centers).max() else 0.0
 
 
-class Pixels(NamedTuple):
+class Decoded(NamedTuple):
     """A photograph in memory."""
 
     image: np.ndarray  # [H, W, 3] on the background: uint8 as a screen shows it, or float32 in linear light
     alpha: np.ndarray | None = None  # [H, W] uint8, where the photograph says it; for other backgrounds
     mask: np.ndarray | None = None  # [H, W] uint8, 1 where the photograph counts; None: everywhere
 
-    def read(self) -> "Pixels":
+    def read(self) -> "Decoded":
         """These."""
         return self
 
@@ -52,7 +52,7 @@ class Pixels(NamedTuple):
 class Stored(NamedTuple):
     """A photograph in its file, and what the file's header says."""
 
-    read: Callable[[], Pixels]  # keeps what memory has room for
+    read: Callable[[], Decoded]  # keeps what memory has room for
     linear: bool
     alpha: bool  # whether it may have one
     mask: bool
@@ -64,28 +64,28 @@ class View:
 
     name: str  # as in the scene's files, with sub-folder and extension
     camera: Camera  # scaled to `image`
-    photograph: Pixels | Stored
+    photograph: Decoded | Stored
     original: Camera  # before the resize of `-r` (after undistortion)
     undistorted: bool = False  # from the file, which a lens with distortion took
 
     @property
-    def pixels(self) -> Pixels:
+    def pixels(self) -> Decoded:
         """The photograph, decoded anew if it is stored and there was no room to keep it."""
         return self.photograph.read()
 
     @property
     def image(self) -> np.ndarray:
-        """See :class:`Pixels`."""
+        """See :class:`Decoded`."""
         return self.pixels.image
 
     @property
     def alpha(self) -> np.ndarray | None:
-        """See :class:`Pixels`; nothing is decoded where there can be none."""
+        """See :class:`Decoded`; nothing is decoded where there can be none."""
         return self.pixels.alpha if self.photograph.alpha is not False else None
 
     @property
     def mask(self) -> np.ndarray | None:
-        """See :class:`Pixels`; nothing is decoded where there is none."""
+        """See :class:`Decoded`; nothing is decoded where there is none."""
         return self.pixels.mask if self.photograph.mask is not False else None
 
     @property
@@ -108,7 +108,7 @@ class Sightings(NamedTuple):
 
 
 def as_shown(image: np.ndarray) -> np.ndarray:
-    """An image of :class:`Pixels` as a screen shows it, [H, W, 3] uint8."""
+    """An image of :class:`Decoded` as a screen shows it, [H, W, 3] uint8."""
     return image if image.dtype == np.uint8 else np.rint(255 * to_srgb(image.clip(0, 1), np.where)).astype(np.uint8)
 
 
