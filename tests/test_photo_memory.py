@@ -10,9 +10,9 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS
 from warp_splat.evaluation.views import evaluate_views, show_views
 from warp_splat.formats.model_folder import ply_path
-from warp_splat.scene import load_scene, stored
+from warp_splat.scene import decoding, load_scene
+from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.scene.stored import in_turn
 from warp_splat.training.photographs import Deck
 
 SIZE = 3 * 33 * 31  # bytes of a photograph
@@ -21,7 +21,7 @@ SIZE = 3 * 33 * 31  # bytes of a photograph
 @pytest.fixture(scope="module")
 def bounded():
     """Scenes that keep nothing, and about a third of their photographs."""
-    limits = [1.0, (stored.AHEAD + stored.RECENT + 15) * SIZE]
+    limits = [1.0, (decoding.AHEAD + decoding.RECENT + 15) * SIZE]
     return [load_scene(embedded_scene(), resolution=8, memory=limit, report=str) for limit in limits]
 
 
@@ -40,7 +40,7 @@ def test_a_bound_changes_no_byte(options, scene, bounded, tmp_path):
 
 def check_kept(trainer):
     kept = sum(plane.nbytes for p in trainer.photographs.kept.values() for plane in p if plane is not None)
-    assert kept <= trainer.scene.memory.limit and len(trainer.photographs._coming) <= stored.AHEAD
+    assert kept <= trainer.scene.memory.limit and len(trainer.photographs._coming) <= decoding.AHEAD
 
 
 def test_what_comes_is_what_is_dealt(scene):

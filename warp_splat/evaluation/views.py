@@ -11,7 +11,7 @@ from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import Metric, psnr, write_results
 from warp_splat.formats.atomic import write_text
 from warp_splat.formats.png import load_png, save_png
-from warp_splat.scene.stored import in_turn
+from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.types import View
 from warp_splat.text import format_table
 

@@ -14,9 +14,9 @@ from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.presets import PRESETS
 from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
+from warp_splat.scene.decoding import SHARE
 from warp_splat.scene.images import target_size
 from warp_splat.scene.photos import READABLE, find_files
-from warp_splat.scene.stored import SHARE
 from warp_splat.text import few
 from warp_splat.training.memory import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
 from warp_splat.training.options import LearnOptions, ModelOptions

@@ -19,7 +19,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
 from warp_splat.raster.expose import expose
 from warp_splat.scene import load_scene
-from warp_splat.scene.stored import photo_memory
+from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.types import Scene, View
 
 

@@ -75,8 +75,8 @@ def load_scene(
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
     from warp_splat.scene.colmap import read_tracks  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.decoding import load_views  # noqa: PLC0415
     from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
-    from warp_splat.scene.stored import load_views  # noqa: PLC0415
 
     file, drawn = None, not (start or len(points))
     if start:
@@ -97,7 +97,7 @@ def load_scene(
 
 def _drop_masked(views: list[View], source: str | Path, report: Report) -> list[View]:
     """The views with a pixel that counts."""
-    from warp_splat.scene.stored import in_turn  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.decoding import in_turn  # noqa: PLC0415  keeps `import warp_splat` light
 
     kept = [
         view for view, loaded in zip(views, in_turn(views), strict=True) if loaded.mask is None or loaded.mask.any()

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from warp_splat.color import from_srgb
-from warp_splat.scene.stored import in_turn
+from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.types import Scene
 
 LONG = 480  # px, of the images from which colors are taken: means over several pixels of larger ones

@@ -19,8 +19,8 @@ from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch, pool
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
+from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.scene.stored import photo_memory
 from warp_splat.scene.types import Scene
 from warp_splat.training.config_file import load_options, write_config
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig

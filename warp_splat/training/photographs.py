@@ -14,8 +14,8 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.runtime.timers import stage
+from warp_splat.scene.decoding import AHEAD, in_turn
 from warp_splat.scene.images import THREADS
-from warp_splat.scene.stored import AHEAD, in_turn
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.options import LearnOptions, TrainConfig
 

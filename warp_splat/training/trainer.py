@@ -29,7 +29,7 @@ from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import load
 from warp_splat.runtime.shards import Shards
 from warp_splat.runtime.timers import stage
-from warp_splat.scene.stored import AHEAD, in_turn
+from warp_splat.scene.decoding import AHEAD, in_turn
 from warp_splat.scene.types import Scene, View
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.loss import LOSS_CURVES, image_loss
