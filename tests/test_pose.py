@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from trainings import begin, state_of, steps
 
 from warp_splat.cli import main
-from warp_splat.config import ViewConfig
 from warp_splat.evaluation import alignment
 from warp_splat.evaluation.alignment import find_pose
 from warp_splat.formats.colmap_text import write_colmap as write_model
-from warp_splat.formats.model_folder import read_cameras, read_cfg_args
+from warp_splat.formats.model_folder import read_cameras
 from warp_splat.lenses import Lens
 from warp_splat.raster.api import rasterize
+from warp_splat.rendering.finished import Finished
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Decoded, View, visible
 from warp_splat.training.parts.pose import MOST, Pose, factors, gauge, inverses, orthonormal, pose_error, sensitivity
@@ -193,7 +193,7 @@ def test_render_knows_the_cameras(trained, capsys):
 
 def test_the_viewer_has_both_cameras(trained):
     given = load_scene(SCENE, eval=True, resolution=8, report=lambda line: None)
-    found = _find_scene(ViewConfig(str(trained)), read_cfg_args(trained), 24)
+    found = _find_scene(Finished(trained, 24), "")
     cameras = {view.name: view.camera for view in (*found.train, *found.test)}
     assert len(cameras) == 2 * (len(given.train) + len(given.test))
     for view in given.train:
