@@ -30,7 +30,7 @@ class Watch:
 
     def silent(self) -> list[int]:
         """Those that have gone by now, which takes a moment to tell."""
-        time.sleep(GONE + 1.0)
+        time.sleep(GONE + 2.0)  # a second until their last sign is seen, another until it is looked at again
         return self.gone(GONE)
 
     def look(self) -> None:
