@@ -217,6 +217,9 @@ def test_refused_in_one_sentence(simulation):
     camera = camera_of_fov(WIDTH, HEIGHT, FOV)
     with pytest.raises(InputError, match=r"rgb_image: expected shape \(2, 32, 40\), got \(3, 32, 40\)"):
         simulation.sensor.update(state, transforms, camera, **images(3, rgb_image=wp.vec3))
+    named = wp.zeros((2, 32, 40), dtype=wp.uint32)
+    with pytest.raises(InputError, match="mesh_index: expected mesh_depth beside it"):
+        simulation.sensor.update(state, transforms, camera, shape_index_image=named, mesh_index=named)
     with pytest.raises(InputError, match=r"world_indices: expected 2 of 0..1, got \[0, 2\]"):
         simulation.sensor.update(state, transforms, camera, world_indices=[0, 2])
 

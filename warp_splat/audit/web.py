@@ -70,8 +70,8 @@ def screenshot(page: Path, camera, write: Callable[[Path], object], file: str = 
         CACHE.mkdir(parents=True, exist_ok=True)
         subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(CACHE), *missing], check=True)
     tab, folder, address = _browser()
-    if not (folder / "page").exists():
-        (folder / "page").symlink_to(page.parent.resolve())
+    (folder / "page").unlink(missing_ok=True)
+    (folder / "page").symlink_to(page.parent.resolve())
     write(folder)
     tab.set_viewport_size({"width": camera.width, "height": camera.height})
     tab.goto(f"{address}/page/{page.name}")

@@ -106,9 +106,14 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
         ]
         if not prims:
             raise Unexpected("none that is visible")
-        axes, unit = frame(AXES[UsdGeom.GetStageUpAxis(stage)]), 1.0
+        up, unit = UsdGeom.GetStageUpAxis(stage), 1.0
+        if up not in AXES:
+            raise Unexpected(f"one whose axis {up} is up")
+        axes = frame(AXES[up])
         if UsdGeom.StageHasAuthoredMetersPerUnit(stage) and (unit := UsdGeom.GetStageMetersPerUnit(stage)) != 1:
             notes.append(f"its units of {unit:g} m became meters")
+        if not 0 < unit < np.inf:
+            raise Unexpected(f"units of {unit:g} m")
         parts, places = [], UsdGeom.XformCache(now)
         for prim in prims:
             world = np.array(places.GetLocalToWorldTransform(prim)).T  # USD multiplies from the left
@@ -117,7 +122,7 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
             parts.append(turned(splats, axes @ turn, unit * (axes @ translation), unit * scale))
         antialiased = all(prim.GetCustomDataByKey(RENDER_MODE) == "mip" for prim in prims)
         told = stage.GetRootLayer().customLayerData.get(COORDINATES, "null")
-        coordinates = kept(json.loads(told))
+        coordinates = kept(json.loads(told)) if isinstance(told, str) else None
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
     return SplatFile(concatenated(parts), antialiased, coordinates)
@@ -142,7 +147,7 @@ def _read_prim(prim, now, report: Report) -> SplatArrays:
             report(f"its {name} is {hint}; this renderer knows {ours} alone")
     means = values("positions", None, np.zeros((1, 3)))
     count, degree = len(means), prim.GetAttribute(DEGREE).Get(now) if prim.HasAttribute(DEGREE) else 0
-    if not 0 <= degree <= MOST_DEGREE:
+    if not isinstance(degree, int) or not 0 <= degree <= MOST_DEGREE:
         raise Unexpected(f"harmonics of degree {degree}")
     size = (degree + 1) ** 2
     sh = values(COLORS, count * size, np.zeros((1, 3))).reshape(count, size, 3)

@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from warp_splat.color import to_srgb
 from warp_splat.config import MeshConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
@@ -86,7 +87,8 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
                 raise InputError("mesh: expected views of a plane to fuse, found a panorama; train on cube faces.")
             smaller = as_pinhole(camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height))))
             shown = render(gaussians, smaller, background, options)
-            found.append(Drawn(smaller, shown.median_depth.cpu().contiguous(), shown.image.cpu().contiguous()))
+            image = to_srgb(shown.image, torch.where) if opened.scene.linear else shown.image
+            found.append(Drawn(smaller, shown.median_depth.cpu().contiguous(), image.cpu().contiguous()))
     return found
 
 

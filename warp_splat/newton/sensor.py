@@ -126,7 +126,7 @@ class SensorSplatCamera:
             world_indices: world of each view; by default view i is world i.
 
         Raises:
-            InputError: if an image is of another shape, or a view of no world.
+            InputError: if an image is of another shape, one of meshes has no depth, or a view is of no world.
         """
         views = len(camera_transforms)
         shape = (views, camera.height, camera.width)
@@ -135,6 +135,9 @@ class SensorSplatCamera:
         for name, array in {**outputs, "mesh_index": mesh_index}.items():
             if array is not None and array.shape != shape:
                 raise InputError(f"{name}: expected shape {shape}, got {array.shape}.")
+        for name, array in (("mesh_color", mesh_color), ("mesh_index", mesh_index)):
+            if array is not None and mesh_depth is None:
+                raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
         chosen = range(views) if world_indices is None else [int(world) for world in world_indices]
         if len(chosen) != views or not all(0 <= world < len(self._worlds) for world in chosen):
             raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {list(chosen)}.")

@@ -11,6 +11,8 @@ from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing, with_copies
 
+AT_ONCE = 1024  # Gaussians of a list that are compared with all of it
+
 
 @torch.no_grad()
 def popping_of(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> torch.Tensor:
@@ -61,9 +63,12 @@ def _exchanged(alphas, colors, depths, extents) -> torch.Tensor:
 
     In front of i and j lies what is before them in any order: T is at most the root of what that leaves of both.
     """
-    near, far = depths - extents, depths + extents
-    overlap = (near[:, None] <= far) & (near <= far[:, None])
-    changes = torch.where(overlap, torch.cdist(colors, colors, p=torch.inf), 0.0)
-    before = (far < near[:, None]).float()  # of each in a row
-    shares = alphas * torch.exp(0.5 * torch.log1p(-alphas) @ before.T)
-    return (0.5001 * ((shares @ changes) * shares).sum(1)).minimum(colors.max())
+    near, far, through = depths - extents, depths + extents, torch.log1p(-alphas)
+    parts = torch.arange(len(depths), device=depths.device).split(AT_ONCE)
+    before = (through @ (far[:, None] < near[part]).float() for part in parts)
+    shares, found = alphas * torch.exp(0.5 * torch.cat(list(before), 1)), alphas.new_zeros(len(alphas))
+    for part in parts:
+        overlap = (near[part, None] <= far) & (near <= far[part, None])
+        changes = torch.where(overlap, torch.cdist(colors[part], colors, p=torch.inf), 0.0)
+        found += ((shares[:, part] @ changes) * shares).sum(1)
+    return (0.5001 * found).minimum(colors.max())
