@@ -1,8 +1,8 @@
 """Photographs through OpenImageIO: read, composite on the background, undistort, resize, quantize to 8 bit.
 
-Decoded stay float32 until the last step, so 16-bit files keep their precision through the filters. Files of floats, and
-those that say so, are in linear light and are not quantized. The orientation tag of EXIF is ignored: structure from
-motion saw the pixels as stored.
+Pixels stay float32 until the last step, so 16-bit files keep their precision through the filters. Files of 8 bits that
+need no filter stay bytes. Files of floats, and those that say so, are in linear light and are not quantized. The
+orientation tag of EXIF is ignored: structure from motion saw the pixels as stored.
 """
 
 import math
