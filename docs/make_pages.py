@@ -1,6 +1,6 @@
 """What pages repeat, from where it stands: ``python docs/make_pages.py``.
 
-- docs/flags.md and docs/presets.md, from the configurations.
+- docs/flags.md, docs/flags_train.md and docs/presets.md, from the configurations.
 - Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote, a table of docs/sentences.py, or, for
   ``imports``, the package's imports.
 - Figures in running text: see docs/sentences.py.
@@ -8,6 +8,8 @@
 """
 
 import re
+import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 
 import make_architecture
@@ -24,8 +26,13 @@ TABLE = re.compile(r"<!-- (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 INTRODUCTION = """# Every flag
 
 What each command can be told, as `--help` says it. `python docs/make_pages.py` wrote this page. Flags that are on or
-off have a `--no-` form. `train.py` is `warp-splat train`, `render.py` is `warp-splat render`, and
-`python -m warp_splat.compare` is `warp-splat compare`.
+off have a `--no-` form. Those of `warp-splat train` have [a page of their own](flags_train.md). `render.py` is
+`warp-splat render`, and `python -m warp_splat.compare` is `warp-splat compare`.
+"""
+TRAINING = """# Every flag of a training
+
+What `uv run train.py` (which is `warp-splat train`) can be told, as its `--help` says it. `python docs/make_pages.py`
+wrote this page. Flags that are on or off have a `--no-` form. The other commands have theirs [here](flags.md).
 """
 PRESET_TEXT = """# What presets change
 
@@ -40,17 +47,19 @@ def filled(page: Path) -> str:
     def table(found: re.Match) -> str:
         name, written = found[1], DOCS / "benchmarks" / f"{found[1]}.md"
         make = {**sentences.TABLES, "imports": make_architecture.table}.get(name, written.read_text)
-        return f"<!-- {name} -->\n{make().strip()}\n<!-- end -->"
+        lines = [line if line.startswith("|") else textwrap.fill(line, 120) for line in make().strip().split("\n")]
+        return "\n".join([f"<!-- {name} -->", *lines, "<!-- end -->"])
 
     if page.name in GENERATED:
         return GENERATED[page.name]()
     return sentences.filled(page.name, TABLE.sub(table, page.read_text()))
 
 
-def flags() -> str:
-    """The page of flags."""
-    parts = [INTRODUCTION]
-    for name, (config_type, _, help) in COMMANDS.items():
+def flags(introduction: str, names: Iterable[str]) -> str:
+    """The page of the flags of some commands."""
+    parts = [introduction]
+    for name in names:
+        config_type, _, help = COMMANDS[name]
         parts.append(f"\n## warp-splat {name}\n{help[0].upper()}{help[1:]}.\n")
         heading = None
         for item in flags_of(config_type):
@@ -91,7 +100,11 @@ def _shown(value: object) -> str:
     return str(value)
 
 
-GENERATED = {"flags.md": flags, "presets.md": presets}
+GENERATED = {
+    "flags.md": lambda: flags(INTRODUCTION, [name for name in COMMANDS if name != "train"]),
+    "flags_train.md": lambda: flags(TRAINING, ["train"]),
+    "presets.md": presets,
+}
 
 if __name__ == "__main__":
     PICTURE.write_text(make_architecture.picture())
