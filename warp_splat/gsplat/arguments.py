@@ -2,7 +2,8 @@
 
 import math
 import numbers
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 
@@ -38,42 +39,17 @@ SHUTTERS = {
 }
 
 
-class Request(NamedTuple):
-    """The arguments that are carried, the scenes' dimensions flattened to S."""
+class Request(SimpleNamespace):
+    """The arguments of :func:`warp_splat.gsplat.rasterization` by their names, and of the shapes that it tells.
 
-    means: torch.Tensor  # [S, N, 3]
-    quats: torch.Tensor  # [S, N, 4]
-    scales: torch.Tensor  # [S, N, 3]
-    opacities: torch.Tensor  # [S, N]
-    covars: torch.Tensor | None  # [S, N, 3, 3], instead of quats and scales
-    colors: torch.Tensor  # [S, C or 1, N, D], or [S, C or 1, N, K, 3]
-    viewmats: torch.Tensor  # [S, C, 4, 4]
-    Ks: torch.Tensor  # [S, C, 3, 3]
-    width: int
-    height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
-    eps2d: float
-    sh_degree: int | None
-    packed: bool
-    backgrounds: torch.Tensor | None  # [S, C, D]
-    render_mode: str
-    absgrad: bool
-    rasterize_mode: str
-    camera_model: str
-    with_ut: bool
-    radial_coeffs: torch.Tensor | None  # [S, C, 6 or 4]
-    tangential_coeffs: torch.Tensor | None  # [S, C, 2]
-    thin_prism_coeffs: torch.Tensor | None  # [S, C, 4]
-    rolling_shutter: str  # one of SHUTTERS; empty: all rows at once
-    viewmats_rs: torch.Tensor | None  # [S, C, 4, 4], of the last row; those above of the first
-    batch: tuple[int, ...] = ()  # the scenes' dimensions
+    Once checked, the scenes' dimensions are flattened to one, S, and kept as ``batch``; colors are [S, C or 1, N, ...];
+    ``rolling_shutter`` is one of SHUTTERS, or empty: all rows at once.
+    """
 
 
-def check_request(request: Request, given: dict[str, Any]) -> Request:
+def check_request(request: Request) -> Request:
     """The request with flat scenes. Raises InputError for the first argument that is not as it should be."""
-    shutter = _check_choices(request, given)
+    given, shutter = vars(request), _check_choices(request)
     means, viewmats, colors = request.means, request.viewmats, request.colors
     if not isinstance(means, torch.Tensor) or means.dim() < 2:
         raise InputError(f"means: expected a tensor [..., N, 3], got {_found(means)}.")
@@ -111,7 +87,7 @@ def check_request(request: Request, given: dict[str, Any]) -> Request:
         raise InputError("Ks: expected matrices with focal lengths fx and fy [px], got a singular one; correct it.")
     flat["colors"] = colors.reshape(math.prod(batch), -1 if per_view else 1, *colors.shape[len(batch) + per_view :])
     flat |= {name: int(given[name]) for name in ("width", "height")}
-    return request._replace(**flat, rolling_shutter=shutter, batch=batch)
+    return Request(**(given | flat | {"rolling_shutter": shutter, "batch": batch}))
 
 
 def _check_colors(request: Request, batch: tuple[int, ...], count: int, cameras: int) -> bool:
@@ -133,8 +109,9 @@ def _check_colors(request: Request, batch: tuple[int, ...], count: int, cameras:
     return per_view
 
 
-def _check_choices(request: Request, given: dict[str, Any]) -> str:
+def _check_choices(request: Request) -> str:
     """The shutter's name, if it rolls. Raises InputError for what is not carried, or out of range."""
+    given = vars(request)
     for name, instead in NOT_CARRIED.items():
         if given[name] is not None and given[name] is not False:
             raise InputError(f"{name}: warp_splat.gsplat does not carry it; {instead}.")

@@ -103,7 +103,7 @@ def rasterization(
     if sparse_grad and packed:
         shapes = ("means", "quats", "scales", "covars")
         given |= {name: _thin(given[name], drawn) for name in shapes if given[name] is not None}
-    request = check_request(Request(**{name: given[name] for name in Request._fields[:-1]}), given)
+    request = check_request(Request(**given))
     seen = see(request)
     drawn.append(seen.drawn)
     shown, seen = _show(request, seen)
