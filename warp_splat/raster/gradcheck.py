@@ -15,26 +15,9 @@ from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.falloff import Falloff, make_evaluate
+from warp_splat.raster import checks, differences
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.checks import (
-    check_background,
-    check_camera,
-    check_gaussians,
-    check_options,
-    explain_invalid,
-    is_one_of,
-    own_explained,
-)
-from warp_splat.raster.differences import (
-    INTERMEDIATES,
-    RUNGS,
-    SHAPES,
-    MovableScene,
-    Trial,
-    inputs_of,
-    try_direction,
-    try_directions,
-)
+from warp_splat.raster.differences import INTERMEDIATES, RUNGS, SHAPES, MovableScene, Trial
 from warp_splat.runtime.launch import launch, view
 from warp_splat.text import format_table
 
@@ -153,16 +136,16 @@ def check_gradients(
             if the falloff of ``options`` is none.
     """
     options = _check(adjoint, options, camera, parameters, directions, tolerance, seed)
-    names = inputs_of(camera) if parameters is None else tuple(parameters)
-    gaussians = check_gaussians(means, quats, scales, opacities, sh)
-    background = check_background(background, means.device)
-    with own_explained(options):
+    names = differences.inputs_of(camera) if parameters is None else tuple(parameters)
+    gaussians = checks.check_gaussians(means, quats, scales, opacities, sh)
+    background = checks.check_background(background, means.device)
+    with checks.own_explained(options):
         scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
     if options.falloff:
         _check_falloff(options.falloff, means.device)
     if scene.out.invalid:
-        explain_invalid(scene.out.invalid, quats)
-    trials = {name: try_directions(scene, name, directions, tolerance) for name in names}
+        checks.explain_invalid(scene.out.invalid, quats)
+    trials = {name: differences.try_directions(scene, name, directions, tolerance) for name in names}
     rows = tuple(_judge(name, trials[name], tolerance) for name in names)
     of_gaussians = {*SHAPES, "sh", *INTERMEDIATES}
     off = [row for row in rows if row.verdict == "off" and row.name in of_gaussians]
@@ -203,11 +186,13 @@ def _check_falloff(falloff: Falloff, device: torch.device) -> None:
 
 def _check(adjoint, options, camera, parameters, directions, tolerance, seed) -> RasterOptions:
     """The options to use. Raises InputError for what :func:`check_gradients` itself demands of its arguments."""
-    if not is_one_of(adjoint, MODES):
+    if not checks.is_one_of(adjoint, MODES):
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
-    known = inputs_of(camera) + INTERMEDIATES
+    known = differences.inputs_of(camera) + INTERMEDIATES
     if parameters is not None and not (
-        isinstance(parameters, (list, tuple)) and parameters and all(is_one_of(name, known) for name in parameters)
+        isinstance(parameters, (list, tuple))
+        and parameters
+        and all(checks.is_one_of(name, known) for name in parameters)
     ):
         raise InputError(f"parameters: expected a list of some of {', '.join(known)}, got {parameters!r}.")
     if not (isinstance(directions, int) and directions >= 1):
@@ -216,8 +201,8 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}.")
     if isinstance(seed, bool) or not (isinstance(seed, Integral) and 0 <= int(seed) < 2**63):
         raise InputError(f"seed: expected a whole number from 0 to below 2^63, got {seed!r}.")
-    check_camera(camera)
-    options = check_options(ADJOINTS[0], options)
+    checks.check_camera(camera)
+    options = checks.check_options(ADJOINTS[0], options)
     if options.falloff and not {"conics", "opacities2d"}.isdisjoint(parameters or ()):
         raise InputError(
             "parameters: expected no conics and no opacities2d with a falloff of your own, since differences know "
@@ -278,4 +263,4 @@ def _try_rows(
     """The part of a direction that moves some Gaussians only."""
     part = torch.zeros_like(step)
     part[rows] = step[rows]
-    return try_direction(scene, name, part, rungs)
+    return differences.try_direction(scene, name, part, rungs)
