@@ -16,7 +16,7 @@ from made_up import cameras, make_crowd
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
-from warp_splat.compare.knobs import KNOBS
+from warp_splat.compare.adjoints import KNOBS
 from warp_splat.compare.stability import cases, verdict
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ALPHA_MIN, RasterOptions

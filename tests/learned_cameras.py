@@ -4,7 +4,7 @@ import torch
 
 from warp_splat import CameraParameters, RasterOptions, rasterize
 from warp_splat.compare import oracle, truth
-from warp_splat.compare.exact_motion import exact_camera
+from warp_splat.compare.exact_cameras import exact_camera
 
 LENS_ERROR = 1e-4  # relative L2, of coefficients, and of cameras with distortion away from the base
 PLAIN, DEPTH, SHARP = RasterOptions(), RasterOptions(depth=True), RasterOptions(antialiasing=True)

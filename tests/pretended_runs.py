@@ -17,7 +17,7 @@ from fake_viser import FakeClient, FakeServer, drawn
 
 from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
 from warp_splat.cli import main
-from warp_splat.compare import adjoints, knobs
+from warp_splat.compare import adjoints
 from warp_splat.compare.workloads import layered
 from warp_splat.config import ADJOINTS
 from warp_splat.gsplat import rasterization
@@ -100,7 +100,7 @@ def call_as_gsplat() -> None:
 def compare() -> None:
     """What ``warp-splat compare`` measures, of a scene small enough for fibers."""
     workload = layered(10).to(torch.device("cuda"))
-    assert adjoints.run_adjoints([workload], ADJOINTS, str) and knobs.run_knobs([workload], str)
+    assert adjoints.run_adjoints([workload], ADJOINTS, str) and adjoints.run_knobs([workload], str)
 
 
 def view(folder: Path) -> None:

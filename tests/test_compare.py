@@ -11,7 +11,7 @@ import warp as wp
 from scenes import SCENES
 
 from warp_splat import RasterOptions, cli
-from warp_splat.compare import adjoints, knobs, oracle, plots, trained, truth, workloads
+from warp_splat.compare import adjoints, oracle, plots, trained, truth, workloads
 from warp_splat.compare.stability import cases
 from warp_splat.compare.volume import measure as physics
 from warp_splat.config import ADJOINTS
@@ -100,7 +100,7 @@ def test_layered_scenes_are_as_deep_as_they_say():
 
 def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     monkeypatch.setattr(adjoints, "REPEATS", 2)
-    monkeypatch.setattr(knobs, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
+    monkeypatch.setattr(adjoints, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
     scenes = [workloads.layered(10), workload()]
     measured, lines = adjoints.run_adjoints(scenes, ["stepwise"], lambda _: None), []
     rows = adjoints.records(measured)
@@ -118,7 +118,7 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     plots.plot_errors(tmp_path / "errors.png", measured)
     plots.plot_memory(tmp_path / "memory.png", measured)
     plots.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
-    turned = knobs.run_knobs(scenes, lambda _: None)
+    turned = adjoints.run_knobs(scenes, lambda _: None)
     plots.plot_knobs(tmp_path / "knobs.png", turned)
     lines += adjoints.knob_table(turned).splitlines()
     assert len({len(line) for line in lines}) == 2  # two tables, every line as long as its header

@@ -9,8 +9,8 @@ from learned_cameras import LENS_ERROR, exact_render, gradients_of, learned
 from scenes import LENSES, SCENES
 
 from warp_splat import CameraParameters, Lens, RasterOptions
-from warp_splat.compare import exact_lenses, oracle, truth
-from warp_splat.compare.exact_motion import exact_camera
+from warp_splat.compare import exact_cameras, oracle, truth
+from warp_splat.compare.exact_cameras import exact_camera
 from warp_splat.config import ADJOINTS
 from warp_splat.lenses.formulas import MODELS
 from warp_splat.raster.data import Gaussians
@@ -46,8 +46,8 @@ class Numeric(torch.autograd.Function):
 def scene(model, monkeypatch):
     """Seen through the lens; the oracle is told of it."""
     bend = lambda rays, lens: Numeric.apply(rays, Lens(lens.model, tuple(lens.coefficients)))  # noqa: E731
-    monkeypatch.setattr(exact_lenses, "bend", bend)
-    monkeypatch.setattr(exact_lenses, "WIDE", [name for name, (family, _) in MODELS.items() if family.wide])
+    monkeypatch.setattr(exact_cameras, "bend", bend)
+    monkeypatch.setattr(exact_cameras, "WIDE", [name for name, (family, _) in MODELS.items() if family.wide])
     scene = SCENES["fisheye"]()
     return replace(scene, camera=replace(scene.camera, fx=60.0, fy=63.0, lens=LENSES[model]))
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from test_rasterize import relative_error, run, truth
 
 from warp_splat import Camera, InputError, RasterOptions, Shutter, rasterize
-from warp_splat.compare import exact_motion, oracle
+from warp_splat.compare import exact_cameras, oracle
 from warp_splat.compare.truth import for_oracle
 from warp_splat.formats import model_folder
 from warp_splat.kernels.project import affine
@@ -110,7 +110,7 @@ def test_beyond_the_picture_the_motion_ends_and_that_alone_is_what_an_oracle_wit
         return float((out.image - wanted.image)[sure].detach().abs().max()), far
 
     assert max(off()) < ERROR
-    monkeypatch.setattr(exact_motion, "LATEST", 1e9)
+    monkeypatch.setattr(exact_cameras, "LATEST", 1e9)
     image, gradient = off()
     assert 1e-3 < image < 0.05 and 1e-3 < gradient < 0.2
 

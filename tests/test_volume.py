@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from warp_splat.compare import through_lenses
 from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.volume import light as physics
-from warp_splat.compare.volume import measure, media
+from warp_splat.compare.volume import measure
 from warp_splat.compare.volume.light import Volume
 from warp_splat.errors import InputError
 
@@ -129,36 +129,38 @@ def test_orders(integrate, order):
 
 @pytest.mark.parametrize(("optical_depth", "method"), [(3.0, "LSODA"), (3.0, "Radau"), (1e4, "Radau"), (1e6, "Radau")])
 def test_truth_against_a_stiff_solver(optical_depth, method):
-    profile, volume = media.stiff_medium(optical_depth, rays=1)
+    profile, volume = measure.stiff_medium(optical_depth, rays=1)
     medium = profile.medium(volume.colors)
 
     def toward_camera(q, radiance):
-        tau, source = medium(np.array([media.FAR - q]))
+        tau, source = medium(np.array([measure.FAR - q]))
         return source[0, 0] - tau[0, 0] * radiance
 
-    solution = solve_ivp(toward_camera, (0, media.FAR), BACKGROUND, method=method, rtol=1e-9, atol=1e-11, max_step=0.5)
+    solution = solve_ivp(
+        toward_camera, (0, measure.FAR), BACKGROUND, method=method, rtol=1e-9, atol=1e-11, max_step=0.5
+    )
     truth = physics.integrate_exact(profile, volume.colors, BACKGROUND)[0]
     assert solution.y[:, -1] == pytest.approx(truth, abs=1e-6)
 
 
 def test_dense_media_leave_only_the_exponential_alive():
-    profile, volume = media.stiff_medium(1e6, rays=4)
+    profile, volume = measure.stiff_medium(1e6, rays=4)
     truth = physics.integrate_exact(profile, volume.colors, BACKGROUND, 128)
     medium = profile.medium(volume.colors)
     highest = max(volume.colors.max(), BACKGROUND.max())
     for samples in (8, 64, 512):
-        radiance = physics.integrate_exponential(medium, 0.0, media.FAR, samples, BACKGROUND)
+        radiance = physics.integrate_exponential(medium, 0.0, measure.FAR, samples, BACKGROUND)
         assert radiance.min() >= 0 and radiance.max() <= highest * (1 + 1e-14)
         for explicit in INTEGRATORS[1:]:  # no warning either: it would fail this test
             with np.errstate(divide="raise"):
-                error = explicit(medium, 0.0, media.FAR, samples, BACKGROUND) - truth
+                error = explicit(medium, 0.0, measure.FAR, samples, BACKGROUND) - truth
             assert not np.abs(error).max() < 1e6
     assert np.abs(radiance - truth).max() < 1e-4
 
 
 @pytest.mark.parametrize(("name", "limit"), [("Euler", 2.0), ("RK4", 2.785293563), ("exponential", np.inf)])
 def test_stability_limits(name, limit):
-    assert measure._slab_limit(media.METHODS[name][0]) == pytest.approx(limit, rel=1e-5)
+    assert measure._slab_limit(measure.METHODS[name][0]) == pytest.approx(limit, rel=1e-5)
 
 
 def test_thin_far_separate_gaussians_are_splats():
@@ -219,14 +221,14 @@ def test_bad_volumes_are_refused(name, value):
 
 def test_run_writes_its_files(tmp_path, monkeypatch):
     for name, value in {"OPTICAL_DEPTHS": (1.0, 1e6), "SAMPLES": [8, 64, 512, 4096], "REPEATS": 1, "RAYS": 2}.items():
-        monkeypatch.setattr(media, name, value)
-    monkeypatch.setattr(media, "LIMIT_DEPTHS", (1e2,))
-    scenes = {name: media.SCENES[name] for name in ("one", "needle at the edge")}
-    monkeypatch.setattr(media, "SCENES", scenes)
-    monkeypatch.setattr(media, "PICTURED", tuple(scenes))
+        monkeypatch.setattr(measure, name, value)
+    monkeypatch.setattr(measure, "LIMIT_DEPTHS", (1e2,))
+    scenes = {name: measure.SCENES[name] for name in ("one", "needle at the edge")}
+    monkeypatch.setattr(measure, "SCENES", scenes)
+    monkeypatch.setattr(measure, "PICTURED", tuple(scenes))
     said = []
     results = measure.compare_with_physics(tmp_path / "new", said.append)
-    assert {record["rung"] for record in results["ladder"]} == set(media.PARENT)
+    assert {record["rung"] for record in results["ladder"]} == set(measure.PARENT)
     assert "unstable" in "\n".join(said)
     assert set(json.loads((tmp_path / "new/volume.json").read_text())) == set(results)
     lines = (tmp_path / "new/volume.csv").read_text().splitlines()

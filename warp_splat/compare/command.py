@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from warp_splat.compare import adjoints, knobs, plots, through_lenses, trained
+from warp_splat.compare import adjoints, plots, through_lenses, trained
 from warp_splat.compare.stability import cases
 from warp_splat.compare.volume import measure
 from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
@@ -85,7 +85,7 @@ def _compare_pixel_loops(
     plots.plot_memory(out / "memory.png", measured)
     plots.plot_stages(out / "stages.png", measured, config.modes)
     _check_directions(workloads, out, say)
-    turned = knobs.run_knobs(_for_knobs(workloads), say)
+    turned = adjoints.run_knobs(_for_knobs(workloads), say)
     say(f"\n{adjoints.knob_table(turned)}\n")
     _write(out, "knobs", turned)
     plots.plot_knobs(out / "knobs.png", turned)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warp_splat.compare import exact_lenses, exact_motion
+from warp_splat.compare import exact_cameras
 
 BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.2  # Gaussians nearer than this are culled
@@ -150,9 +150,9 @@ def exact_splats(
     world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
     points, seen = means @ world_to_camera.T + translation, world_to_camera
     if getattr(camera, "shutter", None):
-        points, along = exact_motion.exposed(points, camera, near)
+        points, along = exact_cameras.exposed(points, camera, near)
         seen = along @ world_to_camera
-    depth, live = exact_lenses.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
+    depth, live = exact_cameras.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
     live = live & (depth > near) & (quats.norm(dim=1) > 0)
     points = torch.where(live[:, None], points, points.new_tensor([0.3, 0, 1]))  # no division by zero, no gradient
     x, y, z = points.unbind(1)
@@ -163,10 +163,10 @@ def exact_splats(
         means2d, sharp = outlines(points, sigma, live, camera)
     elif projection == "unscented":
         axes = seen @ rotation_matrices(quats) * scales[:, None]
-        means2d, sharp = exact_lenses.unscented(points, axes, camera, near)
+        means2d, sharp = exact_cameras.unscented(points, axes, camera, near)
     elif camera.lens:
-        means2d, to_pixels = exact_lenses.seen(points, camera)
-        sharp = exact_lenses.narrowed(to_pixels @ sigma @ to_pixels.transpose(1, 2), camera)
+        means2d, to_pixels = exact_cameras.seen(points, camera)
+        sharp = exact_cameras.narrowed(to_pixels @ sigma @ to_pixels.transpose(1, 2), camera)
     else:
         means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
         to_pixels = jacobians(points, camera)
@@ -252,9 +252,9 @@ def exact_render(
     if pixels is None:
         pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width))
     once = splats = exact_splats(means, quats, scales, opacities, sh, camera, **view)
-    if camera.lens and camera.lens.model == exact_lenses.AROUND:
+    if camera.lens and camera.lens.model == exact_cameras.AROUND:
         again = {name: torch.cat([getattr(once, name)] * 3) for name in once.__dataclass_fields__}
-        splats = Splats(**{**again, "means2d": exact_lenses.shown_thrice(once.means2d, camera)})
+        splats = Splats(**{**again, "means2d": exact_cameras.shown_thrice(once.means2d, camera)})
     copies = 1 if splats is once else 3
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices

@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator, NullLocator
 
-from warp_splat.compare.adjoints import Measurement, knob_default
-from warp_splat.compare.knobs import KNOBS
+from warp_splat.compare.adjoints import KNOBS, Measurement, knob_default
 from warp_splat.compare.workloads import CANDIDATES
 from warp_splat.evaluation import report
 

@@ -18,7 +18,7 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle, plots
-from warp_splat.compare.exact_motion import exact_camera
+from warp_splat.compare.exact_cameras import exact_camera
 from warp_splat.compare.scenes import distinct_depths, make_camera, to_world
 from warp_splat.compare.truth import random_upstream
 from warp_splat.compare.volume import light

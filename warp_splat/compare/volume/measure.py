@@ -6,18 +6,47 @@ The physics is :mod:`warp_splat.compare.volume.light`; here are the media and sc
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from warp_splat.camera import Camera
 from warp_splat.compare import plots
+from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.volume import light as physics
-from warp_splat.compare.volume import media
-from warp_splat.evaluation.report import INK
+from warp_splat.compare.volume.light import Volume
+from warp_splat.evaluation.report import BLUE, GREEN, INK, ORANGE
 from warp_splat.formats.atomic import write_csv, write_json
 from warp_splat.text import format_table, table_of
 
+#: name: (integrator, evaluations of the medium per step, largest stable tau ds in theory, color, marker)
+METHODS = {
+    "exponential": (physics.integrate_exponential, 1, np.inf, BLUE, "o"),
+    "Euler": (physics.integrate_euler, 1, 2.0, ORANGE, "s"),
+    "RK4": (physics.integrate_rk4, 2, 2.785293563405282, GREEN, "^"),
+}
+RAYS = 64
+FAR = 20.0  # world units; the media of the integrators lie between 0 and here
+OPTICAL_DEPTHS = (1e-2, 1.0, 1e2, 1e4, 1e6)
+SAMPLES = [2**k for k in range(3, 13)]
+REPEATS = 5
+UNSTABLE = 1.0  # an error as large as the whole range of color, or one that is no number
+LIMIT_DEPTHS = (1e2, 1e3, 1e4)  # media in which the largest stable step is sought
+
+#: Rung of the ladder: the image that it changes in one thing, so that the difference is that thing's own cost.
+PARENT = {
+    "no overlap": "truth",
+    "linear depth": "no overlap",
+    "linear peak": "no overlap",
+    "affine": "no overlap",
+    "ellipsoid": "no overlap",
+    "affine + blur": "affine",
+    "3DGS": "truth",
+}
+PICTURED = ("overlapping", "needle at the edge", "cluster")
+LEAST_ERROR = 1e-4  # black in the error maps, a fortieth of a step of 8-bit color
 SHOWN = (8, 64, 512, 4096)  # samples, in the table of the integrators
 LIMITS = {
     **{"medium": "{medium}", "integrator": "{method}"},
@@ -28,6 +57,66 @@ LADDER = {
     **{"scene": "{scene}", "rung": "{rung}", "mean error": "{mean:.1e}", "max error": "{max:.1e}"},
     **{"PSNR [dB]": "{psnr:.1f}", "changes": "{parent}", "own mean": "{own_mean:.1e}", "own max": "{own_max:.1e}"},
 }
+
+
+def stiff_medium(optical_depth: float, rays: int = RAYS) -> tuple[physics.Profile, Volume]:
+    """A fan of rays through two overlapping Gaussians of different color, ``optical_depth`` along the first ray."""
+    volume = Volume(
+        means=[[0, 0, 10], [0.4, 0.1, 10.5]],
+        quats=[[1, 0, 0, 0], [0.9, 0.2, 0.3, 0.1]],
+        scales=[[1, 1, 1], [1.2, 0.6, 1.1]],
+        densities=[1, 1],
+        colors=[[0.9, 0.3, 0.1], [0.1, 0.4, 0.9]],
+        background=[0.2, 0.8, 0.4],
+    )
+    directions = np.stack([np.linspace(0, 0.1, rays), np.zeros(rays), np.ones(rays)], 1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    profile = physics.ray_profile(volume, np.zeros(3), directions)
+    return replace(profile, peak=profile.peak * optical_depth / profile.depths()[0].sum()), volume
+
+
+def _scene(camera: Camera, means, scales, optical_depths, colors, quats=None) -> tuple[Volume, Camera]:
+    """Gaussians with an optical depth through the center as the camera sees it; unrotated unless ``quats``."""
+    count = len(means)
+    quats = np.tile([1.0, 0, 0, 0], (count, 1)) if quats is None else quats
+    volume = Volume(means, quats, scales, np.ones(count), colors, [0.05, 0.05, 0.08])
+    return replace(volume, densities=optical_depths / physics.peak_depths(volume, camera)), camera
+
+
+def _camera(focal: float = 48.0) -> Camera:
+    return make_camera(48, 48, focal, seed=None)
+
+
+def _cluster() -> tuple[Volume, Camera]:
+    rng, count = np.random.default_rng(7), 32
+    means = rng.normal(size=(count, 3)) * [0.55, 0.55, 0.4] + [0, 0, 4]
+    scales = np.exp(rng.uniform(np.log(0.08), np.log(0.45), (count, 3)))
+    optical_depths = np.exp(rng.uniform(np.log(0.3), np.log(6), count))
+    return _scene(_camera(), means, scales, optical_depths, rng.uniform(0, 1, (count, 3)), rng.normal(size=(count, 4)))
+
+
+ORANGE_BLUE = np.array([[0.95, 0.55, 0.1], [0.1, 0.4, 0.9]])
+SCENES: dict[str, Callable[[], tuple[Volume, Camera]]] = {
+    "one": lambda: _scene(_camera(), [[0, 0, 4]], [[0.5, 0.35, 0.4]], np.array([2.0]), ORANGE_BLUE[:1]),
+    "separated": lambda: _scene(
+        _camera(), [[-0.2, 0, 3], [0.4, 0, 9]], [[0.3] * 3, [1.0] * 3], np.array([1.5, 3.0]), ORANGE_BLUE
+    ),
+    "overlapping": lambda: _scene(
+        _camera(), [[-0.25, 0, 4], [0.25, 0, 4.2]], [[0.5, 0.5, 0.6]] * 2, np.array([3.0, 3.0]), ORANGE_BLUE
+    ),
+    "needle along its axis": lambda: _scene(
+        _camera(), [[0, 0, 5]], [[0.08, 0.08, 0.8]], np.array([4.0]), ORANGE_BLUE[:1]
+    ),
+    "needle at the edge": lambda: _scene(
+        _camera(focal=17.0), [[2.6, 0.6, 3.0]], [[0.35, 0.35, 0.8]], np.array([3.0]), ORANGE_BLUE[:1]
+    ),
+    "cluster": _cluster,
+}
+
+
+def plain(number: float) -> str:
+    """0.01 and 1,000,000, not 1e+06."""
+    return f"{number:,.0f}" if number >= 1 else f"{number:g}"
 
 
 def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[str, list[dict[str, Any]]]:
@@ -45,7 +134,7 @@ def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[
     """
     out = Path(out)
     integrators, limits = measure_integrators(), measure_limits()
-    say(f"Error of C(0), the largest of {media.RAYS} rays, by samples per ray (and run time for all rays)\n")
+    say(f"Error of C(0), the largest of {RAYS} rays, by samples per ray (and run time for all rays)\n")
     say(_integrator_table(integrators))
     say("\nLargest stable tau ds, tau at its peak\n")
     say(table_of(limits, LIMITS))
@@ -63,34 +152,34 @@ def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[
     maps = {
         name.replace(" at", "\nat"): [
             ("truth", images[name]["truth"], None),
-            *((rung, images[name]["truth"], images[name][rung]) for rung in media.PARENT),
+            *((rung, images[name]["truth"], images[name][rung]) for rung in PARENT),
         ]
-        for name in media.PICTURED
+        for name in PICTURED
     }
-    plots.plot_maps(out / "volume_maps.png", maps, 4.2, media.LEAST_ERROR)
+    plots.plot_maps(out / "volume_maps.png", maps, 4.2, LEAST_ERROR)
     return results
 
 
 def measure_integrators() -> list[dict[str, Any]]:
     """Error and run time of each integrator at each optical depth and number of samples."""
     records = []
-    for optical_depth in media.OPTICAL_DEPTHS:
-        profile, volume = media.stiff_medium(optical_depth)
+    for optical_depth in OPTICAL_DEPTHS:
+        profile, volume = stiff_medium(optical_depth)
         medium, peak = profile.medium(volume.colors), _peak(profile)
         truth, doubled = (physics.integrate_exact(profile, volume.colors, volume.background, n) for n in (128, 256))
-        ways = list(itertools.product(media.METHODS, media.SAMPLES))
+        ways = list(itertools.product(METHODS, SAMPLES))
         seconds, radiance = {way: [] for way in ways}, {}
-        for _, (name, count), warm in itertools.product(range(media.REPEATS), ways, (False, True)):
+        for _, (name, count), warm in itertools.product(range(REPEATS), ways, (False, True)):
             # interleaved, so that a disturbance meets all alike; the first time makes memory and caches ready
-            integrate, evaluations, *_ = media.METHODS[name]
+            integrate, evaluations, *_ = METHODS[name]
             start = time.perf_counter()
-            radiance[name, count] = integrate(medium, 0.0, media.FAR, count // evaluations, volume.background)
+            radiance[name, count] = integrate(medium, 0.0, FAR, count // evaluations, volume.background)
             seconds[name, count] += [time.perf_counter() - start] * warm
         for name, count in ways:
             error = _error(radiance[name, count], truth)
             found = {"optical_depth": optical_depth, "method": name, "samples": count}
-            found |= {"peak_tau_ds": peak * media.FAR * media.METHODS[name][1] / count, "error": error}
-            found |= {"stable": error < media.UNSTABLE, "seconds": float(np.median(seconds[name, count]))}
+            found |= {"peak_tau_ds": peak * FAR * METHODS[name][1] / count, "error": error}
+            found |= {"stable": error < UNSTABLE, "seconds": float(np.median(seconds[name, count]))}
             records.append({**found, "truth_error": _error(truth, doubled)})
     return records
 
@@ -102,20 +191,20 @@ def measure_limits() -> list[dict[str, Any]]:
     the more steps amplify, until nothing can damp them, and the limit falls to that of the slab.
     """
     records = []
-    for name, (integrate, _, theory, *_) in media.METHODS.items():
+    for name, (integrate, _, theory, *_) in METHODS.items():
         records.append({"medium": "slab", "method": name, "theory": theory, "measured": _slab_limit(integrate)})
-    for optical_depth in media.LIMIT_DEPTHS:
-        profile, volume = media.stiff_medium(optical_depth, rays=1)
+    for optical_depth in LIMIT_DEPTHS:
+        profile, volume = stiff_medium(optical_depth, rays=1)
         medium = profile.medium(volume.colors)
         truth = physics.integrate_exact(profile, volume.colors, volume.background, 128)
-        for name, (integrate, _, theory, *_) in media.METHODS.items():
-            steps = np.unique((_peak(profile) * media.FAR / np.geomspace(1, 20, 60)).astype(int))
-            errors = [_error(integrate(medium, 0.0, media.FAR, int(n), volume.background), truth) for n in steps]
-            tau_ds = _peak(profile) * media.FAR / steps
-            bad = np.flatnonzero(~(np.array(errors) < media.UNSTABLE))
+        for name, (integrate, _, theory, *_) in METHODS.items():
+            steps = np.unique((_peak(profile) * FAR / np.geomspace(1, 20, 60)).astype(int))
+            errors = [_error(integrate(medium, 0.0, FAR, int(n), volume.background), truth) for n in steps]
+            tau_ds = _peak(profile) * FAR / steps
+            bad = np.flatnonzero(~(np.array(errors) < UNSTABLE))
             measured = np.inf if not len(bad) else float(tau_ds[bad[-1] + 1])
             found = {"measured": measured, "tau_ds": tau_ds.tolist(), "errors": errors}
-            medium_name = f"Gaussians, optical depth {media.plain(optical_depth)}"
+            medium_name = f"Gaussians, optical depth {plain(optical_depth)}"
             records.append({"medium": medium_name, "method": name, "theory": theory, **found})
     return records
 
@@ -127,7 +216,7 @@ def _error(radiance: np.ndarray, truth: np.ndarray) -> float:
 
 def _peak(profile: physics.Profile) -> float:
     """The largest extinction on the first ray, 1 / world unit."""
-    return float(profile.extinction(np.linspace(0, media.FAR, 4001)[:, None]).sum(-1)[:, 0].max())
+    return float(profile.extinction(np.linspace(0, FAR, 4001)[:, None]).sum(-1)[:, 0].max())
 
 
 def _slab_limit(integrate: Callable) -> float:
@@ -151,12 +240,12 @@ def _slab_limit(integrate: Callable) -> float:
 def measure_ladder() -> tuple[dict[str, dict[str, np.ndarray]], list[dict[str, Any]]]:
     """The images of each scene, "truth" and the rungs, and the errors of the rungs."""
     images, records = {}, []
-    for scene, make in media.SCENES.items():
+    for scene, make in SCENES.items():
         volume, camera = make()
         truth = physics.render_volume(volume, camera)
         truth_error = _error(physics.render_volume(volume, camera, panels=32), truth)
         images[scene] = {"truth": truth, **physics.splat_ladder(volume, camera)}
-        for rung, parent in media.PARENT.items():
+        for rung, parent in PARENT.items():
             error = np.abs(images[scene][rung] - truth)
             own = np.abs(images[scene][rung] - images[scene][parent])
             found = {"mean": float(error.mean()), "max": float(error.max())}
@@ -171,7 +260,7 @@ def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
     for r in records:
         if r["samples"] in SHOWN:
             error = f"{r['error']:.1e}" if r["stable"] else "unstable"
-            row = rows.setdefault((media.plain(r["optical_depth"]), r["method"]), [])
+            row = rows.setdefault((plain(r["optical_depth"]), r["method"]), [])
             row.append(f"{error} ({1e3 * r['seconds']:.2g} ms)")
     headers = ["optical depth", "integrator", *(f"{count} samples" for count in SHOWN)]
     return format_table(headers, [[*key, *cells] for key, cells in rows.items()])
@@ -180,10 +269,10 @@ def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
 def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limits: Sequence[Mapping[str, Any]]) -> None:
     """Draw error against run time, a panel for each optical depth, and error against tau ds around the limits."""
     panels = []
-    for optical_depth in media.OPTICAL_DEPTHS:
-        title, x = f"optical depth {media.plain(optical_depth)}", f"run time for {media.RAYS} rays [ms]"
+    for optical_depth in OPTICAL_DEPTHS:
+        title, x = f"optical depth {plain(optical_depth)}", f"run time for {RAYS} rays [ms]"
         panels.append(panel := plots.Panel(title, x))
-        for place, (name, (*_, color, marker)) in enumerate(media.METHODS.items()):
+        for place, (name, (*_, color, marker)) in enumerate(METHODS.items()):
             for stable in (True, False):
                 chosen = [r for r in integrators if (r["optical_depth"], r["method"]) == (optical_depth, name)]
                 chosen = [r for r in chosen if r["stable"] == stable]
@@ -192,10 +281,10 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
                 label, marks = (name, marker) if stable else ("unstable: error above 1", "x")
                 seconds, line = [1e3 * r["seconds"] for r in chosen], {"ls": "-", "lw": 1.4} if stable else {}
                 panel.marks(label, seconds, errors, (color, marks), **line)
-    title = f"step limit at {media.plain(media.LIMIT_DEPTHS[-1])}"
+    title = f"step limit at {plain(LIMIT_DEPTHS[-1])}"
     panels.append(panel := plots.Panel(title, "tau ds at the peak of tau", ticks=True))
-    for record in limits[-len(media.METHODS) :]:  # those of the densest medium
-        theory, color = record["theory"], media.METHODS[record["method"]][3]
+    for record in limits[-len(METHODS) :]:  # those of the densest medium
+        theory, color = record["theory"], METHODS[record["method"]][3]
         panel.line("", record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, lw=1.4)
         panel.line("stability limit for constant tau", [theory] * 2, [1e-16, 1e3], color=INK, lw=1, ls="--")
     plots.draw_panels(path, panels, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
