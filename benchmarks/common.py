@@ -12,7 +12,11 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from warp_splat.color import to_bytes
+from warp_splat.config import RasterOptions
 from warp_splat.evaluation.report import machine
+from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.finished import make_renderer
 from warp_splat.runtime import pool
 from warp_splat.text import cells_of, format_table
 
@@ -123,3 +127,9 @@ def milliseconds(run: Callable[[], object], device: str, repeats: int) -> float:
 def synchronize(device: str) -> None:
     if device == "cuda":
         torch.cuda.synchronize()
+
+
+def picture_of(model: GaussianModel, background=None, options: RasterOptions | None = None, linear: bool = False):
+    """A function from a camera to the model's image, [H, W, 3] uint8; see ``make_renderer``."""
+    draw = make_renderer(model, background, options)
+    return lambda camera: to_bytes(draw(camera).image, linear)

@@ -10,12 +10,12 @@ import time
 from pathlib import Path
 
 import numpy as np
-from common import TRAINED, option, parse, write_table
+from common import TRAINED, option, parse, picture_of, write_table
 
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import FORMATS, load_gaussians, save_gaussians
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.finished import Finished, make_picture
+from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
 
 COLUMNS = {
@@ -37,7 +37,7 @@ def measure(scene_path: Path, model: Path, folder: Path) -> list[dict]:
         written = time.perf_counter()
         splats = load_gaussians(path).splats
         read, size = time.perf_counter(), path.stat().st_size
-        picture = make_picture(GaussianModel.from_splats(splats), False, finished.options)
+        picture = picture_of(GaussianModel.from_splats(splats), None, finished.options)
         renders = [picture(view.camera) for view in scene.test]
         if first is None:
             first, first_bytes = np.concatenate(renders), size

@@ -4,7 +4,7 @@ import statistics
 import time
 
 import torch
-from common import milliseconds, synchronize
+from common import milliseconds, picture_of, synchronize
 from made_up import cameras, make_gaussians, make_trainer, steps_of
 
 from warp_splat.compare import adjoints
@@ -14,7 +14,6 @@ from warp_splat.errors import InputError
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 from warp_splat.rendering.camera_paths import ORBIT_SIZE
-from warp_splat.rendering.finished import make_picture
 from warp_splat.runtime import timers
 
 STAGES = (
@@ -88,7 +87,7 @@ def measure_orbit(count: int, device: str, frames: int, real: bool) -> list[list
     if not real:
         path = [camera.resized(98, 54) for camera in path]
     for cap in (None, CAP):
-        picture = make_picture(model, False, RasterOptions(max_steps=cap))
+        picture = picture_of(model, None, RasterOptions(max_steps=cap))
         for camera in path[:10]:
             picture(camera)
         start = time.perf_counter()

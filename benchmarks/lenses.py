@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import warp as wp
-from common import option, parse, write_table
+from common import option, parse, picture_of, write_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 from make_scene import TARGET, orbit
@@ -26,7 +26,7 @@ from scene_trace import GRID, LAMP, LAMP_HALF, Scene, Tracer, develop, trace
 from warp_splat.camera import Camera
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
-from warp_splat.rendering.finished import Finished, make_picture
+from warp_splat.rendering.finished import Finished
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
@@ -89,7 +89,7 @@ def own_psnr(folder: Path, model: Path) -> float:
     """Of a model, on the lens's own pixels of the views held out [dB], the mean."""
     finished = Finished(model)
     scene = load_scene(folder, eval=True, lens="native", report=str)
-    draw = make_picture(GaussianModel.from_splats(finished.file.splats), False, finished.options)
+    draw = picture_of(GaussianModel.from_splats(finished.file.splats), None, finished.options)
     errors = [np.mean((draw(view.camera) / 255.0 - view.image / 255.0) ** 2) for view in scene.test]
     return float(np.mean(-10 * np.log10(errors)))
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from common import TRAINED, parse, write_table
+from common import TRAINED, parse, picture_of, write_table
 
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html.merge import merged
@@ -17,7 +17,7 @@ from warp_splat.export_html.pack import shown
 from warp_splat.formats import model_folder
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.finished import Finished, make_picture
+from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
 
 SHARES = {"1/2": 1 / 2, "1/5": 1 / 5, "1/10": 1 / 10}
@@ -32,7 +32,7 @@ def rows_of(model: Path) -> list[tuple]:
     splats, rows = shown(finished.file.splats), []
 
     def pictures(chosen: SplatArrays) -> list[np.ndarray]:
-        picture = make_picture(GaussianModel.from_splats(chosen), False, finished.options)
+        picture = picture_of(GaussianModel.from_splats(chosen), None, finished.options)
         return [picture(camera) for camera in cameras[:VIEWS]]
 
     everything = pictures(splats)

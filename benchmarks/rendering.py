@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import interleaved, option, parse, write_table
+from common import interleaved, option, parse, picture_of, write_table
 
 from warp_splat import rasterize, rasterize_views
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import focus_orbit
-from warp_splat.rendering.finished import make_picture
 from warp_splat.runtime import launch, pool
 from warp_splat.scene import load_scene
 from warp_splat.text import format_table
@@ -37,7 +36,7 @@ HEADERS = ("Gaussians", "options", "frames/s", "times all", "PSNR to all", "larg
 
 def measure(model: GaussianModel, names: list[str], cameras: list, test: list) -> list[tuple]:
     """A row for each of the options: speed on the orbit, error against the first of them, quality on held-out views."""
-    pictures = {name: make_picture(model, False, OPTIONS[name]) for name in names}
+    pictures = {name: picture_of(model, None, OPTIONS[name]) for name in names}
     frames = {name: np.concatenate([picture(camera) for camera in cameras]) for name, picture in pictures.items()}
     runs = {name: lambda picture=picture: [picture(camera) for camera in cameras] for name, picture in pictures.items()}
     seconds, full, rows = interleaved(runs, ROUNDS), frames[FULL], []

@@ -11,9 +11,13 @@ import torch
 
 from warp_splat import Shutter
 from warp_splat.camera import Camera
+from warp_splat.color import to_bytes
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
+from warp_splat.config import RasterOptions
+from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS
+from warp_splat.rendering.finished import make_renderer
 
 C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
 OPENCV, FISHEYE = Lens("OPENCV", (-0.12, 0.02, 0.01, -0.006)), Lens("OPENCV_FISHEYE", (0.03, -0.01, 0.004, -0.001))
@@ -242,3 +246,9 @@ def scene_of(name):
     """By its name; "rolling ..." moves while its rows are read."""
     scene = SCENES[name.removeprefix("rolling ")]()
     return replace(scene, camera=replace(scene.camera, shutter=SHUTTER)) if "rolling" in name else scene
+
+
+def picture_of(model: GaussianModel, background=None, options: RasterOptions | None = None, linear: bool = False):
+    """A function from a camera to the model's image, [H, W, 3] uint8; see ``make_renderer``."""
+    draw = make_renderer(model, background, options)
+    return lambda camera: to_bytes(draw(camera).image, linear)

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 from commands import changes_told
-from scenes import C0
+from scenes import C0, picture_of
 from scipy.spatial.transform import Rotation
 from splat_files import (
     ENDINGS,
@@ -22,7 +22,6 @@ from splat_files import (
 
 from warp_splat.cli import main
 from warp_splat.compare.scenes import make_camera
-from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.convert import losses
@@ -30,7 +29,6 @@ from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.finished import make_picture
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward
@@ -295,7 +293,7 @@ def test_renders_of_the_converted_file(tmp_path, ending, decibels):
     save_gaussians(tmp_path / f"a{ending}", SplatFile(splats), report=silent)
     images = []
     for one in (splats, load_gaussians(tmp_path / f"a{ending}").splats):
-        images.append(make_picture(GaussianModel.from_splats(one), False, RasterOptions())(camera))
+        images.append(picture_of(GaussianModel.from_splats(one))(camera))
     assert images[0].std() > 20 and psnr(images[1], images[0]) > decibels
 
 

@@ -16,7 +16,6 @@ from trainings import begin, steps
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
-from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.png import load_png
@@ -305,7 +304,7 @@ def test_damaged_exposures_are_one_sentence(changes, trained, fails):
 def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
     at_rest(monkeypatch)
     model, client = GaussianModel.from_splats(some_gaussians(50)), FakeClient(1, some_scene().test[0].camera, (120, 60))
-    draw, frames = make_renderer(model, False, RasterOptions()), []
+    draw, frames = make_renderer(model), []
     for factor in (1.0, 0.25):
         exposed = lambda image, view, factor=factor: image * factor  # noqa: E731
         with server.Viewer(draw, lambda: model.parameters["means"], some_scene(), 8080, exposed=exposed) as viewer:

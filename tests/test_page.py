@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 from pages import CAMERAS, EVIL, OPTIONS, Blocks, many_splats, unpacked
+from scenes import picture_of
 from splat_files import covariances, some_splats
 
-from warp_splat.config import RasterOptions
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html import pack
 from warp_splat.export_html.command import make_page
@@ -17,7 +17,6 @@ from warp_splat.export_html.pack import parts, shown
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import orbit_cameras
-from warp_splat.rendering.finished import make_picture
 
 PARTS = ["gaussians0", "gaussians1", "gaussians2", "gaussians3", "harmonics1", "harmonics2", "harmonics3"]
 
@@ -140,7 +139,7 @@ def test_merged_ones_look_more_like_a_surface_than_its_most_important_ones_do():
     splats.scales[:] = rng.normal(-2.5, 0.5, (10_000, 3))
 
     def picture(chosen):
-        return make_picture(GaussianModel.from_splats(chosen), False, RasterOptions())(camera)
+        return picture_of(GaussianModel.from_splats(chosen))(camera)
 
     everything, few = picture(splats), picture(pack.shown(splats, 1000))
     assert psnr(picture(merged(splats, 1000, [camera])[1]), everything) > 3 + psnr(few, everything)

@@ -11,8 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from browser import browser_page
 from pages import EVIL, many_splats
+from scenes import picture_of
 from splat_files import some_splats
 
 from warp_splat.cli import main
@@ -26,7 +28,6 @@ from warp_splat.formats.png import load_png
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import orbit_cameras
-from warp_splat.rendering.finished import make_picture
 from warp_splat.scene.types import Decoded, View
 
 
@@ -39,7 +40,8 @@ def model(folder, splats, options=RasterOptions(), white=False, name="1.jpg", li
     model_folder.write_cameras(folder, [], views)
     settings = {"antialiasing": options.antialiasing, "projection": options.projection}
     model_folder.write_cfg_args(folder, {**settings, "white_background": white, "linear_light": linear})
-    return folder, make_picture(GaussianModel.from_splats(splats), white, options, linear), cameras
+    background = torch.full((3,), float(white))
+    return folder, picture_of(GaussianModel.from_splats(splats), background, options, linear), cameras
 
 
 def export(folder, *arguments):
@@ -269,7 +271,7 @@ def test_the_first_picture_comes_before_the_rest(small_chunks, browser, slow_ser
     assert page.inner_text("#count").startswith("4,096 for ")
     before = photographed(page, tmp_path)[: int(page.locator("#bar").bounding_box()["y"])]
     _, coarse, _ = merged(pack.shown(splats), 4096, cameras)
-    ours = make_picture(GaussianModel.from_splats(coarse), False, RasterOptions())
+    ours = picture_of(GaussianModel.from_splats(coarse))
     assert psnr(before, ours(cameras[0])[: len(before)]) > 45
     assert page.evaluate("document.readyState") == "loading"
     slow_server.more.set()
@@ -301,5 +303,5 @@ def test_a_page_that_ends_too_early_says_so_and_shows_what_came(small_chunks, br
     found = photographed(page, tmp_path)[: int(page.locator("#bar").bounding_box()["y"])]
     fine = fine._replace(sh=fine.sh[:, :1])
     came = [np.concatenate([few[rest:], many[:4096]]) for few, many in zip(coarse, fine, strict=True)]
-    ours = make_picture(GaussianModel.from_splats(SplatArrays(*came)), False, RasterOptions())(cameras[0])
+    ours = picture_of(GaussianModel.from_splats(SplatArrays(*came)))(cameras[0])
     assert psnr(found, ours[: len(found)]) > 45

@@ -7,6 +7,7 @@ import pytest
 import torch
 from commands import SCENE
 from make_faults import beyond, make_faulty, sky_light
+from scenes import picture_of
 from scipy.spatial.transform import Rotation
 from trainings import begin, steps
 
@@ -20,7 +21,6 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.raster.behind import put_behind
 from warp_splat.raster.drivers import CPU, CUDA, using
-from warp_splat.rendering.finished import make_picture
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
 from warp_splat.scene.types import Decoded
@@ -45,9 +45,9 @@ def test_what_is_saved_looks_as_in_training(trained, scene):
     assert (harmonics != 0).all() and np.array_equal(harmonics, trainer.behind.numpy())
     assert np.array_equal(read_environment(ply_path(folder, 12), 0), harmonics)
     model = GaussianModel.load(ply_path(folder, 12))
-    shown, without = (make_picture(model, False, trainer.options, False, some)(camera) for some in (harmonics, None))
+    shown, without = (picture_of(model, some, trainer.options)(camera) for some in (trainer.behind, None))
     trainer.model = trainer.model.arranged()
-    found = make_picture(trainer.model, False, trainer.options, False, harmonics)(camera)
+    found = picture_of(trainer.model, trainer.behind, trainer.options)(camera)
     assert np.array_equal(shown, found) and not np.array_equal(shown, without)
 
 

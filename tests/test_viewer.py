@@ -11,7 +11,7 @@ from fake_viser import PHOTO, FakeClient, at_rest, drawn, some_gaussians, some_s
 from scene_files import write_colmap
 
 from warp_splat.color import to_srgb
-from warp_splat.config import RasterOptions, ViewConfig
+from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
@@ -25,7 +25,7 @@ from warp_splat.viewer.watcher import MOST
 @pytest.fixture
 def viewer(fake_viser):
     model, scene = GaussianModel.from_splats(some_gaussians(50)), some_scene()
-    draw = make_renderer(model, False, RasterOptions())
+    draw = make_renderer(model)
     with server.Viewer(draw, lambda: model.parameters["means"], scene, 8080) as viewer:
         yield viewer
     assert viewer.server.stopped
@@ -182,7 +182,7 @@ def test_windows_of_strange_sizes(viewer, monkeypatch, size):
 def test_small_models(fake_viser, count, coefficients):
     """Also an empty one, and one without spherical harmonics."""
     model = GaussianModel.from_splats(some_gaussians(count, coefficients))
-    draw = make_renderer(model, False, RasterOptions())
+    draw = make_renderer(model)
     with server.Viewer(draw, lambda: model.parameters["means"], None, 8080) as viewer:
         client = FakeClient(1, PHOTO)
         viewer.server.enter(client)
@@ -225,7 +225,7 @@ def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, so
     monkeypatch.setattr("warp_splat.viewer.command.interruptible", lambda: nullcontext([2]))
     at_rest(monkeypatch)
     assert view_model(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
-    draw = make_renderer(GaussianModel.from_splats(some_gaussians(50)).arranged(), False, RasterOptions())
+    draw = make_renderer(GaussianModel.from_splats(some_gaussians(50)).arranged())
     plain = draw(served[0], False).image.clamp(0, 1)
     assert plain.std() > 0.1
     shown = to_srgb(plain, torch.where) if source else plain

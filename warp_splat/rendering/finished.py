@@ -62,19 +62,23 @@ class Finished:
 
     def background(self, device: torch.device) -> torch.Tensor:
         """What lies behind the Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
-        return backdrop(bool(self.trained.get("white_background")), self.harmonics, device)
+        if self.harmonics is not None:
+            return torch.from_numpy(self.harmonics).to(device)
+        return torch.full((3,), float(bool(self.trained.get("white_background"))), device=device)
 
     def renderer(self, model: GaussianModel, options: RasterOptions | None = None) -> Callable[..., RenderOutput]:
         """:func:`make_renderer` of its Gaussians, or some of them."""
-        white = bool(self.trained.get("white_background"))
-        return make_renderer(model, white, options or self.options, self.harmonics)
+        return make_renderer(model, self.background(model.device), options or self.options)
 
     def picture(
         self, model: GaussianModel, scene: Scene | None, options: RasterOptions | None = None
     ) -> Callable[..., np.ndarray]:
-        """:func:`make_picture` likewise; ``scene``: that of the model, if it is known."""
-        white, linear = bool(self.trained.get("white_background")), self.is_linear(scene)
-        return make_picture(model, white, options or self.options, linear, self.harmonics, self.exposures)
+        """A function from a camera, and whose photograph's exposure it has, to the image [H, W, 3] uint8.
+
+        ``scene``: that of the model, if it is known.
+        """
+        draw, linear = self.renderer(model, options), self.is_linear(scene)
+        return lambda camera, name="": to_bytes(as_photographed(draw(camera).image, self.exposures, name), linear)
 
     def load_scene(self, source_path: str, say: Callable[[str], object]) -> Scene:
         """The scene that it was trained on, as it was loaded then.
@@ -123,40 +127,21 @@ class Finished:
         return replace(view, camera=camera.resized(view.camera.width, view.camera.height), original=camera)
 
 
-def backdrop(white_background: bool, harmonics: np.ndarray | None, device: torch.device) -> torch.Tensor:
-    """What lies behind Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
-    if harmonics is None:
-        return torch.full((3,), float(white_background), device=device)
-    return torch.from_numpy(harmonics).to(device)
-
-
-def make_picture(
-    model: GaussianModel,
-    white_background: bool,
-    options: RasterOptions,
-    linear: bool = False,
-    harmonics: np.ndarray | None = None,
-    exposures: Exposures | None = None,
-) -> Callable[..., np.ndarray]:
-    """A function from a camera, and whose photograph's exposure it has, to the model's image, [H, W, 3] uint8.
-
-    ``linear``: its colors are in linear light.
-    """
-    draw = make_renderer(model, white_background, options, harmonics)
-    return lambda camera, name="": to_bytes(as_photographed(draw(camera).image, exposures, name), linear)
-
-
 def make_renderer(
-    model: GaussianModel, white_background: bool, options: RasterOptions, harmonics: np.ndarray | None = None
+    model: GaussianModel, background: torch.Tensor | None = None, options: RasterOptions | None = None
 ) -> Callable[..., RenderOutput]:
-    """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients."""
-    background = backdrop(white_background, harmonics, model.device)
+    """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients.
+
+    ``background``: a color [3], black unless given; or harmonics [16, 3].
+    """
+    behind = torch.zeros(3, device=model.device) if background is None else background
+    options = options or RasterOptions()
     with torch.no_grad():
         gaussians = model.activated()
 
     @torch.no_grad()
     def draw(camera: Camera, depth: bool = False) -> RenderOutput:
-        return render_gaussians(gaussians, camera, background, replace(options, depth=depth))
+        return render_gaussians(gaussians, camera, behind, replace(options, depth=depth))
 
     return draw
 
