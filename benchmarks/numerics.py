@@ -132,7 +132,7 @@ def flipped(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list
     )
     double = [tensor.double() for tensor in gaussians]
     exact = oracle.exact_splats(*double[:4], torch.cat(double[4:], 1), camera)
-    order = torch.sort(exact.z.float(), stable=True).indices
+    order = torch.sort(exact.splats.z.float(), stable=True).indices
     order = order[exact.live[order]]
     drawn = project(gaussians, camera, RasterOptions(alpha_min=1e-6))
     xx, xy, yy = drawn.conics[order].unbind(1)

@@ -12,6 +12,7 @@ import torch
 from warp_splat import Shutter
 from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
+from warp_splat.compare import oracle
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
@@ -19,6 +20,7 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS
 from warp_splat.rendering.finished import make_renderer
 
+FAINTEST = 1e-37  # about the least normal number of float32, the cut where there is none
 C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
 OPENCV, FISHEYE = Lens("OPENCV", (-0.12, 0.02, 0.01, -0.006)), Lens("OPENCV_FISHEYE", (0.03, -0.01, 0.004, -0.001))
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
@@ -246,6 +248,24 @@ def scene_of(name):
     """By its name; "rolling ..." moves while its rows are read."""
     scene = SCENES[name.removeprefix("rolling ")]()
     return replace(scene, camera=replace(scene.camera, shutter=SHUTTER)) if "rolling" in name else scene
+
+
+@torch.no_grad()
+def culling(out, camera, alpha_min: float = oracle.ALPHA_MIN) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of a render of the oracle, by Gaussian: whether it is seen or nearly, and how far it reaches.
+
+    [N] bool, the box around alpha >= ``alpha_min`` overlaps the image, or nearly; [N] px, the long half axis of the
+    ellipse where alpha is that, 0 where there is none.
+    """
+    splats, count, least = out.splats, len(out.means2d), max(alpha_min, FAINTEST)
+    level = 2 * torch.log((splats.opacity / least).clamp_min(1))  # d' conic d on the edge of the ellipse
+    half = (level[:, None] * torch.diagonal(splats.cov2d, dim1=1, dim2=2)).sqrt() + 0.01
+    low, high = splats.means2d - half, splats.means2d + half
+    size = splats.means2d.new_tensor([camera.width, camera.height])
+    inside = ((high > 0) & (low < size)).all(1) & splats.live & (splats.opacity > least * (1 - oracle.BAND))
+    reach = (level * torch.linalg.eigvalsh(splats.cov2d)[:, 1]).sqrt() * splats.live
+    copies = 3 if len(inside) > count else 1
+    return inside.reshape(copies, count).any(0), reach[:count]
 
 
 def picture_of(model: GaussianModel, background=None, options: RasterOptions | None = None, linear: bool = False):

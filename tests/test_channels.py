@@ -49,7 +49,7 @@ def truth(name):
     normals = normals * -((normals * (leaves[0] - center)).sum(1, keepdim=True)).sign().detach()
     after = 1 - weights.cumsum(2)
     crossed = (after <= 0.5).double().argmax(2)
-    median = torch.where((after <= 0.5).any(2), exact.z[order[crossed]], 0)
+    median = torch.where((after <= 0.5).any(2), exact.splats.z[order[crossed]], 0)
     strong = weights.topk(min(4, weights.shape[2]), 2)
     sure = ~exact.fragile & ((after - 0.5).abs().amin(2) > NARROW)
     sure &= (strong.values[..., :-1] - strong.values[..., 1:]).amin(2) > NARROW * 1e-2

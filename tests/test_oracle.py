@@ -38,7 +38,8 @@ def test_one_gaussian_closed_form():
     assert out.image[4, 6].tolist() == pytest.approx(expected, rel=1e-12)
     assert out.alpha[3, 4].item() == pytest.approx(0.6, rel=1e-12)
     assert out.depth[4, 6].item() == pytest.approx(4, rel=1e-12)
-    assert out.reach.item() == pytest.approx(math.sqrt(2 * variance * math.log(255 * 0.6)), rel=1e-12)
+    reach = scenes.culling(out, CENTERED)[1].item()
+    assert reach == pytest.approx(math.sqrt(2 * variance * math.log(255 * 0.6)), rel=1e-12)
 
 
 def test_two_layers_closed_form_whatever_the_order_of_input():

@@ -104,17 +104,18 @@ def check_depth(out, expected):
     assert (depth[(expected.alpha == 0) & sure] == 0).all()
 
 
-def check_culling(out, expected):
+def check_culling(out, expected, camera, options):
     """Radius 0 for what cannot be seen, a radius that covers the ellipse for what can."""
     radii = out.radii.cpu()
+    near_image, reach = scenes.culling(expected, camera, options.alpha_min)
     assert radii.dtype == torch.int32 and (radii >= 0).all()
     assert (radii[expected.touches] > 0).all()
-    assert (radii[~expected.near_image] == 0).all()
+    assert (radii[~near_image] == 0).all()
     drawn = radii > 0
     error = (out.means2d.detach().cpu().double() - expected.means2d).abs().amax(1)
     assert (error <= 1e-5 * (50 + expected.means2d.abs().amax(1)))[drawn].all()
-    assert (radii[drawn] >= expected.reach[drawn] - 1).all()
-    assert (radii[drawn] <= 1.1 * expected.reach[drawn] + 3).all()
+    assert (radii[drawn] >= reach[drawn] - 1).all()
+    assert (radii[drawn] <= 1.1 * reach[drawn] + 3).all()
 
 
 def relative_error(gradient, expected):
@@ -177,7 +178,7 @@ def test_scene(name, options, adjoint, device, record_property):
     expected = truth(name, options)
     record_property("fragile_pixels", int(expected.out.fragile.sum()))
     check_image(out, expected.out)
-    check_culling(out, expected.out)
+    check_culling(out, expected.out, expected.scene.camera, options)
     check_gradients(gradients, expected.gradients)
     if options.depth:
         check_depth(out, expected.out)

@@ -12,6 +12,7 @@ import torch
 
 from warp_splat.audit.program import draw_by_program
 from warp_splat.audit.web import draw_by_page
+from warp_splat.compare.truth import PARAMETERS
 from warp_splat.compare.workloads import Workload
 from warp_splat.errors import InputError
 
@@ -136,16 +137,12 @@ def _bits(run) -> bytes:
 
 
 def _draw(render, given: list[np.ndarray], camera, upstream: np.ndarray | None):
-    *leaves, background = (torch.from_numpy(array.copy()).requires_grad_(upstream is not None) for array in given)
-    image = render(*leaves[:4], torch.cat(leaves[4:], 1), camera, background)
+    *geometry, sh_dc, sh_rest, background = (torch.from_numpy(array.copy()) for array in given)
+    sh = torch.cat([sh_dc, sh_rest], 1)
+    leaves = [tensor.requires_grad_(upstream is not None) for tensor in (*geometry, sh, background)]
+    image = render(*leaves[:5], camera, background)
     if not isinstance(image, torch.Tensor) or not image.requires_grad:
         return np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image), None
-    names = ("means", "quats", "scales", "opacities", "sh_dc", "sh_rest", "background")
-    wanted = [leaf for leaf in (*leaves, background) if leaf.numel()]
-    gradient = torch.from_numpy(upstream).to(image)
-    found = iter(torch.autograd.grad(image, wanted, gradient, allow_unused=True))
-    by_name = {name: next(found) for name, leaf in zip(names, (*leaves, background), strict=True) if leaf.numel()}
-    dc, rest = by_name.pop("sh_dc"), by_name.pop("sh_rest", None)
-    by_name["sh"] = dc if dc is None or rest is None else torch.cat([dc, rest], 1)
-    gradients = {name: value.cpu().numpy() for name, value in by_name.items() if value is not None}
-    return image.detach().cpu().numpy(), gradients
+    found = torch.autograd.grad(image, leaves, torch.from_numpy(upstream).to(image), allow_unused=True)
+    named = zip(PARAMETERS, found, strict=False)
+    return image.detach().cpu().numpy(), {name: value.cpu().numpy() for name, value in named if value is not None}

@@ -13,7 +13,7 @@ from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import atomic_write, write_csv, write_json
+from warp_splat.formats.atomic import atomic_write, write_csv, write_json, write_text
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch, pool
@@ -36,12 +36,10 @@ def run(config: CompareConfig) -> int:
         raise InputError(f"{', '.join(chosen)}: expected one of them, got {len(chosen)}; run the command for each.")
     if chosen and (config.scene or config.full):
         raise InputError(f"--scene, --full: these belong to the comparison without {chosen[0]}.")
+    if chosen and config.device == "cuda":
+        raise InputError(f"--device cuda: {chosen[0]} computes on the CPU only; use --device cpu.")
     scenes = {} if chosen else named_scenes(config.scene, print)
-    wanted = config.device
-    if chosen:
-        if wanted == "cuda":
-            raise InputError(f"--device cuda: {chosen[0]} computes on the CPU only; use --device cpu.")
-        wanted = "cpu"
+    wanted = "cpu" if chosen else config.device
     device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
     out, log = Path(config.out), []
     with atomic_write(out / ".writable") as path:  # to fail before all measuring, not after
@@ -52,22 +50,20 @@ def run(config: CompareConfig) -> int:
         print(text)
         log.append(text)
 
+    code = 0
     if config.stability:
-        name, code = "stability", 1 if cases.run_cases(out, config.modes, say) else 0
+        code = int(cases.run_cases(out, config.modes, say) > 0)
     elif config.volume:
-        name, code = "volume", 0
         measure.compare_with_physics(out, say)
     elif config.cameras:
-        name, code = "cameras", 0
         through_lenses.compare_cameras(out, say)
     else:
-        name, code = "compare", 0
         _compare_pixel_loops(config, scenes, device, out, say)
         trained.run_trainings(out, config.modes, scenes, config.full, say, device.type)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
-    with atomic_write(out / f"{name}.txt") as path:
-        path.write_text("\n".join(log) + "\n", encoding="utf-8")
+    name = chosen[0].removeprefix("--") if chosen else "compare"
+    write_text(out / f"{name}.txt", "\n".join([*log, ""]))
     print(f"Tables and plots: {out}")
     return code
 

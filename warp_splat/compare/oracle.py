@@ -23,7 +23,6 @@ OUTLINE = 2.0  # standard deviations of the ellipsoid whose outline is taken
 OUTLINE_REACH = 3.0  # of the one that must not reach the plane of the camera
 SIDE = 0.3  # the Jacobian sees x/z at most this share of the half width beyond the image
 
-FAINTEST = 1e-37  # about the least normal number of float32, the cut where there is none
 ROUNDING = 2.0**-24  # float32, half a unit in the last place
 UNSEEN = 1e-5  # a blending weight (and its gradient) too small to tell, a tenth of the error allowed
 BAND = 1e-3  # a Gaussian whose largest alpha is this close (relative) to 1/255 may be culled or not
@@ -51,11 +50,9 @@ class Render:
     means2d: torch.Tensor  # [N, 2] on the way to the image: retain_grad() works
     fragile: torch.Tensor  # [H, W] bool, float32 may see another decision here
     touches: torch.Tensor  # [N] bool, reaches a pixel beyond doubt
-    near_image: torch.Tensor  # [N] bool, the box around alpha >= 1/255 overlaps the image (or nearly)
-    reach: torch.Tensor  # [N] px, long half axis of the ellipse alpha = 1/255, 0 where there is none
     order: torch.Tensor  # [M] Gaussians that a pixel sees, nearest first
     weights: torch.Tensor  # [H, W, M] their shares in the pixels
-    z: torch.Tensor  # [N] depth in the camera
+    splats: Splats  # [N], or of a panorama [3 N]: those that leave it come in at the other side
 
 
 def rotation_matrices(quats):
@@ -225,20 +222,6 @@ def _swappable(alpha, blended, depth, alpha_max):
     return (both & (before * alpha[:, :-1] * alpha[:, 1:] > UNSEEN)).any(1)
 
 
-def _culling(splats, alpha, order, camera, alpha_min):
-    """Which splats a renderer must keep, which it may keep, and how far they reach."""
-    touches = torch.zeros_like(splats.live)
-    touches[order] = (alpha >= alpha_min * (1 + BAND)).any(0)
-    alpha_min = max(alpha_min, FAINTEST)
-    level = 2 * torch.log((splats.opacity / alpha_min).clamp_min(1))  # d' conic d on the edge of the ellipse
-    half = (level[:, None] * torch.diagonal(splats.cov2d, dim1=1, dim2=2)).sqrt() + 0.01
-    low, high = splats.means2d - half, splats.means2d + half
-    size = splats.means2d.new_tensor([camera.width, camera.height])
-    inside = ((high > 0) & (low < size)).all(1) & splats.live & (splats.opacity > alpha_min * (1 - BAND))
-    reach = (level * torch.linalg.eigvalsh(splats.cov2d)[:, 1]).sqrt() * splats.live
-    return touches, inside, reach
-
-
 def exact_render(
     means, quats, scales, opacities, sh, camera, background=BLACK, alpha_min=ALPHA_MIN, alpha_max=ALPHA_MAX, t_min=STOP,
     pixels=None, **view,
@@ -263,7 +246,8 @@ def exact_render(
         raw, error = _alphas(splats, order, camera, pixels)
         blended, fragile = _decide(raw, error, alpha_min, alpha_max, t_min)
         fragile |= _swappable(raw, blended, splats.z.detach()[order], alpha_max)
-        touches, near_image, reach = _culling(splats, raw, order, camera, alpha_min)
+        touches = torch.zeros_like(splats.live)
+        touches[order] = (raw >= alpha_min * (1 + BAND)).any(0)
         seen = blended.any(0)  # the others have no gradient, and need no memory for it
     order, blended = order[seen], blended[:, seen]
     raw, _ = _alphas(splats, order, camera, pixels)
@@ -281,9 +265,7 @@ def exact_render(
         means2d=once.means2d,
         fragile=fragile.reshape(shape),
         touches=touches.reshape(copies, len(means)).any(0),
-        near_image=near_image.reshape(copies, len(means)).any(0),
-        reach=reach[: len(means)],
         order=order,
         weights=weight.reshape(*shape, len(order)),
-        z=splats.z,
+        splats=splats,
     )
