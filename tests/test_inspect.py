@@ -60,9 +60,8 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
 
 def test_the_reprojection_error_is_that_of_pycolmap(capsys):
     subject, _ = read_subject(SCENE, "images")
-    measured = geometry.Measured()
-    list(geometry.check_reprojection(subject, measured))
-    errors = np.concatenate(list(measured.errors.values()))
+    list(geometry.check_reprojection(subject))
+    errors = np.concatenate(list(subject.errors.values()))
     subject.model.update_point_3d_errors()
     points = subject.model.points3D.values()
     expected = sum(point.error * point.track.length() for point in points) / len(errors)
@@ -146,7 +145,7 @@ def two_of_one_stem(path):
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_damage_is_found(life, tmp_path, capsys, monkeypatch, damage, finding, text):
-    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject, measured: ())  # takes long
+    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject: ())  # takes long
     damage(life)
     findings, _ = examine(life, tmp_path, capsys, 1 if finding[0] == "error" else 0)
     assert any(text in what for *found, what in findings if tuple(found) == finding), findings
@@ -154,7 +153,7 @@ def test_damage_is_found(life, tmp_path, capsys, monkeypatch, damage, finding, t
 
 @pytest.mark.parametrize("case", BAD)
 def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case):
-    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject, measured: ())
+    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject: ())
     source, options = BAD[case][0](tmp_path)
     if options.keys() - {"images"}:
         return  # of the resolution or the split, which this command does not have

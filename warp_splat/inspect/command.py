@@ -7,7 +7,7 @@ from pathlib import Path
 
 from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
-from warp_splat.inspect import brightness, geometry, verdicts
+from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.page import draw_pictures, write_page
 from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos
@@ -30,13 +30,12 @@ def inspect(config: InspectConfig) -> int:
     if not has_cameras(source):
         read_photos(source, config.images, print)  # says what is missing
     subject, findings = read_subject(source, config.images)
-    measured = geometry.Measured()
     findings += verdicts.check_cameras(subject)
-    findings += geometry.check_reprojection(subject, measured)
-    findings += geometry.check_coverage(subject, measured)
+    findings += geometry.check_reprojection(subject)
+    findings += geometry.check_coverage(subject)
     findings += geometry.check_sky(subject)
     findings += geometry.check_axes(subject)
-    findings += brightness.check_exposure(subject, measured)
+    findings += geometry.check_exposure(subject)
     findings += verdicts.check_coordinates(subject)
     findings += verdicts.check_names(subject)
     findings += verdicts.check_masks(subject)
@@ -44,7 +43,7 @@ def inspect(config: InspectConfig) -> int:
     findings += verdicts.check_cost(subject)
     findings.sort(key=lambda finding: LEVELS.index(finding.level))
     verdict = _verdict(findings)
-    write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject, measured))
+    write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))
     for finding in findings:
         print(f"{_colored(finding.level)}  {finding.check:13s} {finding.text}")
     print(f"{source}: {verdict} ({time.perf_counter() - started:.1f} s)\n  page {page}")

@@ -1,15 +1,17 @@
-"""Checks of cameras against points: reprojection, coverage, points that nobody sees, axes that are mixed up."""
+"""Checks of photographs against points: reprojection, coverage, a sky, how bright they are, axes that are mixed up."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from warp_splat.camera import Camera
+from warp_splat.errors import InputError
 from warp_splat.inspect.subject import Finding, Subject
-from warp_splat.scene.horizon import NEEDED, share_of_sky
-from warp_splat.scene.images import Photo
+from warp_splat.scene import gains as brightness
+from warp_splat.scene import horizon
+from warp_splat.scene.images import Photo, read_exposure
 from warp_splat.scene.types import visible
 from warp_splat.text import few
 
@@ -25,28 +27,12 @@ BETTER = 4.0  # times more points seen with other axes
 GAP = 120.0  # degrees
 
 
-@dataclass
-class Measured:
-    """Numbers for the pictures."""
-
-    errors: dict[str, np.ndarray] = field(default_factory=dict)  # px, of each observation of an image
-    pixels: dict[str, np.ndarray] = field(default_factory=dict)  # [n, 2] px in the model's image, of each observation
-    seen: dict[str, int] = field(default_factory=dict)  # points inside an image
-    stops: dict[str, float] = field(default_factory=dict)  # gain of an image, their mean is 0
-    exif: dict[str, float] = field(default_factory=dict)  # the same from EXIF, with the mean of those above
-
-    @property
-    def medians(self) -> dict[str, float]:
-        """The median error of each image, px."""
-        return {name: float(np.median(errors)) for name, errors in self.errors.items()}
-
-
 def sample(items: Any, count: int) -> Any:
     """At most ``count`` of the items of a list or an array, evenly."""
     return items[:: max(1, -(-len(items) // count))]
 
 
-def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding]:
+def check_reprojection(subject: Subject) -> Iterator[Finding]:
     """Points projected into images, against the keypoints from which they were triangulated."""
     if subject.model is None:
         return
@@ -65,13 +51,13 @@ def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding
         front = in_camera[:, 2] > 0
         errors = np.full(len(xyz), np.inf)  # a point behind the camera that observed it
         errors[front] = np.linalg.norm(image.camera.img_from_cam(in_camera[front]) - keypoints[front], axis=1)
-        measured.errors[image.name], measured.pixels[image.name] = errors, keypoints
+        subject.errors[image.name], subject.pixels[image.name] = errors, keypoints
         widths[image.name] = image.camera.width
-    if not measured.errors:
+    if not subject.errors:
         yield Finding("reprojection", "note", "the model keeps no observations of its points; look at the picture.")
         return
-    medians = measured.medians
-    every = np.concatenate(list(measured.errors.values()))
+    medians = subject.medians
+    every = np.concatenate(list(subject.errors.values()))
     typical, width = float(np.median(every)), float(np.median(list(widths.values())))
     behind = np.count_nonzero(~np.isfinite(every))
     level, meaning = "ok", ""
@@ -87,7 +73,7 @@ def check_reprojection(subject: Subject, measured: Measured) -> Iterator[Finding
         yield Finding("reprojection", "warning", f"{len(worst)} images are much worse than the others: {text}.")
 
 
-def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
+def check_coverage(subject: Subject) -> Iterator[Finding]:
     """Points in each image, points in no image, cameras all at one place, sides that nobody photographed."""
     if not subject.photos or not len(subject.points):
         return
@@ -97,11 +83,11 @@ def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
     for photo in subject.photos:
         inside = visible(photo.camera, points)
         counts += inside
-        measured.seen[photo.name] = round(scale * np.count_nonzero(inside))
-    poor = [name for name, seen in measured.seen.items() if seen < FEW_POINTS]
+        subject.seen[photo.name] = round(scale * np.count_nonzero(inside))
+    poor = [name for name, seen in subject.seen.items() if seen < FEW_POINTS]
     text = f", each point inside {np.median(counts):.0f} of {len(subject.photos)}"
     text = f", but fewer than {FEW_POINTS} in {few(poor)}" if poor else text
-    median = f"{np.median(list(measured.seen.values())):.0f} points lie inside the median image"
+    median = f"{np.median(list(subject.seen.values())):.0f} points lie inside the median image"
     yield Finding("coverage", "warning" if poor else "ok", f"{median}{text}.")
     unseen = np.count_nonzero(counts == 0) / len(points)
     level = "error" if unseen == 1 else "warning" if unseen > UNSEEN and not subject.random_points else "ok"
@@ -112,10 +98,57 @@ def check_coverage(subject: Subject, measured: Measured) -> Iterator[Finding]:
 def check_sky(subject: Subject) -> Iterator[Finding]:
     """How much of the photographs looks up to where there are no points."""
     if subject.photos and len(subject.points) and not subject.random_points:
-        share = share_of_sky([photo.camera for photo in subject.photos], subject.points)
+        share = horizon.share_of_sky([photo.camera for photo in subject.photos], subject.points)
         text = f"{100 * share:.1f} % of the photographs look up to where there are no points"
-        needed = share >= NEEDED
+        needed = share >= horizon.NEEDED
         yield Finding("sky", "note" if needed else "ok", f"{text}{': train with --parts sky' * needed}.")
+
+
+def check_exposure(subject: Subject) -> Iterator[Finding]:
+    """Gains of photographs along the tracks of points, from their thumbnails."""
+    if subject.model is None:
+        return
+    samples = {}
+    for image in (subject.model.image(i) for i in subject.model.reg_image_ids()):
+        seen = image.get_observation_points2D()
+        if image.name in subject.thumbnails and seen:
+            places = np.array([point.xy for point in seen]) / (image.camera.width, image.camera.height)
+            ids = np.array([point.point3D_id for point in seen], np.int64)
+            samples[image.name] = brightness.take_sample(subject.thumbnails[image.name], ids, places)
+    gains = brightness.fit_gains(samples)
+    if not gains.stops:
+        yield Finding("exposure", "note", "photographs share too few points to compare how bright they are.")
+        return
+    subject.stops = {name: float(gains.stops[name][brightness.GREEN]) for name in sorted(gains.stops)}
+    subject.exif = dict(_exif(subject))
+    least, most = (choose(subject.stops, key=lambda name: subject.stops[name]) for choose in (min, max))
+    text = (
+        f"photographs differ by {gains.unlike:.3f} stops from those that show the same points: "
+        f"{subject.stops[least]:+.2f} ({least}) to {subject.stops[most]:+.2f} ({most}) in all"
+    )
+    if subject.exif:
+        apart = np.array([subject.stops[name] - stops for name, stops in subject.exif.items()])
+        count = f"{len(subject.exif)} of {len(subject.stops)}"
+        text += f"; EXIF has the exposure of {count}, {apart.std():.2f} stops beside that (standard deviation)"
+    else:
+        text += "; EXIF says nothing"
+    needed = gains.unlike >= brightness.NEEDED
+    yield Finding("exposure", "warning" if needed else "ok", f"{text}{'; train with --parts exposure' * needed}.")
+
+
+def _exif(subject: Subject) -> Iterator[tuple[str, float]]:
+    """The exposures that files tell [stops], shifted to the mean of those that were subject."""
+    told = {}
+    for photo in subject.photos:
+        try:
+            stops = read_exposure(photo.path)
+        except InputError:  # said elsewhere
+            continue
+        if stops is not None and photo.name in subject.stops:
+            told[photo.name] = stops
+    if told:
+        shift = np.mean([subject.stops[name] - stops for name, stops in told.items()])
+        yield from ((name, float(stops + shift)) for name, stops in told.items())
 
 
 def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:
@@ -170,8 +203,8 @@ TURNS = {
 }
 
 
-def worst_and_best(measured: Measured, photos: list[Photo], count: int) -> list[Photo]:
+def worst_and_best(subject: Subject, photos: list[Photo], count: int) -> list[Photo]:
     """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
-    medians = measured.medians
+    medians = subject.medians
     ranked = sorted(photos, key=lambda photo: -medians.get(photo.name, 0.0))
     return ranked[: count // 2] + sample(ranked[count // 2 :], count - count // 2)

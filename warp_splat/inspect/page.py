@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, new_panels, plain_axes
 from warp_splat.formats.atomic import write_text
-from warp_splat.inspect.geometry import Measured, sample, worst_and_best
+from warp_splat.inspect.geometry import sample, worst_and_best
 from warp_splat.inspect.subject import THUMBNAIL, Finding, Subject
 from warp_splat.scene.types import visible
 
@@ -47,7 +47,7 @@ def write_page(
     write_text(path, page.substitute(title=escape(title), verdict=escape(verdict), rows=rows, figures=figures))
 
 
-def draw_pictures(subject: Subject, measured: Measured) -> Iterable[tuple[str, str]]:
+def draw_pictures(subject: Subject) -> Iterable[tuple[str, str]]:
     """Captions and pictures, as addresses of data that a page holds itself."""
     shown = [photo for photo in subject.photos if photo.name in subject.thumbnails]
     if not shown:
@@ -55,16 +55,16 @@ def draw_pictures(subject: Subject, measured: Measured) -> Iterable[tuple[str, s
     yield "The photographs, evenly chosen", _encode(_sheet(subject, [photo.name for photo in sample(shown, SHEET)]))
     if not len(subject.points):
         return
-    if measured.errors:
+    if subject.errors:
         caption = "Where points were seen, colored by how far from there they project (the worst images first)"
     else:
         caption = "Points projected into photographs: they should lie on what is there"
-    yield caption, _encode(_on_photos(subject, measured))
+    yield caption, _encode(_on_photos(subject))
     yield "Cameras (with their viewing directions) and points, from two sides", _encode(_map(subject))
-    if measured.errors:
-        yield "Reprojection error and points of each image, by name", _encode(_bars(measured))
-    if measured.stops:
-        yield "Exposure of each photograph beside the others, by name", _encode(_exposures(measured))
+    if subject.errors:
+        yield "Reprojection error and points of each image, by name", _encode(_bars(subject))
+    if subject.stops:
+        yield "Exposure of each photograph beside the others, by name", _encode(_exposures(subject))
 
 
 def _encode(figure: Figure) -> str:
@@ -100,18 +100,18 @@ def _sheet(subject: Subject, names: list[str]) -> Figure:
     return figure
 
 
-def _on_photos(subject: Subject, measured: Measured) -> Figure:
-    photos = worst_and_best(measured, [p for p in subject.photos if p.name in subject.thumbnails], ON_PHOTOS)
+def _on_photos(subject: Subject) -> Figure:
+    photos = worst_and_best(subject, [p for p in subject.photos if p.name in subject.thumbnails], ON_PHOTOS)
     height, width = subject.thumbnails[photos[0].name].shape[:2]
     figure, cells = _grid(len(photos), 3 if height > width else 2, height / width)
     dots = None
     for axes, photo in zip(cells, photos, strict=True):
         small = subject.thumbnails[photo.name]
         axes.imshow(small, alpha=0.7)
-        if photo.name in measured.errors:
+        if photo.name in subject.errors:
             image = subject.model.find_image_with_name(photo.name)
-            pixels = measured.pixels[photo.name][:DOTS] * small.shape[1] / image.camera.width
-            errors = measured.errors[photo.name]
+            pixels = subject.pixels[photo.name][:DOTS] * small.shape[1] / image.camera.width
+            errors = subject.errors[photo.name]
             dots = axes.scatter(*pixels.T, c=errors[:DOTS], s=2, cmap="plasma", vmin=0, vmax=MOST)
             title = f"{photo.name}: median {np.median(errors):.2f} px"
         else:
@@ -149,10 +149,10 @@ def _map(subject: Subject) -> Figure:
     return figure
 
 
-def _bars(measured: Measured) -> Figure:
+def _bars(subject: Subject) -> Figure:
     figure, grid = new_panels(2.6, 1, 2)
-    medians = list(measured.medians.values())
-    counts = [len(errors) for errors in measured.errors.values()]
+    medians = list(subject.medians.values())
+    counts = [len(errors) for errors in subject.errors.values()]
     panels = (("median reprojection error [px]", medians, ORANGE), ("observations", counts, BLUE))
     for axes, (title, values, color) in zip(grid[0], panels, strict=True):
         plain_axes(axes, title, "image")
@@ -160,14 +160,12 @@ def _bars(measured: Measured) -> Figure:
     return figure
 
 
-def _exposures(measured: Measured) -> Figure:
+def _exposures(subject: Subject) -> Figure:
     figure, axes = new_panels(2.6)
-    places = {name: place for place, name in enumerate(measured.stops)}
+    places = {name: place for place, name in enumerate(subject.stops)}
     plain_axes(axes, "brightness of the same points [stops]", "photograph")
-    axes.bar(places.values(), measured.stops.values(), color=BLUE, label="measured")
-    if measured.exif:
-        axes.scatter(
-            [places[name] for name in measured.exif], measured.exif.values(), 12, ORANGE, label="EXIF", zorder=2
-        )
+    axes.bar(places.values(), subject.stops.values(), color=BLUE, label="measured")
+    if subject.exif:
+        axes.scatter([places[name] for name in subject.exif], subject.exif.values(), 12, ORANGE, label="EXIF", zorder=2)
         axes.legend(fontsize=7)
     return figure

@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass
 class Subject:
-    """A scene as far as it can be read."""
+    """A scene as far as it can be read, and what checks have measured of it, for the pictures."""
 
     source: Path
     root: Path  # of the images
@@ -49,6 +49,16 @@ class Subject:
     alpha: list[str] = field(default_factory=list)  # names of images with an alpha channel
     linear: list[str] = field(default_factory=list)  # in linear light
     black: list[str] = field(default_factory=list)  # whose masks are black all over
+    errors: dict[str, np.ndarray] = field(default_factory=dict)  # px, of each observation of an image
+    pixels: dict[str, np.ndarray] = field(default_factory=dict)  # [n, 2] px in the model's image, of each observation
+    seen: dict[str, int] = field(default_factory=dict)  # points inside an image
+    stops: dict[str, float] = field(default_factory=dict)  # gain of an image, their mean is 0
+    exif: dict[str, float] = field(default_factory=dict)  # the same from EXIF, with the mean of those above
+
+    @property
+    def medians(self) -> dict[str, float]:
+        """The median reprojection error of each image, px."""
+        return {name: float(np.median(errors)) for name, errors in self.errors.items()}
 
 
 def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
