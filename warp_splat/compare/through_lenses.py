@@ -116,18 +116,8 @@ def footprint_images(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
     """The true image [H, W, 3] and those with each projection's footprints; NaN where the lens has no ray."""
     optical_depths = np.exp(np.random.default_rng(6).uniform(np.log(0.3), np.log(4), len(volume.means)))
     volume = replace(volume, densities=optical_depths / light.peak_depths(volume, camera))
-    rays = light.camera_rays(camera)
-    blind = np.isnan(rays[:, 0])
-    exact = light.ray_profile(volume, camera.center, np.where(blind[:, None], camera.forward, rays)).depths()
-    scene, peak = volume.splats(np.full(len(volume.means), 0.7)), light.peak_depths(volume, camera)
-    splats = {name: oracle.exact_splats(*scene, camera, projection=name) for name in PROJECTED}
-    order = np.argsort(splats["affine"].z.numpy(), kind="stable")
-    live = splats["affine"].live.numpy()  # what no projection draws is not theirs to get right
-    alphas = {"truth": -np.expm1(-exact * live)}
-    alphas |= {name: -np.expm1(-peak * light.falloff_at(found, camera, 0.0)) for name, found in splats.items()}
-    images = {name: light.composite(alpha[:, order], volume, order, camera) for name, alpha in alphas.items()}
-    hidden = blind.reshape(camera.height, camera.width, 1)
-    return {name: np.where(hidden, np.nan, image) for name, image in images.items()}
+    images = light.splat_images(volume, camera, {name: (name, 0.0) for name in PROJECTED})
+    return {"truth": images.pop("no overlap"), **images}
 
 
 def _made_splats(camera: Camera, most: float, count: int) -> list[torch.Tensor]:

@@ -15,7 +15,7 @@ Splatting (Zwicker et al. 2001, "EWA volume splatting"; Kerbl et al. 2023) takes
 are 2D Gaussians, and those are blurred a little.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -235,31 +235,38 @@ def splat_ladder(volume: Volume, camera: Camera) -> dict[str, np.ndarray]:
     ============= ============================================================================================
     """
     peak = peak_depths(volume, camera)
-    exact = ray_profile(volume, camera.center, camera_rays(camera)).depths()
-    opacities = -np.expm1(-peak)
-    scene = volume.splats(opacities)
+    exact, opacities = ray_profile(volume, camera.center, camera_rays(camera)).depths(), -np.expm1(-peak)
+    linear = {"linear depth": exact, "linear peak": opacities * exact / np.where(peak > 0, peak, 1)}
+    footprints = {"affine": ("affine", 0.0), "ellipsoid": ("ellipsoid", 0.0), "affine + blur": ("affine", oracle.BLUR)}
+    images = splat_images(volume, camera, footprints)
     order = np.argsort(volume.means @ camera.forward, kind="stable")
-
-    def footprint(projection: str, blur: float) -> np.ndarray:
-        return peak * falloff_at(oracle.exact_splats(*scene, camera, projection=projection), camera, blur)
-
-    alphas = {
-        "no overlap": -np.expm1(-exact),
-        "linear depth": np.minimum(exact, oracle.ALPHA_MAX),
-        "linear peak": np.minimum(opacities * exact / np.where(peak > 0, peak, 1), oracle.ALPHA_MAX),
-        "affine": -np.expm1(-footprint("affine", 0.0)),
-        "ellipsoid": -np.expm1(-footprint("ellipsoid", 0.0)),
-        "affine + blur": -np.expm1(-footprint("affine", oracle.BLUR)),
-    }
-    images = {name: composite(alpha[:, order], volume, order, camera) for name, alpha in alphas.items()}
-    images["3DGS"] = oracle.exact_render(*scene, camera, background=torch.from_numpy(volume.background)).image.numpy()
+    for name, alpha in linear.items():
+        images[name] = composite(np.minimum(alpha, oracle.ALPHA_MAX)[:, order], volume, order, camera)
+    scene, background = volume.splats(opacities), torch.from_numpy(volume.background)
+    images["3DGS"] = oracle.exact_render(*scene, camera, background=background).image.numpy()
     return images
 
 
-def falloff_at(splats: oracle.Splats, camera: Camera, blur: float) -> np.ndarray:
-    """exp(-d' cov2d^-1 d / 2) at each pixel, [H * W, N], with ``blur`` px^2 in place of the oracle's."""
-    covariance = splats.cov2d.numpy() + (blur - oracle.BLUR) * np.eye(2)
-    offset, sharp = pixel_centers(camera)[:, None] - splats.means2d.numpy(), np.linalg.inv(covariance)
+def splat_images(volume: Volume, camera: Camera, footprints: Mapping[str, tuple[str, float]]) -> dict[str, np.ndarray]:
+    """Images [H, W, 3] of "no overlap", and of the same with footprints: a projection, and its blur [px^2].
+
+    NaN where a lens has no ray. What a projection does not draw is nowhere.
+    """
+    peak, rays, scene = peak_depths(volume, camera), camera_rays(camera), volume.splats(np.ones(len(volume.means)))
+    blind = np.isnan(rays[:, :1])
+    found = {way: oracle.exact_splats(*scene, camera, projection=way[0], blur=way[1]) for way in footprints.values()}
+    first = next(iter(found.values()))
+    order = np.argsort(first.z.numpy(), kind="stable")
+    exact = ray_profile(volume, camera.center, np.where(blind, camera.forward, rays)).depths() * first.live.numpy()
+    depths = {"no overlap": exact} | {name: peak * falloff_at(found[way], camera) for name, way in footprints.items()}
+    images = {name: composite(-np.expm1(-depth)[:, order], volume, order, camera) for name, depth in depths.items()}
+    hidden = blind.reshape(camera.height, camera.width, 1)
+    return {name: np.where(hidden, np.nan, image) for name, image in images.items()}
+
+
+def falloff_at(splats: oracle.Splats, camera: Camera) -> np.ndarray:
+    """exp(-d' cov2d^-1 d / 2) at each pixel, [H * W, N]."""
+    offset, sharp = pixel_centers(camera)[:, None] - splats.means2d.numpy(), np.linalg.inv(splats.cov2d.numpy())
     around = camera.lens is not None and camera.lens.family.around
     falloff = 0.0
     for shift in (0, camera.width, -camera.width) if around else (0,):  # a panorama's copies
