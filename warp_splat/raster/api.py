@@ -12,22 +12,12 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.raster import checks
 from warp_splat.raster.behind import put_behind
 from warp_splat.raster.beside import blend_beside
 from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.certificate import certify, far_reaching, looking
-from warp_splat.raster.checks import (
-    check_background,
-    check_camera,
-    check_features,
-    check_gaussians,
-    check_hidden_from,
-    check_options,
-    check_tolerance,
-    explain_invalid,
-    own_explained,
-)
 from warp_splat.raster.data import Dropped, Gaussians, Room, Splats2D
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
@@ -153,23 +143,23 @@ def rasterize_views(
     if isinstance(cameras, (Camera, CameraParameters)) or not isinstance(cameras, Sequence):
         raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
     for camera in cameras:
-        check_camera(camera)
-    options = check_options(adjoint, options)
-    gaussians = check_gaussians(means, quats, scales, opacities, sh)
-    background = check_background(background, means.device)
-    check_tolerance(options, features)
+        checks.check_camera(camera)
+    options = checks.check_options(adjoint, options)
+    gaussians = checks.check_gaussians(means, quats, scales, opacities, sh)
+    background = checks.check_background(background, means.device)
+    checks.check_tolerance(options, features)
     if features is not None:
-        check_features(features, means)
+        checks.check_features(features, means)
     outputs, bases = [], [camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras]
     for base in bases:
-        check_hidden_from(options, base, means.device)
+        checks.check_hidden_from(options, base, means.device)
     sizes = ((base.width, base.height) for base in bases)
     advice = "render smaller images (Camera.resized) or fewer Gaussians"
-    with own_explained(options), memory_explained(means.device, means, sizes, advice):
+    with checks.own_explained(options), memory_explained(means.device, means, sizes, advice):
         for camera in cameras:
             outputs.append(render(gaussians, camera, background, options, adjoint, features))
             if outputs[-1].invalid:
-                explain_invalid(outputs[-1].invalid, gaussians.quats)
+                checks.explain_invalid(outputs[-1].invalid, gaussians.quats)
     return outputs
 
 
@@ -181,34 +171,19 @@ def render(
     adjoint: str = "manual",
     features: torch.Tensor | None = None,
     room: Room | None = None,
+    splats: Splats2D | None = None,
 ) -> RenderOutput:
     """:func:`rasterize` without its checks: Gaussians that are not finite are left out and counted.
 
     The background may be harmonics [16, 3], too: see :func:`put_behind`. With ``room`` for tile instances, a GPU need
-    not stop for their number; if there is too little, the view is rendered again.
+    not stop for their number; if there is too little, the view is rendered again. ``splats``: what others projected.
     """
-    dropped = Dropped()
+    dropped, driver = Dropped(), driver_of(gaussians.means.device)
     with stage("project"):
-        splats = project(gaussians, camera, far_reaching(options), dropped=dropped)
-    return render_splats(splats, gaussians, camera, background, options, adjoint, features, room, dropped)
-
-
-def render_splats(
-    splats: Splats2D,
-    gaussians: Gaussians,
-    camera: Camera | CameraParameters,
-    background: torch.Tensor,
-    options: RasterOptions,
-    adjoint: str = "manual",
-    features: torch.Tensor | None = None,
-    room: Room | None = None,
-    dropped: Dropped | None = None,
-) -> RenderOutput:
-    """:func:`render` of what is projected."""
-    driver, dropped = driver_of(splats.means2d.device), dropped or Dropped()
+        found = splats or project(gaussians, camera, far_reaching(options), dropped=dropped)
     seen = camera.base if isinstance(camera, CameraParameters) else camera  # from here on, its size alone counts
-    crossing = find_crossing(splats, seen)
-    copied = around(splats, seen, crossing)
+    crossing = find_crossing(found, seen)
+    copied = around(found, seen, crossing)
     color = background if background.dim() == 1 else background.new_zeros(3)
 
     def paint(chosen: RasterOptions, tiles: torch.Tensor | None = None) -> Painted:
@@ -235,22 +210,22 @@ def render_splats(
         with stage("channels"):
             more = blend_beside(features, gaussians, drawn, camera, blending, crossing)
     if room and room.overflowed():
-        return render_splats(splats, gaussians, camera, background, options, adjoint, features, room, dropped)
+        return render(gaussians, camera, background, options, adjoint, features, room, splats)
     if certificate:
         more |= {"bound": certificate.bound, "rounding": certificate.rounding}
-        splats = splats._replace(radii=drawn.radii[: len(splats.radii)])
+        found = found._replace(radii=drawn.radii[: len(found.radii)])
     invalid = blending.bins.invalid
     all_valid = isinstance(invalid, int) and not invalid  # a GPU would have to stop for the answer
     return RenderOutput(
         image=image,
         alpha=alpha,
         depth=depth / alpha.clamp_min(1e-10) if options.depth else None,
-        means2d=splats.means2d,
-        radii=splats.radii if all_valid else splats.radii.clamp_min(0),
-        conics=splats.conics,
-        colors=splats.colors,
-        depths=splats.depths,
-        opacities2d=splats.opacities,
+        means2d=found.means2d,
+        radii=found.radii if all_valid else found.radii.clamp_min(0),
+        conics=found.conics,
+        colors=found.colors,
+        depths=found.depths,
+        opacities2d=found.opacities,
         invalid_count=invalid,
         gaussians=gaussians,
         dropped=dropped,

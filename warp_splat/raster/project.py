@@ -23,18 +23,8 @@ from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES, vec16
 from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.lenses import Lens
-from warp_splat.raster.camera_parameters import (
-    CameraParameters,
-    coefficients_gradient,
-    exposed_by,
-    intrinsics_gradient,
-    motion_gradient,
-    motion_of,
-    of_sums,
-    pose_sums,
-    twist_gradient,
-    with_motion,
-)
+from warp_splat.raster import camera_parameters as cameras
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct, view
@@ -122,7 +112,7 @@ def project(
             bend = make_project(projection_of(options, camera.lens, learned=True), reach_of, driver.lanes, None)
     cam = camera_view(camera, gaussians.sh_rest.shape[1], options, limits)
     projection = projection_of(options, camera.lens)
-    kernel = make_project(projection, reach_of, driver.lanes, exposed_by(camera, options, driver.lanes))
+    kernel = make_project(projection, reach_of, driver.lanes, cameras.exposed_by(camera, options, driver.lanes))
     it = Projecting(camera, cam, kernel, bend, driver, dropped or Dropped(), here)
     return Splats2D(*Project.apply(*gaussians, *learned, it))
 
@@ -149,7 +139,7 @@ def _launch_geometry(
         The gradients, of each group, of what all Gaussians share: of a shutter's motion with the quaternions
         (:func:`.camera_parameters.motion_gradient`), or of the formula's coefficients [N / lanes, K]; else nothing.
     """
-    lanes, count, motion, shared_grads = it.driver.lanes, len(outputs[-1]), motion_of(it.camera), []
+    lanes, count, motion, shared_grads = it.driver.lanes, len(outputs[-1]), cameras.motion_of(it.camera), []
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
     whole = count - count % lanes
@@ -165,10 +155,10 @@ def _launch_geometry(
             arrays.insert(0, view(numbers, wp.float32))
             adj_arrays.insert(0, view(shared_grads[-1], wp.float32))
         elif motion is not None:
-            moved = with_motion(given[1], motion, lanes)
+            moved = cameras.with_motion(given[1], motion, lanes)
             arrays[2] = view(moved, row4)
             if adj_inputs:
-                shared_grads.append(with_motion(adj_given[1], 0.0, lanes))
+                shared_grads.append(cameras.with_motion(adj_given[1], 0.0, lanes))
                 adj_arrays[2] = view(shared_grads[-1], row4)
         adj_out = [*arrays_of(types_out, adj_made[:4]), None, None]
         adjoint = {"adj_inputs": adj_arrays, "adj_outputs": adj_out} if adj_inputs else {}
@@ -252,19 +242,19 @@ class Project(torch.autograd.Function):
             found = _launch_geometry(it, _shapes(given), outputs, adj_inputs, adj_outputs)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
             peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
-            adj_motion = motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
+            adj_motion = cameras.motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
                 adj_means += adj_placed
-                sums = pose_sums(it.cam, lanes, given, adj, adj_placed)
-                by_twist = partial(twist_gradient, it.camera, it.here, adj_motion)
-                adj_twist = of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
-                adj_last = of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
+                sums = cameras.pose_sums(it.cam, lanes, given, adj, adj_placed)
+                by_twist = partial(cameras.twist_gradient, it.camera, it.here, adj_motion)
+                adj_twist = cameras.of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
+                adj_last = cameras.of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
             if wants_intrinsics:
-                adj_intrinsics = intrinsics_gradient(
+                adj_intrinsics = cameras.intrinsics_gradient(
                     it.camera, it.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3], peeks
                 )
             if it.bend:
-                adj_coefficients = coefficients_gradient(it.camera.lens, found, coefficients)
+                adj_coefficients = cameras.coefficients_gradient(it.camera.lens, found, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (it.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
                 bad = torch.zeros_like(splats.radii)

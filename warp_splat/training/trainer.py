@@ -20,7 +20,7 @@ from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.exposures import Exposures
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
-from warp_splat.raster.api import RenderOutput, render, render_splats
+from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians, Room, Splats2D
 from warp_splat.rendering.finished import as_photographed
@@ -265,10 +265,8 @@ class Trainer:
     ) -> RenderOutput:
         with stage("project"):
             gaussians = self.model.activated(self.degree)
-        if splats:
-            return render_splats(splats, gaussians, camera, background, options, self.config.model.adjoint, room=room)
-        options = replace(options, sh_degree=self.degree)
-        return render(gaussians, camera, background, options, self.config.model.adjoint, room=room)
+        adjoint, options = self.config.model.adjoint, replace(options, sh_degree=self.degree)
+        return render(gaussians, camera, background, options, adjoint, room=room, splats=splats)
 
     @property
     def behind(self) -> torch.Tensor:
