@@ -6,6 +6,7 @@ length. ``f_rest`` is channel-major: all coefficients of red, then of green, the
 """
 
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,9 @@ def save_ply(path: str | Path, file: SplatFile, report: Report = print) -> None:
 
 def save_ply_parts(path: str | Path, count: int, parts: Iterable[SplatArrays], antialiased: bool = False) -> None:
     """:func:`save_ply` of ``count`` Gaussians that come in parts; raises InputError as that does."""
-    write_parts(path, "vertex", count, map(_table_of, parts), [ANTIALIASED] * antialiased)
+    tables = map(_table_of, parts)
+    first = next(tables)
+    write_parts(path, {"vertex": (count, first.dtype)}, chain([first], tables), [ANTIALIASED] * antialiased)
 
 
 def _table_of(splats: SplatArrays) -> np.ndarray:

@@ -31,29 +31,22 @@ def write_tables(path: str | Path, tables: Mapping[str, np.ndarray], comments: S
     Raises:
         InputError: if the file cannot be written.
     """
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        file.write(_header({name: (len(rows), rows.dtype) for name, rows in tables.items()}, comments))
-        for rows in tables.values():
-            file.write(rows.data)
+    sizes = {name: (len(rows), rows.dtype) for name, rows in tables.items()}
+    write_parts(path, sizes, tables.values(), comments)
 
 
 def write_parts(
-    path: str | Path, name: str, count: int, parts: Iterable[np.ndarray], comments: Sequence[str] = ()
+    path: str | Path, tables: Mapping[str, tuple[int, np.dtype]], parts: Iterable[np.ndarray], comments: Sequence[str]
 ) -> None:
-    """:func:`write_tables` of one table of ``count`` rows, which comes in parts."""
-    with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        for place, rows in enumerate(parts):
-            if not place:
-                file.write(_header({name: (count, rows.dtype)}, comments))
-            file.write(rows.data)
-
-
-def _header(tables: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str]) -> bytes:
+    """:func:`write_tables` of which one knows the rows and the types, and whose rows come in ``parts``."""
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     for element, (count, dtype) in tables.items():
         header += [f"element {element} {count}"]
         header += [f"property {TYPES_WRITTEN[code[1:]]} {name}" for name, code, *_ in dtype.descr]
-    return "\n".join([*header, "end_header", ""]).encode("ascii")
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
+        for rows in parts:
+            file.write(rows.data)
 
 
 def columns_of(rows: np.ndarray, names: Sequence[str], dtype: str = "f4") -> np.ndarray:

@@ -7,17 +7,9 @@ from dataclasses import replace
 
 import torch
 
+from warp_splat import config
 from warp_splat.camera import Camera
-from warp_splat.config import (
-    ADJOINTS,
-    BOUNDS_OF,
-    CHANNELS_MOST,
-    EXP_DEGREES,
-    EXTENTS,
-    PROJECTIONS,
-    STRONGEST_MOST,
-    RasterOptions,
-)
+from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError, reason_of
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.project import Projection
@@ -62,17 +54,17 @@ def is_one_of(value: object, choices: Collection) -> bool:
 
 def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     """The options to use, numbers as Python's. Raises InputError for an unknown adjoint or option."""
-    if not is_one_of(adjoint, ADJOINTS):
-        raise InputError(f"adjoint: expected one of {', '.join(ADJOINTS)}, got {adjoint!r}.")
+    if not is_one_of(adjoint, config.ADJOINTS):
+        raise InputError(f"adjoint: expected one of {', '.join(config.ADJOINTS)}, got {adjoint!r}.")
     options = RasterOptions() if options is None else options
     if not isinstance(options, RasterOptions):
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
     if not is_one_of(options.sh_degree, (None, 0, 1, 2, 3)):
         raise InputError(f"options.sh_degree: expected 0, 1, 2, 3 or None, got {options.sh_degree!r}.")
-    if not isinstance(options.projection, Projection) and not is_one_of(options.projection, PROJECTIONS):
-        wanted = f"one of {', '.join(PROJECTIONS)} or a warp_splat.kernels.project.Projection"
+    if not isinstance(options.projection, Projection) and not is_one_of(options.projection, config.PROJECTIONS):
+        wanted = f"one of {', '.join(config.PROJECTIONS)} or a warp_splat.kernels.project.Projection"
         raise InputError(f"options.projection: expected {wanted}, got {options.projection!r}.")
-    for name, choices in (("extent", EXTENTS), ("exp_degree", EXP_DEGREES), ("of", BOUNDS_OF)):
+    for name, choices in (("extent", config.EXTENTS), ("exp_degree", config.EXP_DEGREES), ("of", config.BOUNDS_OF)):
         if not is_one_of(getattr(options, name), choices):
             wanted = ", ".join(str(choice) for choice in choices)
             raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
@@ -93,8 +85,8 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     if steps is not None and not (isinstance(steps, numbers.Integral) and int(steps) >= 0):
         raise InputError(f"options.max_steps: expected a whole number, at least 0, or None, got {steps!r}.")
     most = options.strongest
-    if isinstance(most, bool) or not (isinstance(most, numbers.Integral) and 0 <= int(most) <= STRONGEST_MOST):
-        raise InputError(f"options.strongest: expected a whole number, 0 to {STRONGEST_MOST}, got {most!r}.")
+    if isinstance(most, bool) or not (isinstance(most, numbers.Integral) and 0 <= int(most) <= config.STRONGEST_MOST):
+        raise InputError(f"options.strongest: expected a whole number, 0 to {config.STRONGEST_MOST}, got {most!r}.")
     return replace(
         options,
         strongest=int(most),
@@ -162,8 +154,8 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
 def check_features(features: torch.Tensor, means: torch.Tensor) -> None:
     """Raise InputError if ``features`` are not a number of finite channels for each of ``means``."""
     _check_tensor("features", features, (means.shape[0], "C"), means.device)
-    if not 1 <= features.shape[1] <= CHANNELS_MOST:
-        raise InputError(f"features: expected 1 to {CHANNELS_MOST} channels, got {features.shape[1]}.")
+    if not 1 <= features.shape[1] <= config.CHANNELS_MOST:
+        raise InputError(f"features: expected 1 to {config.CHANNELS_MOST} channels, got {features.shape[1]}.")
     _check_finite("features", features.detach())
 
 

@@ -101,21 +101,11 @@ class ImageLoss(torch.autograd.Function):
             padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, RING, groups, MOMENTS)
             blurred, slopes = _lanes(bands, ROWS, groups, MOMENTS), _lanes(height, SLOPES, groups + 2)
             sums = image.new_empty(height, 2)
-            launch(
-                ssim.compare,
-                bands,
-                [
-                    view(bounds, wp.int32),
-                    _pictures(image, limits, target, centers),
-                    view(_missing(groups, length), vec16),
-                ],
-                [
-                    *(view(lanes, vec16) for lanes in (padded, ring, blurred)),
-                    view(sums, wp.float32),
-                    view(slopes, vec16),
-                ],
-                bounds=list(range(bands + 1)),
-            )
+            pictures, missing = _pictures(image, limits, target, centers), _missing(groups, length)
+            inputs = [view(bounds, wp.int32), pictures, view(missing, vec16)]
+            outputs = [view(lanes, vec16) for lanes in (padded, ring, blurred)]
+            outputs += [view(sums, wp.float32), view(slopes, vec16)]
+            launch(ssim.compare, bands, inputs, outputs, bounds=list(range(bands + 1)))
             l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
             ctx.save_for_backward(image, target, slopes)
             ctx.lambda_dssim, ctx.limits, ctx.centers = lambda_dssim, limits, centers
@@ -131,18 +121,10 @@ class ImageLoss(torch.autograd.Function):
             ring, blurred = (_lanes(bands, rows, groups, SLOPES) for rows in (RING, ROWS))
             adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
             weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
-            launch(
-                ssim.adj_compare,
-                bands,
-                [
-                    view(bounds, wp.int32),
-                    _pictures(image, ctx.limits, target, ctx.centers),
-                    view(slopes, vec16),
-                    *weights,
-                ],
-                [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)],
-                bounds=list(range(bands + 1)),
-            )
+            pictures = _pictures(image, ctx.limits, target, ctx.centers)
+            inputs = [view(bounds, wp.int32), pictures, view(slopes, vec16), *weights]
+            outputs = [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)]
+            launch(ssim.adj_compare, bands, inputs, outputs, bounds=list(range(bands + 1)))
             return adj.view(height, -1, CHANNELS), None, None, None
 
 
