@@ -3,7 +3,7 @@
 A renderer that was measured before and is not named keeps its row, and so does one that is not there. Minutes for each;
 those in a browser take longer.
 
-    python benchmarks/audit.py [TARGET ...] [--scenes one two] [--out docs/benchmarks]
+    python benchmarks/audit.py [TARGET ...] [--scenes one two] [--more] [--out docs/benchmarks]
 """
 
 import argparse
@@ -14,6 +14,7 @@ import numpy as np
 from audit_targets import OTHERS, OURS
 
 from warp_splat.audit.command import run_audit, side_by_side, worst_gradient
+from warp_splat.audit.judged import measure
 from warp_splat.audit.renderer import Renderer, function_of
 from warp_splat.audit.small_scenes import SCENES
 from warp_splat.errors import InputError
@@ -23,25 +24,32 @@ from warp_splat.text import table_of
 
 ALL = {**OURS, **OTHERS}
 NEARLY = 0.03  # eight levels of a screen
-USUAL = 1e-2  # the first scene is pictured where more than this share of the pixels is off
 
 
-def measured(name: str, scenes: tuple[str, ...], out: Path) -> None:
-    target = ALL[name]
+def measured(name: str, scenes: list[str], out: Path, more: bool) -> None:
+    """A target's file, written after each scene, and the picture of its worst one."""
+    target, file = ALL[name], out / "audit" / f"{name}.json"
     try:
         function_of(target.place)
     except InputError as error:
         print(f"{name}: left out. {error}")
         return
     renderer = Renderer(target.place, limit=120.0)
-    facts, rows = run_audit(renderer, name, target.degree, scenes)
-    facts |= {"version": target.version, "settings": target.settings}
+    facts = json.loads(file.read_text()) if more and file.exists() else {}
+    if facts.get("version") != target.version:
+        facts, _ = run_audit(renderer, name, target.degree, ())
+        facts |= {"version": target.version, "settings": target.settings, "worst": ["", 0.0], "scenes": []}
+    facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None]
+    known = {row["scene"] for row in facts["scenes"]}
+    left = tuple(scene for scene in scenes if scene not in known)
+    for row in measure(renderer, facts["options"], target.degree, tuple(facts["background"]), left):
+        print(f"  {row.scene}: {row.verdict}", flush=True)
+        if row.pictures and row.off > 0 and row.mean > facts["worst"][1]:
+            facts["worst"] = [row.scene, row.mean]
+            save_png(out / "audit" / f"{name}.png", side_by_side(*row.pictures))
+        facts["scenes"].append(row.record())
+        write_json(file, facts)
     renderer.close()
-    write_json(out / "audit" / f"{name}.json", facts | {"scenes": [row.record() for row in rows]})
-    shown = next((row for row in rows if row.off > USUAL), None)
-    if shown:
-        save_png(out / "audit" / f"{name}.png", side_by_side(*shown.pictures))
-        print(f"{name}.png: {shown.scene}")
 
 
 def summary(facts: dict) -> dict:
@@ -88,10 +96,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("targets", nargs="*", default=list(ALL))
     parser.add_argument("--scenes", nargs="*", default=list(SCENES))
+    parser.add_argument("--more", action="store_true", help="keep what was measured of the same version, add the rest")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
     for name in arguments.targets:
-        measured(name, tuple(arguments.scenes), arguments.out)
+        measured(name, arguments.scenes, arguments.out, arguments.more)
     write_summary(arguments.out)
 
 

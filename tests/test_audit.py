@@ -13,6 +13,7 @@ import torch
 import wrong_renderer
 from audit_targets import own
 
+from warp_splat.audit import web
 from warp_splat.audit.judged import measure
 from warp_splat.audit.renderer import Answer, Renderer, function_of
 from warp_splat.audit.rules import find_rules
@@ -29,6 +30,7 @@ USUAL["projection"] = "affine"
 def rules_of(eight_bit=False, **broken):
     def draw(workload):
         *geometry, dc, rest = workload.gaussians
+        assert (workload.gaussians.scales > 0).all()  # which a renderer may ask for, and a file cannot say otherwise
         given = (*geometry, torch.cat([dc, rest], 1), workload.camera, workload.background)
         image = wrong_renderer.draw(wrong_renderer.Wrong(**broken), *given).float().double().numpy()
         image = np.round(image.clip(0, 1) * 255) / 255 if eight_bit else image
@@ -107,7 +109,12 @@ def importable(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "says"),
-    [("hangs", "hangs: no answer in 1 s"), ("crashes", "ended with 7"), ("draws_nothing", "draws nothing")],
+    [
+        ("hangs", "hangs: no answer in 1 s"),
+        ("crashes", "ended with 7"),
+        ("draws_nothing", "draws nothing"),
+        ("counts", "returned int64, neither floats nor uint8"),
+    ],
 )
 def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says):
     renderer = Renderer(f"wrong_renderer:{function}", limit=1.0 if function == "hangs" else 60.0)
@@ -163,12 +170,38 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["nothing.html"], "window.show"),
         (["no_module:draw"], "that can be imported"),
         (["x", "--command", "prog {ply}"], "{out}"),
+        (["x", "--command", "false"], "{out} (or {exr}) in it, found 'false'"),
+        (["x", "--command", "prog {scene} {out}"], "expected {ply}, {cameras} and {out}"),
+        (["x", "--command", "prog '{out}"], "expected {ply}, {cameras} and {out}"),
+        (["wrong_renderer:torch"], "expected a function, found module"),
         (["audit_targets.own:manual", "--case", "nothing"], "expected one of one, two"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, says, capsys):
     assert main(["audit", *arguments]) == 1
     assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (np.nan, np.nan, np.nan)], ids=str)
+def test_nothing_is_read_off_a_picture_that_shows_nothing(color):
+    """The same picture whatever it is asked for."""
+    blank = Answer(np.broadcast_to(color, (49, 65, 3)), False, None, True)
+    rules = find_rules(lambda workload: blank)
+    assert list(rules.sentences) == ["background"] and "shows nothing" in rules.sentences["background"]
+
+
+def test_a_page_whose_packages_cannot_be_fetched_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(web, "CACHE", tmp_path)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match=r"spark.html: expected npm, which fetches three@.*; install Node.js"):
+        function_of(audit_targets.OTHERS["spark"].place)
+
+
+def test_a_program_that_writes_no_picture_says_so():
+    drawn, camera = SCENES["one"][1]()
+    given = [drawn[name] for name in ("means", "quats", "scales", "opacities", "sh_dc")]
+    with pytest.raises(RuntimeError, match="wrote no picture"):
+        function_of("true {out}")(*given, camera, torch.zeros(3))
 
 
 def test_tiny_rotations_are_not_lost_in_gsplats_function():
@@ -193,7 +226,9 @@ def test_every_target_of_a_table_can_be_called_or_is_absent(name):
     try:
         assert callable(function_of({**audit_targets.OURS, **audit_targets.OTHERS}[name].place))
     except InputError as error:
-        assert name not in audit_targets.OURS and re.search("No module named|needs CUDA", str(error))
+        assert name not in audit_targets.OURS and re.search(
+            "No module named|needs CUDA|(needs|expected) npm", str(error)
+        )
 
 
 def test_harmonics_are_cut_where_a_renderer_claims_none():

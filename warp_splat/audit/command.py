@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from warp_splat.audit.judged import LEVEL, SceneRow, exact_image, in_eight_bits, measure, smallest
-from warp_splat.audit.program import stored, write_files
+from warp_splat.audit.program import draw_by_program, stored, write_files
 from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
@@ -37,7 +37,7 @@ def audit(config: AuditConfig) -> int:
         InputError: for a target, scene or command that there is not.
     """
     place = config.program or config.target
-    function_of(place)
+    draw_by_program(place) if config.program else function_of(place)
     if config.case and config.case not in SCENES:
         raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
     renderer, out = Renderer(place, config.limit), Path(config.out)
@@ -64,7 +64,7 @@ def run_audit(
     columns |= {"by its rules": "{own:.1%}", "gradients": worst_gradient, "verdict": "{verdict}"}
     print(table_of([row.record() for row in rows], columns))
     facts = {"target": name, "date": date.today().isoformat(), "machine": machine(), "degree": degree}
-    return facts | {"rules": rules.sentences, "options": rules.options}, rows
+    return facts | {"rules": rules.sentences, "options": rules.options, "background": rules.background}, rows
 
 
 def worst_gradient(record) -> str:

@@ -17,6 +17,7 @@ from warp_splat.formats.model_folder import camera_entry
 from warp_splat.formats.png import load_png
 from warp_splat.formats.splats import SplatArrays, SplatFile
 
+PLACES = ("ply", "cameras", "out", "exr", "background")
 LOGIT_MOST = 16.0  # 1 - 1e-7: a file cannot say 1
 
 
@@ -39,9 +40,13 @@ def draw_by_program(command: str):
     """A function that draws with ``prog {ply} {cameras} {out}``; also ``{background}``, as r,g,b, and ``{exr}``.
 
     Raises:
-        InputError: if the command names no output.
+        InputError: if the command names no output, has other braces, or a quote without its end.
     """
-    if not ("{out}" in command or "{exr}" in command):
+    try:
+        parts = [part.format(**dict.fromkeys(PLACES, "")) for part in shlex.split(command)]
+    except (KeyError, IndexError, ValueError):
+        parts = []
+    if not parts or not ("{out}" in command or "{exr}" in command):
         raise InputError(f"--command: expected {{ply}}, {{cameras}} and {{out}} (or {{exr}}) in it, found {command!r}.")
 
     def draw(means, quats, scales, opacities, sh, camera, background):
@@ -55,6 +60,8 @@ def draw_by_program(command: str):
                 raise RuntimeError(f"exit code {done.returncode}: {done.stderr.decode(errors='replace')[-200:]}")
             if places["out"].exists():
                 return load_png(places["out"])
+            if not places["exr"].exists():
+                raise RuntimeError("it ended well and wrote no picture")
             import OpenImageIO as oiio  # noqa: PLC0415 - seldom needed
 
             return np.asarray(oiio.ImageBuf(str(places["exr"])).get_pixels(oiio.FLOAT))[..., :3]

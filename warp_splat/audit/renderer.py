@@ -63,6 +63,8 @@ class Renderer:
         shape = (workload.camera.height, workload.camera.width, 3)
         if image.shape != shape:
             raise RendererFailed(f"returned shape {image.shape}, not {shape}")
+        if image.dtype != np.uint8 and image.dtype.kind != "f":
+            raise RendererFailed(f"returned {image.dtype}, neither floats nor uint8")
         found = None if gradients is None else {name: torch.from_numpy(array) for name, array in gradients.items()}
         eight_bit = image.dtype == np.uint8
         return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same)
@@ -102,9 +104,12 @@ def function_of(place: str):
         return draw_by_page(place)
     module, _, name = place.partition(":")
     try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        function = getattr(importlib.import_module(module), name)
+    except Exception as error:  # whatever a module of others does when it is imported
         raise InputError(f"{place}: expected MODULE:function that can be imported, found {error}.") from error
+    if not callable(function):
+        raise InputError(f"{place}: expected a function, found {type(function).__name__}.")
+    return function
 
 
 def _serve(connection, place: str) -> None:

@@ -33,7 +33,10 @@ SHOWN_AS = {"affine": "linearized at their center", "ellipsoid": "seen as ellips
 def find_background(prober: Prober) -> str:
     """What is behind everything, asked for light blue and for black."""
     arrays = balls(probe_camera(), [CENTER], 3.0, 3.0, 0.9, GREEN)
-    asked, black = (prober.picture(arrays, background)[0, 0] for background in (ASKED, (0.0, 0.0, 0.0)))
+    asked, black = (prober.picture(arrays, background) for background in (ASKED, (0.0, 0.0, 0.0)))
+    if not np.ptp(black, axis=(0, 1)).max() > 0:
+        raise RendererFailed("shows nothing of a Gaussian in the middle, or numbers that are not finite")
+    asked, black = asked[0, 0], black[0, 0]
     prober.behind, prober.background = black, tuple(np.round(black, 3).tolist())
     if min(np.abs(asked - each).max() for each in (ASKED, srgb(np.array(ASKED)))) < 0.01 and black.max() < 0.01:
         prober.background = ASKED
@@ -291,4 +294,6 @@ def find_rules(draw: Callable[[Workload], Answer], degree: int = 3, names: Itera
             prober.sentences[name] = FINDERS[name](prober)
         except RendererFailed as error:
             prober.sentences[name] = f"Not found: it {error}."
+            if name == "background":  # the first, and nothing is seen: it would be the same for the others
+                break
     return prober

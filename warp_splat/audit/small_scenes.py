@@ -12,7 +12,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.compare.scenes import at_pixels, cloud, look, make_camera, tensors
 from warp_splat.compare.stability import pixel_loop, shapes
-from warp_splat.compare.stability.verdict import Problem
+from warp_splat.compare.stability.verdict import Problem, activated
 from warp_splat.compare.workloads import Workload, in_training
 from warp_splat.config import RasterOptions
 from warp_splat.formats.stored import SH_C0
@@ -46,7 +46,7 @@ def balls(camera: Camera, pixels, depth, sigma, opacity, color) -> Arrays:
     return {
         "means": at_pixels(pixels, depth, camera),
         "quats": spread([1.0, 0, 0, 0], 4),
-        "scales": spread((spread(sigma) * depth / camera.fx)[:, None], 3),
+        "scales": spread((spread(sigma) * np.abs(depth) / camera.fx)[:, None], 3),
         "opacities": spread(opacity),
         "sh_dc": ((spread(color, 3) - 0.5) / SH_C0)[:, None],
         "sh_rest": np.zeros((len(pixels), 0, 3)),
@@ -100,7 +100,7 @@ def _trained() -> Drawn:
 
 def _of(problem: Callable[[], Problem]) -> Drawn:
     found = problem()
-    return found.gaussians, found.camera
+    return activated(found, found.gaussians)._asdict(), found.camera
 
 
 #: What each scene shows, and how it is made.
@@ -124,6 +124,8 @@ SCENES: dict[str, tuple[str, Callable[[], Drawn]]] = {
     ),
     "trained": ("the embedded scene after 300 steps of training", _trained),
     "opacity_1": ("opacities of 1", lambda: _of(pixel_loop.opacity_one)),
+    "logits_100": ("opacities of 0 and 1 among others", lambda: _of(pixel_loop.logits)),
+    "tile_100000": ("100,000 small Gaussians in one tile", lambda: _of(pixel_loop.tile)),
     **{
         name: (claim, partial(_of, build))
         for cases in shapes.TABLE.values()

@@ -58,15 +58,19 @@ def _browser():
     return browser.new_page(), folder, f"http://127.0.0.1:{server.server_port}"
 
 
+def _missing(page: Path) -> list[str]:
+    """The packages that a page asks for and that are not there."""
+    packages = " ".join(PACKAGES.findall(page.read_text(encoding="utf-8"))).split()
+    return [name for name in packages if not (CACHE / "node_modules" / name.rsplit("@", 1)[0]).exists()]
+
+
 def screenshot(page: Path, camera, write: Callable[[Path], object], file: str = "scene.ply"):
     """What ``page`` shows of the ``file`` that ``write`` puts into a folder, [H, W, 3] uint8; what ``show`` returns.
 
     Raises:
         InputError: if there is no playwright.
     """
-    packages = " ".join(PACKAGES.findall(page.read_text(encoding="utf-8"))).split()
-    missing = [name for name in packages if not (CACHE / "node_modules" / name.rsplit("@", 1)[0]).exists()]
-    if missing:
+    if missing := _missing(page):
         CACHE.mkdir(parents=True, exist_ok=True)
         subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(CACHE), *missing], check=True)
     tab, folder, address = _browser()
@@ -87,10 +91,12 @@ def draw_by_page(page: str):
     ``<meta name="npm" content="three@0.187.0">``: they are installed, and served as ``/node_modules``.
 
     Raises:
-        InputError: if there is no such page.
+        InputError: if there is no such page, or no npm to fetch what it asks for.
     """
     if not Path(page).is_file():
         raise InputError(f"{page}: expected a page with a function window.show(camera, address), found none.")
+    if _missing(Path(page)) and not shutil.which("npm"):
+        raise InputError(f"{page}: expected npm, which fetches {', '.join(_missing(Path(page)))}; install Node.js.")
 
     def draw(means, quats, scales, opacities, sh, camera, background):
         file = stored(means, quats, scales, opacities, sh)
