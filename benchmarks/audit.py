@@ -36,7 +36,7 @@ def measured(name: str, scenes: list[str], out: Path, more: bool) -> None:
         return
     renderer = Renderer(target.place, limit=120.0)
     facts = json.loads(file.read_text()) if more and file.exists() else {}
-    if facts.get("version") != target.version:
+    if facts.get("version") != target.version or "worst" not in facts:
         facts, _ = run_audit(renderer, name, target.degree, ())
         facts |= {"version": target.version, "settings": target.settings, "worst": ["", 0.0], "scenes": []}
     facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None]
