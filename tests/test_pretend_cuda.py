@@ -15,7 +15,7 @@ NAMES = ("a.png", "b.png", "c.png")
 #: Commands that others see most of.
 SELDOM = ("grid", "stepwise", "reversible", "stored", "clean", "compare", "bound", "profile", "resume")
 #: What a training waits for by design: docs/cuda.md.
-WAITING = {"stored": {"raster/bin.py:bin_by_sorting"}, "profile": {"runtime/timers.py:_now"}}
+WAITING = {"profile": {"runtime/timers.py:_now"}}
 
 
 def ran(folder, names=()):
