@@ -138,6 +138,7 @@ def test_convex_pieces(model, tmp_path):
         (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
         (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
         (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen so finely"),
+        (["mesh.ply", "--memory", "1e-9"], "--memory: views of 16 px and more do not fit"),
     ],
 )
 def test_sentences(model, capsys, arguments, said):

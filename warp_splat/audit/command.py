@@ -121,6 +121,6 @@ def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
         return 1
     np.save(out / "found.npy", answer.image)
     save_png(out / "found.png", (in_eight_bits(np.nan_to_num(answer.image)) * 255).astype(np.uint8))
-    error = float(np.abs(answer.image - expected).max())
+    error = float(np.abs(np.nan_to_num(answer.image - expected, nan=np.inf)).max())
     print(f"{count}, off by {error:.3g} at most; expected and found in {out}.")
     return int(error > 1.01 * LEVEL)

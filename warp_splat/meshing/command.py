@@ -27,6 +27,7 @@ ENDINGS = (".ply", ".glb", ".obj")
 GLTF_AXES = np.diag([-1.0, -1.0, 1.0])  # x left, y up, z forward
 ISLAND = 0.01  # of the largest piece's triangles, below which a piece is left out
 PIXEL = 20  # bytes of a pixel of a view
+LEAST = 16  # px, of the shorter edge of a view: smaller ones agree on nothing
 PIXELS = 2.0  # edge of a voxel where nothing else is asked for
 COARSER = 1.25  # times the voxel, until there is memory for all
 
@@ -80,6 +81,8 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     background = setting.background if setting.background.ndim == 1 else setting.background.new_zeros(3)
     cameras = [view.camera for view in opened.scene.train]
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
+    if share * min(min(camera.width, camera.height) for camera in cameras) < LEAST:
+        raise InputError(f"--memory: views of {LEAST} px and more do not fit into {memory / 1e9:.2g} GB; raise it.")
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
         for camera in cameras:
