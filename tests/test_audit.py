@@ -167,7 +167,7 @@ def test_a_program_may_write_an_exr(tmp_path):
     ("arguments", "says"),
     [
         (["nobody"], "MODULE:function that can be imported"),
-        (["nothing.html"], "window.show"),
+        (["nothing.html"], "expected a page, found no such file"),
         (["no_module:draw"], "that can be imported"),
         (["x", "--command", "prog {ply}"], "{out}"),
         (["x", "--command", "false"], "{out} (or {exr}) in it, found 'false'"),

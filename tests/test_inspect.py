@@ -162,6 +162,17 @@ def test_what_the_loader_refuses_is_an_error(tmp_path, capsys, monkeypatch, case
     assert "Traceback" not in "".join(capsys.readouterr())
 
 
+@pytest.mark.parametrize(
+    ("far", "apart", "words"), [(0.0, 0.0, "all cameras stand at one place"), (5.5e6, 1.0, "too little for 32 bits")]
+)
+def test_cameras_at_one_place_or_far_away(tmp_path, capsys, far, apart, words):
+    def frame(index):
+        return {"transform_matrix": [[1, 0, 0, far + apart * index], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+
+    findings, _ = examine(write_transforms(tmp_path / "a", frame=frame, points=False), tmp_path, capsys, 0)
+    assert any(level == "warning" and words in text for level, _, text in findings), findings
+
+
 def test_masks_that_a_frame_names(tmp_path, capsys):
     names = ["a.png", "b.png", "c.png"]
     root = write_transforms(tmp_path / "a", names, frame=lambda index: {"mask_path": "seen.png"} if index == 0 else {})

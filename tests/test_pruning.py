@@ -240,7 +240,7 @@ def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ("", "expected one of --keep, --max_loss, --size and --tolerance, got none"),
+        ("", "expected one of --keep, --max_loss, --size and --tolerance above 0, got none"),
         ("--keep 0.5 --size 1MB", "got --keep and --size"),
         ("--keep 0.001", "nothing would be left of 40 Gaussians"),
         ("--keep 1.5", "--keep: expected"),

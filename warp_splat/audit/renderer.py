@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,8 @@ def function_of(place: str):
     if "{" in place:
         return draw_by_program(place)
     if place.endswith(".html"):
+        if not Path(place).is_file():
+            raise InputError(f"{place}: expected a page, found no such file; check the path.")
         return draw_by_page(place)
     module, _, name = place.partition(":")
     try:

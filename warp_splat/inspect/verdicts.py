@@ -24,6 +24,7 @@ from warp_splat.training.options import LearnOptions, ModelOptions
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
 OFF_CENTER = 0.1  # of the image's width or height
+ROUNDED = 1e-4  # of the distance between cameras, which may be lost by rounding
 AT_LEAST = 20  # images; fewer train, but show little from new sides
 BASE = 0.7 * GIB  # Python, torch, Warp and their kernels
 SECONDS_PER_PIXEL = 6.7e-7  # of a thread, for each step: 1216 s for 7,000 steps of 518,400 px on two
@@ -58,6 +59,14 @@ def check_cameras(subject: Subject) -> Iterator[Finding]:
         yield Finding("intrinsics", "ok", f"focal lengths are {focal[0]:.2f} to {focal[-1]:.2f} widths of the image.")
     if 0 < len(subject.photos) < AT_LEAST:
         yield Finding("cameras", "warning", f"{len(subject.photos)} images are few: new views will be poor.")
+    if len(subject.photos) > 1:
+        centers = np.array([photo.camera.center for photo in subject.photos])
+        away, spread = np.abs(centers).max(), np.ptp(centers, axis=0).max()
+        if spread <= 1e-9 * away and not len(subject.points):
+            yield Finding("coverage", "warning", "all cameras stand at one place, from where depth cannot be seen.")
+        elif ROUNDED * spread < 2.0**-24 * away:
+            text = f"cameras are {away:.3g} from the origin and {spread:.3g} apart, too little for 32 bits"
+            yield Finding("coordinates", "warning", f"{text}: move the origin, as warp-splat sfm --coordinates does.")
 
 
 def check_coordinates(subject: Subject) -> Iterator[Finding]:

@@ -101,7 +101,7 @@ def _check(config: SimplifyConfig) -> None:
     if len(given) != 1:
         found = " and ".join(f"--{name}" for name in given) or "none"
         raise InputError(
-            f"warp-splat simplify: expected one of --keep, --max_loss, --size and --tolerance, got {found}."
+            f"warp-splat simplify: expected one of --keep, --max_loss, --size and --tolerance above 0, got {found}."
         )
     if config.size:
         bytes_of(config.size)
