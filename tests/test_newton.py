@@ -1,6 +1,8 @@
 """Gaussians in Newton's simulations: pictures against float64, meshes between them, gradients, memory."""
 
 import gc
+import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +13,7 @@ from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import some_splats
 
-from warp_splat import Camera, InputError, RasterOptions
+from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import exact_render, sh_basis
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
@@ -68,13 +70,15 @@ def moved(splats, transform, scale=1.0):
     )
 
 
-def seen_exactly(parts, body, camera_transform, **cuts):
+def seen_exactly(parts, body, camera_transform, lens=None, shutter=None, **cuts):
     """The float64 renderer's picture of a world, whose harmonics are turned."""
     both = [parts[0], moved(moved(parts[1], PLACE, 1.5), body)]
     means, sh, opacities, scales, quats = (torch.from_numpy(array).double() for array in concatenated(both))
     turn = np.diag([1.0, -1, -1]) @ Rotation.from_quat(camera_transform[3:]).as_matrix().T
     fov = camera_of_fov(WIDTH, HEIGHT, FOV)
-    camera = Camera(WIDTH, HEIGHT, fov.fx, fov.fy, fov.cx, fov.cy, turn, -turn @ np.array(camera_transform[:3]))
+    camera = Camera(
+        WIDTH, HEIGHT, fov.fx, fov.fy, fov.cx, fov.cy, turn, -turn @ np.array(camera_transform[:3]), lens, shutter
+    )
     return exact_render(means, quats, scales.exp(), opacities.sigmoid(), sh, camera, BACKGROUND, **cuts)
 
 
@@ -108,6 +112,29 @@ def test_pictures_are_those_of_the_float64_renderer(simulation):
         indices = made["shape_index_image"].numpy()[view]
         assert set(np.unique(indices)) <= {0, 1 + world, 2**32 - 1} and (indices == 1 + world).any()
         assert (made["forward_depth_image"].numpy()[view][exact.alpha > 0.1] > 1).all()
+
+
+@pytest.mark.parametrize(
+    ("lens", "shutter"),
+    [
+        (Lens("OPENCV_FISHEYE", (0.05, -0.02, 0.004, 0.0)), None),
+        (Lens("OPENCV", (-0.2, 0.03, 0.001, -0.002)), None),
+        (None, Shutter((0.1, -0.2, 0.15), (0.2, 0.1, -0.1))),
+        (Lens("OPENCV_FISHEYE", (0.05, -0.02, 0.004, 0.0)), Shutter((0.05, -0.1, 0.1), (0.1, 0.1, -0.1))),
+    ],
+    ids=("fisheye", "distorted", "rolling", "rolling fisheye"),
+)
+def test_lenses_and_shutters_are_those_of_the_float64_renderer(simulation, lens, shutter):
+    """To 1e-5, but where rounding decides whether a Gaussian is blended at all."""
+    camera = replace(camera_of_fov(WIDTH, HEIGHT, FOV), lens=lens, shutter=shutter)
+    made = images(rgb_image=wp.vec3)
+    simulation.sensor.update(state_of(simulation), wp.array(CAMERAS, dtype=wp.transform), camera, **made)
+    for view, image in enumerate(made["rgb_image"].numpy()):
+        exact = seen_exactly(simulation.parts, BODIES[view], CAMERAS[view], lens, shutter)
+        sure = ~exact.fragile.numpy()
+        plain = seen_exactly(simulation.parts, BODIES[view], CAMERAS[view])
+        assert sure.mean() > 0.9 and abs(plain.image - exact.image).max() > 0.05, "it matters"
+        np.testing.assert_allclose(image[sure], exact.image.numpy()[sure], atol=1e-5)
 
 
 def test_gradients_are_those_of_finite_differences(simulation):
@@ -193,20 +220,77 @@ def test_meshes_hide_splats_and_splats_hide_meshes():
     )
 
 
-def test_nothing_piles_up(simulation):
+@pytest.fixture
+def allocated(monkeypatch):
+    """Which of our modules take memory of Warp's."""
+    found, take = [], wp._src.context.CpuDefaultAllocator.allocate
+
+    def allocate(self, size):
+        frame = sys._getframe(1)
+        while frame and not (name := frame.f_globals["__name__"]).startswith("warp_splat."):
+            frame = frame.f_back
+        found.append(name if frame else "the caller")
+        return take(self, size)
+
+    monkeypatch.setattr(wp._src.context.CpuDefaultAllocator, "allocate", allocate)
+    return found
+
+
+def test_buffers_are_used_again(simulation, allocated):
+    """After the first call only the renderer's lists take memory, for as long as it runs; images stay in place."""
     state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
     camera, made = camera_of_fov(WIDTH, HEIGHT, FOV), images(rgb_image=wp.vec3, forward_depth_image=float)
-
-    def arrays_alive():
-        gc.collect()
-        return sum(isinstance(thing, wp.array) for thing in gc.get_objects())
-
-    counts = []
-    for _ in range(3):
+    places, alive, pictures = {name: array.ptr for name, array in made.items()}, [], []
+    for _ in range(4):
         for _ in range(10):
             simulation.sensor.update(state, transforms, camera, **made)
-        counts.append(arrays_alive())
-    assert counts[0] == counts[1] == counts[2]
+        gc.collect()
+        alive.append(sum(isinstance(thing, wp.array) for thing in gc.get_objects()))
+        pictures.append(made["rgb_image"].numpy().copy())
+        if len(alive) == 1:
+            allocated.clear()
+    assert set(allocated) == {"warp_splat.raster.bin"} and len(set(alive)) == 1
+    assert all(np.array_equal(picture, pictures[0]) for picture in pictures) and pictures[0].std() > 0.05
+    assert places == {name: array.ptr for name, array in made.items()}
+
+
+def test_the_device_is_that_of_the_model(simulation, monkeypatch):
+    """Whatever the scope says: with no default device at all, a picture and its gradients are the same."""
+    camera, found = camera_of_fov(WIDTH, HEIGHT, FOV), []
+    ones = wp.full((2, HEIGHT, WIDTH), wp.vec3(1.0))
+    for scoped in (True, False):
+        state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform, requires_grad=True)
+        made = images(rgb_image=wp.vec3)
+        with wp.ScopedDevice("cpu") if scoped else monkeypatch.context() as change, wp.Tape() as recorded:
+            if not scoped:
+                change.setattr(wp._src.context.runtime, "default_device", None)
+                with pytest.raises(AttributeError):
+                    wp.zeros(1)
+            simulation.sensor.update(state, transforms, camera, **made)
+            recorded.backward(grads={made["rgb_image"]: ones})
+        found.append([array.numpy() for array in (made["rgb_image"], transforms.grad, state.body_q.grad)])
+    assert all(np.array_equal(one, other) and one.any() for one, other in zip(*found, strict=True))
+
+
+def test_what_newtons_sensor_is_told_this_one_understands(simulation):
+    """By its names, in its order, and the world of each view as an array."""
+    state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
+    worlds, found = wp.array([1, 0], dtype=wp.int32), []
+    rays = SensorCamera.compute_camera_rays_pinhole(WIDTH, HEIGHT, camera_fov=FOV)
+    for sensor, lens in (
+        (SensorCamera(simulation.model), rays),
+        (simulation.sensor, camera_of_fov(WIDTH, HEIGHT, FOV)),
+    ):
+        made = {
+            "color_image": sensor.allocate_image_color(2, WIDTH, HEIGHT),
+            "forward_depth_image": sensor.allocate_image_depth_forward(2, WIDTH, HEIGHT),
+            "shape_index_image": sensor.allocate_image_shape_index(2, WIDTH, HEIGHT),
+        }
+        sensor.update(state, transforms, lens, **made, world_indices=worlds)
+        found.append({name: (array.shape, array.dtype, array.device) for name, array in made.items()})
+    assert found[0] == found[1]
+    indices = made["shape_index_image"].numpy()
+    assert [set(np.unique(index)) - {2**32 - 1} for index in indices] == [{0, 2}, {0, 1}]
 
 
 def test_refused_in_one_sentence(simulation):

@@ -6,6 +6,7 @@ The tape of Warp has all of it: :mod:`warp_splat.kernels.place` around :mod:`war
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,6 @@ class Piece:
 
     shape: int
     body: int
-    count: int
-    coefficients: int
     view: ShapeView
 
 
@@ -83,14 +82,20 @@ class SensorSplatCamera:
             key = (id(source), size)
             if key not in views:
                 views[key] = self._view(source, size)
-            piece = Piece(shape, int(bodies[shape]), source.count, views[key].sh.shape[1], views[key])
-            own[int(worlds[shape])].append((piece, (key, source)))
+            own[int(worlds[shape])].append((Piece(shape, int(bodies[shape]), views[key]), (key, source)))
         if not views:
             raise InputError("model: expected a Gaussian shape (ModelBuilder.add_shape_gaussian), found none.")
         self._worlds = []
         for world in range(max(model.world_count, 1)):
             pieces = own[-1] + own.get(world, [])
             self._worlds.append(([piece for piece, _ in pieces], self._layout([source for _, source in pieces])))
+
+    def allocate_image(self, view_count: int, width: int, height: int, dtype: Any) -> wp.array:
+        """An image for :meth:`update`; those below are of one kind, by Newton's names."""
+        return wp.zeros((view_count, height, width), dtype=dtype, device=self.device)
+
+    allocate_image_color = allocate_image_shape_index = partialmethod(allocate_image, dtype=wp.uint32)
+    allocate_image_depth_forward = partialmethod(allocate_image, dtype=wp.float32)
 
     def update(
         self,
@@ -105,7 +110,7 @@ class SensorSplatCamera:
         mesh_color: wp.array | None = None,
         mesh_depth: wp.array | None = None,
         mesh_index: wp.array | None = None,
-        world_indices: Sequence[int] | None = None,
+        world_indices: wp.array | Sequence[int] | None = None,
     ) -> None:
         """Draw; inside ``with wp.Tape()``, with gradients from ``rgb_image`` and ``forward_depth_image``.
 
@@ -123,7 +128,7 @@ class SensorSplatCamera:
             mesh_color: uint32, ``color_image`` of Newton's sensor: what is seen through the Gaussians.
             mesh_depth: float, its ``forward_depth_image``: hides Gaussians whose centers are farther.
             mesh_index: uint32, its ``shape_index_image``.
-            world_indices: world of each view; by default view i is world i.
+            world_indices: world of each view, which the host reads; by default view i is world i.
 
         Raises:
             InputError: if an image is of another shape, one of meshes has no depth, or a view is of no world.
@@ -138,7 +143,8 @@ class SensorSplatCamera:
         for name, array in (("mesh_color", mesh_color), ("mesh_index", mesh_index)):
             if array is not None and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
-        chosen = range(views) if world_indices is None else [int(world) for world in world_indices]
+        given = world_indices.numpy() if isinstance(world_indices, wp.array) else world_indices
+        chosen = range(views) if given is None else [int(world) for world in given]
         if len(chosen) != views or not all(0 <= world < len(self._worlds) for world in chosen):
             raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {list(chosen)}.")
         camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))
@@ -148,13 +154,10 @@ class SensorSplatCamera:
         recorded = open_tape() is not None
         for view, world in enumerate(chosen):
             pieces, layout = self._worlds[world]
-            gaussians = self._place(view, pieces, layout, state, camera_transforms, recorded)
+            means, quats, sh = self._place(view, pieces, layout, state, camera_transforms, recorded)
             of = lambda array: None if array is None else array[view]  # noqa: B023, E731 - called at once
             surface = of(mesh_depth)
-            room = {} if recorded else {name: self._room(name, shape[1:]) for name in ("image", "alpha")}
-            if options.depth and not recorded:
-                room["depth"] = self._room("depth", shape[1:])
-            means, quats, sh = gaussians
+            room = {} if recorded else {name: self._room(name, shape[1:]) for name in ("image", "alpha", "depth")}
             seen = tape.rasterize(
                 *(means, quats, layout.scales, layout.opacities, sh, camera),
                 **{"adjoint": self.adjoint, "options": options, "hidden_from": surface, "out": room},
@@ -162,12 +165,11 @@ class SensorSplatCamera:
             rgb = of(rgb_image) if rgb_image is not None else self._room("rgb", shape[1:])
             inputs = [seen.image, seen.alpha, seen.depth, self.background, of(mesh_color), surface]
             made = [rgb, of(color_image), of(forward_depth_image)]
-            pixels = camera.height * camera.width
-            launch_on_tape(put_among_meshes, pixels, inputs, made, self.device)
+            launch_on_tape(put_among_meshes, rgb.size, inputs, made, self.device)
             if shape_index_image is not None:
                 inputs = [seen.strongest, seen.strongest_weights, seen.alpha, self._owners_of(world), surface]
                 made = [of(shape_index_image)]
-                launch_on_tape(name_shapes, pixels, [*inputs, of(mesh_index)], made, self.device)
+                launch_on_tape(name_shapes, rgb.size, [*inputs, of(mesh_index)], made, self.device)
 
     def _place(self, view: int, pieces: list[Piece], layout: Layout, state, camera_transforms, recorded: bool) -> tuple:
         """Means, quats and colors of a world's Gaussians in the camera's frame; on a tape, in arrays of their own."""
@@ -178,8 +180,9 @@ class SensorSplatCamera:
         for piece in pieces:
             where = wp.vec4i(view, piece.body, piece.shape, begin)
             inputs = [where, piece.view, self.model.shape_transform, state.body_q, camera_transforms]
-            launch_on_tape(make_place(piece.coefficients), piece.count, inputs, made, self.device)
-            begin += piece.count
+            count, coefficients = piece.view.sh.shape
+            launch_on_tape(make_place(coefficients), count, inputs, made, self.device)
+            begin += count
         return made
 
     def _view(self, source: Any, size: float) -> ShapeView:
@@ -219,7 +222,7 @@ class SensorSplatCamera:
         """The shape of each Gaussian."""
         if world not in self._owners:
             pieces, _ = self._worlds[world]
-            shapes = np.repeat([piece.shape for piece in pieces], [piece.count for piece in pieces])
+            shapes = np.repeat([piece.shape for piece in pieces], [piece.view.sh.shape[0] for piece in pieces])
             self._owners[world] = wp.array(shapes.astype(np.uint32), dtype=wp.uint32, device=self.device)
         return self._owners[world]
 
