@@ -376,3 +376,7 @@ def test_a_disk_that_is_full_costs_the_checkpoint_only(tmp_path, monkeypatch, ca
     assert train(tmp_path / "model", "--iterations", "5", "--checkpoint_iterations", "3") == 0
     assert capsys.readouterr().err.count("no space left") == 3  # at the start, after iteration 3, at the end
     assert ply_path(tmp_path / "model", 5).is_file()
+
+    monkeypatch.setattr("warp_splat.evaluation.report.contact_sheet", full)
+    assert train(tmp_path / "other", "--iterations", "5") == 1
+    assert "Done after 5 iterations" in capsys.readouterr().out

@@ -256,6 +256,7 @@ def test_render_says_that_the_scene_is_another(told, tmp_path, capsys):
         ("--video_output a.mp4", "expected --video or --orbit"),
         ("--video path --frames 0", "--frames: expected at least 1"),
         ("--frames 3", "--frames 3: expected --video"),
+        ("--of ideal", "--of ideal: expected --tolerance or --bound"),
         ("--orbit --video_output a.AVI", "expected .mp4 or a folder, found .avi"),
     ],
 )

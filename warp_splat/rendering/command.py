@@ -109,6 +109,8 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"--video_output {config.video_output}: expected --video or --orbit beside it.")
     if config.bound and (config.orbit or config.video):
         raise InputError("--bound: expected views of a scene, got a video or --orbit; leave one of them out.")
+    if config.of != RenderConfig.of and not (config.bound or config.tolerance):
+        raise InputError(f"--of {config.of}: expected --tolerance or --bound beside it.")
     if config.frames != RenderConfig.frames and not config.video:
         raise InputError(f"--frames {config.frames}: expected --video beside it.")
     suffix = Path(config.video_output).suffix.lower()

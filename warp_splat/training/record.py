@@ -190,7 +190,14 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         say(sentence)
     views, where = trainer.refined(views), trainer.where_taken()
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
-    show_views(compared, run.folder, split, run.iteration, say)
+    state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
+    try:
+        show_views(compared, run.folder, split, run.iteration, say)
+    finally:  # what was measured is told, even if the disk is full
+        print(
+            f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
+            f"{split} {metrics_line(means)}, {run.gaussians} Gaussians"
+        )
     run.events.write((run.iteration, f"{split}/{name}", value) for name, value in means.items())
     run.events.close()
     names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
@@ -201,11 +208,6 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
-    print(
-        f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
-        f"{split} {metrics_line(means)}, {run.gaussians} Gaussians"
-    )
     for name, where in lines:
         print(f"  {name:9s} {where}")
     if trainer.config.learn.settle_from_iter:  # a clock may have said so
