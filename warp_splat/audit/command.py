@@ -1,7 +1,5 @@
 """``warp-splat audit``: a table, JSON and a page on a renderer, or the smallest scene that shows a finding."""
 
-from __future__ import annotations
-
 import base64
 import io
 from datetime import date

@@ -1,7 +1,5 @@
 """How far a renderer's pictures and gradients are from float64: under the usual rules, and under its own."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ Everything is read off the cover of a green Gaussian, 1 - T, which any color beh
 candidates in float64 is nearest to the picture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A program that reads files: Gaussians as PLY, cameras as the reference writes them; it writes PNG or EXR."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import subprocess

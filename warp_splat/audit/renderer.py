@@ -1,7 +1,5 @@
 """A renderer in a process of its own, which may hang or die: what it drew, and how its gradients came out."""
 
-from __future__ import annotations
-
 import importlib
 import multiprocessing
 from dataclasses import dataclass

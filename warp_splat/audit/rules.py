@@ -1,7 +1,5 @@
 """What a renderer does, found from pictures of probes: each rule as a sentence, and as options for the oracle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small scenes with answers that are known, and those of the catalog of stiff cases that anyone could draw."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from functools import partial

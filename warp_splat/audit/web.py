@@ -1,7 +1,5 @@
 """A page in a headless Chromium, which shows a file of Gaussians from a camera."""
 
-from __future__ import annotations
-
 import functools
 import os
 import re

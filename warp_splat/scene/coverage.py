@@ -1,7 +1,5 @@
 """How many photographs show the same."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from warp_splat.scene.types import Scene, visible

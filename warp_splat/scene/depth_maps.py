@@ -3,8 +3,6 @@
 A monocular network knows inverse depth up to a factor and an offset, which were fitted to the points of the scene.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ for what is in front. So the logarithms are sums of two numbers, one of the poin
 fitted to all at once with small absolute errors, which shine and occlusion do not pull far.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

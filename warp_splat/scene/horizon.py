@@ -1,7 +1,5 @@
 """Whether photographs show a sky: directions above the horizon in which structure from motion found no point."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

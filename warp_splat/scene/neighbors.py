@@ -1,7 +1,5 @@
 """What photographs have that were taken side by side: guessed of one from those nearest to it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

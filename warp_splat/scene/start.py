@@ -1,7 +1,5 @@
 """What training starts from where a scene has no points: random ones, or Gaussians of a file."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A photograph is described by its own SIFT features in a vocabulary of the captur
 normalized residuals (Arandjelovic and Zisserman 2013). All is drawn from a seed, and ties go to the lower number.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from itertools import pairwise

@@ -3,8 +3,6 @@
 The measure is that of Pech-Pacheco et al. 2000 (Diatom autofocusing in brightfield microscopy), on the luma.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
