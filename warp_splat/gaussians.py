@@ -96,22 +96,25 @@ class GaussianModel:
         return rows.sorting(keys_of(self.parameters["means"], rows), sizes)
 
     @classmethod
-    def from_points(cls, points: np.ndarray, colors: np.ndarray, sh_degree: int) -> GaussianModel:
-        """Start from points [P, 3] with colors [P, 3] uint8, as the reference does.
+    def from_points(
+        cls, points: np.ndarray, colors: np.ndarray, sh_degree: int, own: np.ndarray | slice = slice(None)
+    ) -> GaussianModel:
+        """Start from the ``own`` of the points [P, 3] with colors [P, 3] uint8, as the reference does.
 
         A point becomes a ball as wide as the root mean squared distance to its three nearest neighbors, opacity 0.1.
         """
-        count = len(points)
-        neighbors = min(4, count)  # the point itself and three others
-        nearest = KDTree(points).query(points, k=neighbors)[1].reshape(count, neighbors)[:, 1:]
-        offsets = points[nearest].astype(np.float64) - points[:, None]
+        neighbors = min(4, len(points))  # the point itself and three others
+        tree, centers, colors = KDTree(points), points[own], colors[own]
+        count = len(centers)
+        nearest = tree.query(centers, k=neighbors)[1].reshape(count, neighbors)[:, 1:]
+        offsets = points[nearest].astype(np.float64) - centers[:, None]
         # fewer than four points: no or few neighbors; one unit then
         squared = np.mean((offsets * offsets).sum(2), axis=1) if neighbors > 1 else np.ones(count)
         scales = 0.5 * logarithm(np.maximum(squared, SMALLEST_DISTANCE2))
         tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
         return cls(
             {
-                "means": tensor(points),
+                "means": tensor(centers),
                 "sh_dc": tensor((colors / 255.0 - 0.5) / C0)[:, None],
                 "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
                 "opacities": torch.full((count,), float(np.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)))),

@@ -17,7 +17,9 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.formats.curve import along_curve
 from warp_splat.formats.exposures import Exposures
+from warp_splat.formats.splats import SplatArrays
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
@@ -75,12 +77,13 @@ class Trainer:
             raise InputError("--parts auto: expected names of parts here; trial.settle_parts chooses them.")
         self.scene, self.config, self.device = scene, config, choose_device(config.machine.device)
         self.processes = processes
+        means, degree = (scene.start.splats.means if scene.start else scene.points), config.model.sh_degree
+        own = along_curve(torch.from_numpy(means).float())[processes.own(len(means))].numpy()
         if scene.start:
-            model = GaussianModel.from_splats(scene.start.splats, config.model.sh_degree)
+            model = GaussianModel.from_splats(SplatArrays(*(rows[own] for rows in scene.start.splats)), degree)
         else:
-            model = GaussianModel.from_points(scene.points, scene.colors, config.model.sh_degree)
-        arranged, own = model.arranged(), processes.own(len(model))
-        self.model = GaussianModel({name: rows[own] for name, rows in arranged.parameters.items()}).to(self.device)
+            model = GaussianModel.from_points(scene.points, scene.colors, degree, own)
+        self.model = model.to(self.device)
         self.background = torch.full((3,), float(config.data.white_background), device=self.device)
         seed, limit, growth = config.learn.seed, config.grow.max_gaussians, config.grow.growth
         setting = Setting(scene, self.model, self.background, processes, seed, limit, config.learn.iterations)
