@@ -16,7 +16,7 @@ LEFT = "left"
 
 
 class Watch:
-    """The signs of all processes, looked at by a thread of its own."""
+    """The signs of all processes. A thread of its own reads them: of a network that is cut, it waits for ever."""
 
     def __init__(self, rank: int, count: int, store: Any, patience: float):
         self.rank, self.store, self.patience, self.stopped = rank, store, patience, threading.Event()
@@ -25,26 +25,33 @@ class Watch:
 
     def gone(self, seconds: float) -> list[int]:
         """Processes that have left no sign for so long."""
-        now = time.monotonic()
-        return [rank for rank, then in enumerate(self.changed) if now - then > seconds and rank != self.rank]
+        now, signs = time.monotonic(), zip(self.signs, self.changed, strict=True)
+        return [rank for rank, (sign, then) in enumerate(signs) if now - then > seconds and sign != LEFT.encode()]
 
     def silent(self) -> list[int]:
         """Those that have gone by now, which takes a moment to tell."""
         time.sleep(GONE + 2.0)  # a second until their last sign is seen, another until it is looked at again
-        return self.gone(GONE)
+        return [rank for rank in self.gone(GONE) if rank != self.rank]
 
     def look(self) -> None:
-        """Leave a sign and look at those of others, until one of them hangs: then this process can only end."""
+        """Leave a sign and look at those of others, until the process that keeps them has gone."""
         beat = 0
         while not self.stopped.wait(1.0):
             beat += 1
-            self.store.set(self.names[self.rank], str(beat))
-            signs, now = self.store.multi_get(self.names), time.monotonic()
+            try:
+                self.store.set(self.names[self.rank], str(beat))
+                signs, now = self.store.multi_get(self.names), time.monotonic()
+            except RuntimeError:
+                return
             for rank, sign in enumerate(signs):
-                if sign != self.signs[rank] or sign == LEFT.encode():
+                if sign != self.signs[rank]:
                     self.changed[rank] = now
             self.signs = signs
-            if hung := self.gone(self.patience):
+
+    def judge(self) -> None:
+        """Wait until one of the others hangs: then this process can only end."""
+        while not self.stopped.wait(1.0):
+            if hung := [rank for rank in self.gone(self.patience) if rank != self.rank]:
                 ranks = ", ".join(map(str, hung))
                 words = (
                     f"Process {self.rank}: no sign of process {ranks} for {HUNG:.0f} s; the last checkpoint is whole."
@@ -59,21 +66,15 @@ def watching(rank: int, count: int, ends: bool) -> Iterator[Watch]:
     store = dist.distributed_c10d._get_default_store()
     store.set(f"sign/{rank}", "0")
     watch = Watch(rank, count, store, HUNG if ends else math.inf)
-    thread = threading.Thread(target=_until_the_store_ends, args=(watch,), daemon=True)
-    thread.start()
+    threads = [threading.Thread(target=run, daemon=True) for run in (watch.look, watch.judge)]
+    for thread in threads:
+        thread.start()
     try:
         yield watch
     finally:
         watch.stopped.set()
-        thread.join(2.0)
+        threads[0].join(2.0)
         try:
             store.set(f"sign/{rank}", LEFT)
         except RuntimeError:  # the process that kept the store has gone before
             pass
-
-
-def _until_the_store_ends(watch: Watch) -> None:
-    try:
-        watch.look()
-    except RuntimeError:
-        return
