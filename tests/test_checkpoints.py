@@ -207,6 +207,20 @@ def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
     assert len(load_ply(ply_path(whole, 120)).splats.means) <= 40000
 
 
+def test_a_process_that_torchrun_starts_again_goes_on_from_its_own_checkpoint(tmp_path, monkeypatch):
+    options = TrainConfig(source_path=str(SCENE), iterations=50, shard=True).flat()
+    save_checkpoint(tmp_path / LAST, {}, {"options": options, "iteration": 3})
+    words = ["train", "-s", str(SCENE), "-m", str(tmp_path), "--iterations", "50", "--shard"]
+    goes_on = lambda: parse(words).data.start_checkpoint == str(tmp_path)  # noqa: E731
+    assert not goes_on()
+    monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    monkeypatch.chdir(tmp_path)
+    assert goes_on() and parse(words).learn.iterations == 50
+    assert not parse(["train", "-s", str(SCENE)]).data.start_checkpoint
+    os.utime(tmp_path / LAST, (0, 0))  # of an older training, which the next step of the program refuses to overwrite
+    assert not goes_on()
+
+
 @pytest.mark.parametrize("gone", [False, True], ids=["the file is there", "the file has gone"])
 def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
     """Of a scene without points; stopped before the first evaluation, resumed to there, and on to the same bytes.

@@ -118,6 +118,8 @@ def parse(arguments: list[str]) -> Any:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
+    if config_type is TrainConfig and os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0":
+        values = _restarted(values)
     given = values
     if values.get("config"):
         from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
@@ -140,6 +142,18 @@ def parse(arguments: list[str]) -> Any:
             defaults = [EMBEDDED_DEFAULTS[""], PRESETS[preset], EMBEDDED_DEFAULTS[preset]]
         values = {**{name: value for table in defaults for name, value in table.items()}, **values, "preset": preset}
     return config_type(**values)
+
+
+def _restarted(given: dict) -> dict:
+    """Words of a process that torchrun starts again, by the same ones: it goes on from its own last checkpoint."""
+    import psutil  # noqa: PLC0415 - seldom needed
+
+    from warp_splat.formats.checkpoint import LAST  # noqa: PLC0415
+
+    folder, begun = given.get("model_path", ""), psutil.Process(os.getppid()).create_time()  # of torchrun
+    path = os.path.join(folder, LAST)
+    own = folder and os.path.isfile(path) and os.path.getmtime(path) > begun  # not of an older training
+    return {"start_checkpoint": folder} if own else given
 
 
 def _continued(given: dict) -> dict:
