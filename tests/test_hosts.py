@@ -162,7 +162,9 @@ def test_a_full_disk_on_one_host_costs_a_checkpoint(hosts, tmp_path):
     goes_on(tmp_path / "hosts")
 
 
-def test_torchrun_restarts_from_the_last_checkpoint(hosts, tmp_path):
+def test_torchrun_restarts_from_the_last_checkpoint(hosts, tmp_path, monkeypatch):
+    """With a new store for each start: one that stays has the addresses of processes that have gone."""
+    monkeypatch.setenv("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1")
     for host in hosts:
         host.start(tmp_path / "hosts", ENDLESS, "--max-restarts", "1")
     until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
