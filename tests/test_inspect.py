@@ -58,6 +58,15 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
     }  # fmt: skip
 
 
+def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys):
+    shutil.copytree(SCENE / "images", tmp_path / "photos")
+    count = len(list((tmp_path / "photos").iterdir()))
+    assert main(["inspect", str(tmp_path / "photos")]) == 1
+    told = capsys.readouterr()
+    assert f"Cameras of {count} photographs will take about " in told.out and "photographs alone" in told.err
+    assert f"{count * (count - 1) // 2} pairs" in told.out
+
+
 def test_the_reprojection_error_is_that_of_pycolmap(capsys):
     subject, _ = read_subject(SCENE, "images")
     list(geometry.check_reprojection(subject))

@@ -11,6 +11,7 @@ from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.page import draw_pictures, write_page
 from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos
+from warp_splat.sfm.forecast import time_of_cameras
 
 LEVELS = ("error", "warning", "note", "ok")
 COLORS = {"error": 31, "warning": 33, "note": 34, "ok": 32}  # of a terminal
@@ -28,6 +29,9 @@ def inspect(config: InspectConfig) -> int:
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out {page}: expected the name of a page, which ends in .html; found {page.suffix!r}.")
     if not has_cameras(source):
+        alone = source.is_dir() and not (source / "point_cloud").is_dir()
+        if alone and (told := time_of_cameras(source)):
+            print(told)
         read_photos(source, config.images, print)  # says what is missing
     subject, findings = read_subject(source, config.images)
     findings += verdicts.check_cameras(subject)

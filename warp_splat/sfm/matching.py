@@ -49,11 +49,7 @@ def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> in
     with opened(database) as connection:
         images = connection.num_images()
         features = connection.num_keypoints() / max(images, 1)
-    matching = config.matching
-    if matching == "auto":
-        matching = "exhaustive" if images < MANY else "looks"
-    every = images * (images - 1) // 2
-    pairs = {"looks": min(every, TYPICAL * images), "exhaustive": every}.get(matching, 0)
+    matching, pairs = pairs_compared(config.matching, images)
     if pairs >= TYPICAL * MANY:
         seconds = pairs * (PER_FEATURE * features + PER_SQUARE * features**2) / config.threads
         say(f"matching will take about {seconds / 60:.1f} min: {pairs} pairs of {features:.0f} features each")
@@ -65,8 +61,16 @@ def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> in
         _run(database, pycolmap.match_sequential, pairing, _sequential_pairs(images, pairing.overlap), config)
     else:
         pairing = pycolmap.ExhaustivePairingOptions(block_size=BLOCK)
-        _run(database, pycolmap.match_exhaustive, pairing, every, config)
+        _run(database, pycolmap.match_exhaustive, pairing, pairs, config)
     return len(_matched(database))
+
+
+def pairs_compared(matching: str, images: int) -> tuple[str, int]:
+    """How that many photographs are matched, which "auto" decides, and how many pairs are compared, about."""
+    if matching == "auto":
+        matching = "exhaustive" if images < MANY else "looks"
+    every = images * (images - 1) // 2
+    return matching, {"looks": min(every, TYPICAL * images), "exhaustive": every}.get(matching, 0)
 
 
 def _run(database: Path, run: Callable, pairing: object, total: int, config: SfmConfig) -> None:
