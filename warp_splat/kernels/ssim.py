@@ -28,21 +28,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_splat.kernels import window
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import LANES, fill, over, times, total, vec16, where_less
-from warp_splat.kernels.window import (
-    RADIUS,
-    RING,
-    ROWS,
-    SLOPES,
-    WEIGHTS,
-    WINDOW,
-    blur_moments,
-    blur_moments_along_columns,
-    blur_slopes,
-    blur_slopes_along_columns,
-    part,
-)
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -161,10 +149,10 @@ def compare_row(
     zero = vec16(0.0)
     groups = missing.shape[0]
     above = float(0.0)  # share of the window above or below the image
-    for tap in range(WINDOW):
-        if row + tap - RADIUS < 0 or row + tap - RADIUS >= height:
-            above += WEIGHTS[tap]
-    for plane in range(SLOPES):
+    for tap in range(window.WINDOW):
+        if row + tap - window.RADIUS < 0 or row + tap - window.RADIUS >= height:
+            above += window.WEIGHTS[tap]
+    for plane in range(window.SLOPES):
         slopes_out[plane, 0] = zero
         slopes_out[plane, groups + 1] = zero
     sums = zero
@@ -216,17 +204,17 @@ def compare(
     p = centers[0]
     q = centers[1]
     zero = vec16(0.0)
-    x = part(padded_out.ptr, groups + 2, 2 * band)
-    y = part(padded_out.ptr, groups + 2, 2 * band + 1)
+    x = window.part(padded_out.ptr, groups + 2, 2 * band)
+    y = window.part(padded_out.ptr, groups + 2, 2 * band + 1)
     for side in range(2):
         x[side * (groups + 1)] = zero
         y[side * (groups + 1)] = zero
     ring = ring_out[band]
     blurred = blurred_out[band]
     row = bounds[band]
-    ahead = wp.max(row - RADIUS, 0)
+    ahead = wp.max(row - window.RADIUS, 0)
     while row < bounds[band + 1]:
-        while ahead < wp.min(row + ROWS + RADIUS, height):
+        while ahead < wp.min(row + window.ROWS + window.RADIUS, height):
             difference = zero
             for group in range(groups):
                 start = LANES * group
@@ -238,11 +226,11 @@ def compare(
                 difference = difference + wp.max(delta, -delta)
             if ahead >= bounds[band] and ahead < bounds[band + 1]:
                 sums_out[ahead, 0] = total(difference)
-            blur_moments(x, y, ring[ahead & (RING - 1)])
+            window.blur_moments(x, y, ring[ahead & (window.RING - 1)])
             ahead += 1
-        blur_moments_along_columns(ring, row, ahead, blurred)
+        window.blur_moments_along_columns(ring, row, ahead, blurred)
         which = int(0)
-        while which < ROWS and row < bounds[band + 1]:
+        while which < window.ROWS and row < bounds[band + 1]:
             sums_out[row, 1] = compare_row(blurred[which], missing, centers, row, height, length, slopes_out[row])
             which += 1
             row += 1
@@ -280,17 +268,17 @@ def adj_compare(
     ring = ring_out[band]
     blurred = blurred_out[band]
     row = bounds[band]
-    ahead = wp.max(row - RADIUS, 0)
+    ahead = wp.max(row - window.RADIUS, 0)
     while row < bounds[band + 1]:
-        while ahead < wp.min(row + ROWS + RADIUS, height):
-            dmu = part(slopes.ptr, groups + 2, SLOPES * ahead)
-            dxx = part(slopes.ptr, groups + 2, SLOPES * ahead + 1)
-            dxy = part(slopes.ptr, groups + 2, SLOPES * ahead + 2)
-            blur_slopes(dmu, dxx, dxy, ring[ahead & (RING - 1)])
+        while ahead < wp.min(row + window.ROWS + window.RADIUS, height):
+            dmu = window.part(slopes.ptr, groups + 2, window.SLOPES * ahead)
+            dxx = window.part(slopes.ptr, groups + 2, window.SLOPES * ahead + 1)
+            dxy = window.part(slopes.ptr, groups + 2, window.SLOPES * ahead + 2)
+            window.blur_slopes(dmu, dxx, dxy, ring[ahead & (window.RING - 1)])
             ahead += 1
-        blur_slopes_along_columns(ring, row, ahead, blurred)
+        window.blur_slopes_along_columns(ring, row, ahead, blurred)
         which = int(0)
-        while which < ROWS and row < bounds[band + 1]:
+        while which < window.ROWS and row < bounds[band + 1]:
             for group in range(groups):
                 start = LANES * group
                 given = neighbors(image, image_taps, row, start)

@@ -21,20 +21,8 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of
-from warp_splat.kernels.cuda.warps import (
-    COLUMNS,
-    PIXELS,
-    WARP,
-    WARP_OPTIONS,
-    across_of,
-    blocks_of,
-    column_of,
-    down_of,
-    lane_sum,
-    vec10,
-    vec_pixels,
-)
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant
@@ -43,7 +31,7 @@ from warp_splat.kernels.structs import BinsView, PixelsView
 
 
 @wp.func
-def row_of(mean: wp.vec2, conic: wp.vec3, rest: vec10):
+def row_of(mean: wp.vec2, conic: wp.vec3, rest: warps.vec10):
     """A slot: mean and conic, then opacity and channels as they are in ``rest``."""
     row = rest
     row[MEAN_X] = mean[0]
@@ -129,7 +117,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     reach_of = make_falloff(variant.falloff).reach_of
     pixel, geometry = make_reverse_step(mode, variant.falloff, float)
 
-    @wp.kernel(module="unique", module_options=dict(WARP_OPTIONS))
+    @wp.kernel(module="unique", module_options=dict(warps.WARP_OPTIONS))
     def adj_blend(
         bins: BinsView,
         alphas: wp.vec2,
@@ -145,16 +133,16 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
         left = float((tile % bins.tiles_x) * TILE) + 0.5
         top = float((tile // bins.tiles_x) * TILE) + 0.5
         start = bins.ranges[tile][0]
-        column = column_of(lane, COLUMNS)
-        ts = vec_pixels(0.0)
-        adj_ts = vec_pixels(0.0)
-        walked = vec_pixels(0.0)
-        reds = vec_pixels(0.0)
-        greens = vec_pixels(0.0)
-        blues = vec_pixels(0.0)
-        fars = vec_pixels(0.0)
-        for p in range(PIXELS):
-            place = down_of(lane, p) * TILE + across_of(lane, p)
+        column = warps.column_of(lane, warps.COLUMNS)
+        ts = warps.vec_pixels(0.0)
+        adj_ts = warps.vec_pixels(0.0)
+        walked = warps.vec_pixels(0.0)
+        reds = warps.vec_pixels(0.0)
+        greens = warps.vec_pixels(0.0)
+        blues = warps.vec_pixels(0.0)
+        fars = warps.vec_pixels(0.0)
+        for p in range(warps.PIXELS):
+            place = warps.down_of(lane, p) * TILE + warps.across_of(lane, p)
             u = up[tile, place]
             ts[p] = final[tile, place]
             walked[p] = float(count[tile, place])
@@ -166,34 +154,34 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
             blues[p] = u[2]
             if wp.static(CHANNELS > 3):
                 fars[p] = u[3]
-        for batch in range((steps[tile] + WARP - 1) // WARP):
-            last = steps[tile] - 1 - batch * WARP
-            mine = vec10(0.0)
+        for batch in range((steps[tile] + warps.WARP - 1) // warps.WARP):
+            last = steps[tile] - 1 - batch * warps.WARP
+            mine = warps.vec10(0.0)
             touched = int(0)
             if last - lane >= 0:
                 splat = bins.splats[bins.instances[start + last - lane]]
                 mine = staged_of(splat)
                 z_most = 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0])
-                touched = blocks_of(splat, z_most, left, top)
+                touched = warps.blocks_of(splat, z_most, left, top)
             staged = wp.tile(mine, preserve_type=True)
             blocks = wp.tile(touched)
-            for j in range(wp.min(WARP, last + 1)):
+            for j in range(wp.min(warps.WARP, last + 1)):
                 g = staged[j]
                 root = wp.vec3(g[XX], g[XY], g[YY])
                 touched = blocks[j]
                 here = float(last - j)
-                sums = vec10(0.0)
-                for p in range(PIXELS):
+                sums = warps.vec10(0.0)
+                for p in range(warps.PIXELS):
                     if (touched & (1 << p)) != 0:  # the same for all lanes
-                        dx = g[MEAN_X] - (left + float(across_of(lane, p)))
-                        dy = g[MEAN_Y] - (top + float(down_of(lane, p)))
+                        dx = g[MEAN_X] - (left + float(warps.across_of(lane, p)))
+                        dy = g[MEAN_Y] - (top + float(warps.down_of(lane, p)))
                         lit = reds[p] * g[CHANNEL] + greens[p] * g[CHANNEL + 1] + blues[p] * g[CHANNEL + 2]
                         if wp.static(CHANNELS > 3):
                             lit += fars[p] * g[CHANNEL + 3]
                         front, adj_front, w, part = pixel(
                             dx, dy, root, g[OPACITY], ts[p], adj_ts[p], alphas, here, walked[p], lit
                         )
-                        sums += vec10(
+                        sums += warps.vec10(
                             part[MEAN_X], part[MEAN_Y], part[XX], part[XY], part[YY], part[OPACITY],
                             w * reds[p], w * greens[p], w * blues[p], w * fars[p],
                         )  # fmt: skip
@@ -203,7 +191,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
                     wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], root, g[OPACITY]
                 )
                 row = row_of(mean, conic, sums)
-                total = lane_sum(row, lane)
+                total = warps.lane_sum(row, lane)
                 k = start + last - j
                 if column >= 0 and column < GRADS:
                     slots_out[k, column] = total

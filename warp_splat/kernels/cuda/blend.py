@@ -11,17 +11,8 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, Since
+from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.cuda.settle import conclude, expect, mat_settled, skip
-from warp_splat.kernels.cuda.warps import (
-    COLUMNS,
-    WARP,
-    across_of,
-    ballot,
-    blocks_of,
-    down_of,
-    lowest,
-    vec10,
-)
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
@@ -42,20 +33,20 @@ BLEND_OPTIONS = {**BLOCK_OPTIONS, "block_dim": TILE * TILE // 4}
 @wp.func
 def staged_of(splat: Splat2D):
     """What the loops read of a Gaussian, as one element of a tile, in a slot's columns; XX to YY are the root's."""
-    return vec10(
+    return warps.vec10(
         splat.mean[0], splat.mean[1], splat.root[0], splat.root[1], splat.root[2], splat.opacity,
         splat.color[0], splat.color[1], splat.color[2], splat.depth,
     )  # fmt: skip
 
 
 @wp.func
-def with_blocks(row: vec10, touched: int):
+def with_blocks(row: warps.vec10, touched: int):
     """What loops read of a Gaussian, and which blocks it touches.
 
     Shared memory takes and gives twelve numbers by four, without conflicts of banks.
     """
     staged = vec12()
-    for column in range(COLUMNS):
+    for column in range(warps.COLUMNS):
         staged[column] = row[column]
     staged[TOUCHED] = wp.cast(touched, float)
     return staged
@@ -66,7 +57,7 @@ def going_of(ts: vec_each, thread: int):
     """Blocks of the warp in which a pixel has not stopped, a bit for each."""
     going = int(0)
     for p in range(EACH):
-        if ballot(ts[p] >= 0.0, thread) != 0:
+        if warps.ballot(ts[p] >= 0.0, thread) != 0:
             going |= 1 << p
     return going
 
@@ -85,7 +76,7 @@ def write_pixel(pixels_out: PixelsView, background: wp.array[float], y: int, x: 
 @wp.func
 def place_of(lane: int, block: int):
     """The pixel of a lane in one of its blocks, row by row."""
-    return down_of(lane, block) * TILE + across_of(lane, block)
+    return warps.down_of(lane, block) * TILE + warps.across_of(lane, block)
 
 
 @functools.cache
@@ -110,8 +101,8 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         kept_out: wp.array2d[float],  # [M, THREADS] transmittance in front of each Gaussian
     ):
         tile, thread = wp.tid()
-        lane = thread % WARP
-        half = (thread // WARP) * EACH  # the first of the warp's blocks
+        lane = thread % warps.WARP
+        half = (thread // warps.WARP) * EACH  # the first of the warp's blocks
         column = (tile % bins.tiles_x) * TILE
         line = (tile // bins.tiles_x) * TILE
         left = float(column) + 0.5
@@ -127,8 +118,8 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         blues = vec_each(0.0)
         fars = vec_each(0.0)
         for p in range(EACH):
-            y = line + down_of(lane, half + p)
-            x = column + across_of(lane, half + p)
+            y = line + warps.down_of(lane, half + p)
+            x = column + warps.across_of(lane, half + p)
             if y >= pixels_out.image.shape[0] or x >= pixels_out.image.shape[1]:
                 ts[p] = -1.0  # stopped from the beginning
                 counts[p] = 0.0
@@ -145,25 +136,25 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
                 splat = bins.splats[bins.instances[start + first + thread]]
                 touched = int(-1)  # every T is kept, or every pixel's bound
                 if wp.static(not (variant.keep or variant.bound)):
-                    touched = blocks_of(splat, 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0]), left, top)
+                    touched = warps.blocks_of(splat, 0.5 * LOG2_E * reach_of(splat.opacity, alphas[0]), left, top)
                 mine = with_blocks(staged_of(splat), touched)
             staged = wp.tile(mine, preserve_type=True)
-            for group in range(wp.static(int(BATCH) // int(WARP))):
+            for group in range(wp.static(int(BATCH) // int(warps.WARP))):
                 looked_at = going
                 if wp.static(variant.keep):
                     looked_at = -1
-                listed = staged[group * WARP + lane]
-                left_over = ballot(((wp.cast(listed[TOUCHED], int) >> half) & looked_at) != 0, thread)
+                listed = staged[group * warps.WARP + lane]
+                left_over = warps.ballot(((wp.cast(listed[TOUCHED], int) >> half) & looked_at) != 0, thread)
                 while left_over != 0:
-                    j = group * WARP + lowest(left_over)
+                    j = group * warps.WARP + warps.lowest(left_over)
                     left_over = left_over & (left_over - 1)
                     g = staged[j]
                     touched = (wp.cast(g[TOUCHED], int) >> half) & looked_at
                     here = float(first + j)
                     for p in range(EACH):
                         if (touched & (1 << p)) != 0:  # the same for all lanes
-                            dx = g[MEAN_X] - (left + float(across_of(lane, half + p)))
-                            dy = g[MEAN_Y] - (top + float(down_of(lane, half + p)))
+                            dx = g[MEAN_X] - (left + float(warps.across_of(lane, half + p)))
+                            dy = g[MEAN_Y] - (top + float(warps.down_of(lane, half + p)))
                             fall = fall_at(exponent(dx, dy, g[XX], g[XY], g[YY]))
                             alpha = alpha_of(fall * g[OPACITY], alphas)
                             if wp.static(variant.bound):
@@ -185,7 +176,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
                             ts[p] = behind
                 going = going_of(ts, thread)
             votes = wp.tile(going)
-            if (votes[0] | votes[WARP]) == 0:
+            if (votes[0] | votes[warps.WARP]) == 0:
                 break
         for p in range(EACH):
             place = place_of(lane, half + p)
