@@ -18,7 +18,7 @@ from warp_splat.audit.judged import measure
 from warp_splat.audit.renderer import Renderer, function_of
 from warp_splat.audit.small_scenes import SCENES
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import write_json, write_text
+from warp_splat.formats.files import write_json, write_text
 from warp_splat.formats.png import save_png
 from warp_splat.text import table_of
 

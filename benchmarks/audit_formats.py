@@ -20,8 +20,8 @@ from warp_splat.audit.program import stored
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.audit.web import screenshot
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import write_text
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
+from warp_splat.formats.files import write_text
 from warp_splat.formats.stored import SH_C0
 from warp_splat.text import table_of
 

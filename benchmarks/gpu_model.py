@@ -20,7 +20,7 @@ from gpu_steps import STAGES
 from made_up import cameras, make_crowd, make_gaussians
 
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import write_json
+from warp_splat.formats.files import write_json
 from warp_splat.kernels.cuda.adam_by_number import AT_ONCE
 from warp_splat.kernels.cuda.blend import EACH
 from warp_splat.kernels.cuda.comparison import BAND, STRIP

@@ -14,7 +14,7 @@ from gpu_training import GSPLAT_HEADERS, NCU_HEADERS, TRAINING_HEADERS
 
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import atomic_write, write_json
+from warp_splat.formats.files import atomic_write, write_json
 from warp_splat.runtime.devices import is_out_of_memory
 from warp_splat.text import format_table
 

@@ -9,7 +9,7 @@ from commands import full_disk
 from splat_files import some_splats
 
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.files import atomic_write
 from warp_splat.formats.ply import load_ply, load_points, save_ply, save_points
 from warp_splat.formats.splats import SplatFile
 

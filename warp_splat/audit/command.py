@@ -18,7 +18,7 @@ from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import write_json
+from warp_splat.formats.files import write_json
 from warp_splat.formats.png import save_png
 from warp_splat.inspect.page import write_page
 from warp_splat.inspect.subject import Finding

@@ -13,7 +13,7 @@ from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.atomic import atomic_write, write_csv, write_json, write_text
+from warp_splat.formats.files import atomic_write, write_csv, write_json, write_text
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch, pool

@@ -24,7 +24,7 @@ from warp_splat.compare.truth import random_upstream
 from warp_splat.compare.volume import light
 from warp_splat.compare.volume.light import Volume
 from warp_splat.config import ADJOINTS, PROJECTIONS, RasterOptions
-from warp_splat.formats.atomic import write_csv
+from warp_splat.formats.files import write_csv
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter
 from warp_splat.raster.api import rasterize

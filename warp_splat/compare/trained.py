@@ -27,7 +27,7 @@ from warp_splat.compare.workloads import CAPS, SHORT
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import psnr, ssim
-from warp_splat.formats.atomic import write_csv, write_json
+from warp_splat.formats.files import write_csv, write_json
 from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project

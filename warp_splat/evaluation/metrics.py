@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import write_json
+from warp_splat.formats.files import write_json
 from warp_splat.formats.png import check_image
 
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.

@@ -15,7 +15,7 @@ import torch
 
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS, Metric, masked, unit_images
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, reading
 
 SMALLEST = 32  # px; the networks halve what they see too often for less
 WEIGHTS = "torchvision's weights of VGG16 or AlexNet, such as vgg16-397923af.pth"

@@ -9,7 +9,7 @@ import numpy as np
 from warp_splat.camera import Camera
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import Metric, psnr, write_results
-from warp_splat.formats.atomic import write_text
+from warp_splat.formats.files import write_text
 from warp_splat.formats.png import load_png, save_png
 from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.types import View

@@ -19,7 +19,7 @@ from warp_splat.export_html import pack
 from warp_splat.export_html.merge import merged
 from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
-from warp_splat.formats.atomic import write_text
+from warp_splat.formats.files import write_text
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels import falloff, harmonics
 

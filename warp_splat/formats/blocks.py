@@ -14,7 +14,7 @@ import torch
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import EXPECTED, Checkpoint, load_checkpoint, save_checkpoint
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, reading
 from warp_splat.runtime.distributed import Processes
 from warp_splat.runtime.rows import Rows
 

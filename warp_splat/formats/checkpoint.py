@@ -19,9 +19,8 @@ from safetensors import SafetensorError, safe_open
 
 from warp_splat import __version__
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.exchange import FORMATS
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, atomic_write, reading
 
 LAST = "checkpoint.safetensors"  # where the run in a model folder stands
 FORMAT = 1  # rises when older programs could not read what newer ones write

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
-from warp_splat.formats.atomic import write_text
+from warp_splat.formats.files import write_text
 from warp_splat.lenses.formulas import EQUIRECTANGULAR, MODELS
 
 #: Of each family, the model that has all its coefficients, and two focal lengths.

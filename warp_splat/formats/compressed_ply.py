@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from warp_splat.formats.coordinates import comments_of
+from warp_splat.formats.files import Unexpected
 from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_tables
-from warp_splat.formats.reading import Unexpected
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.formats.stored import SH_C0, clipped, from_smallest_three, logit, sigmoid, smallest_three
 from warp_splat.text import Report

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.atomic import write_json
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, reading, write_json
 
 FILE = "coordinates.json"
 KEPT = ("origin", "axes", "reference")  # of it, in files of Gaussians

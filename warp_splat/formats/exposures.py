@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from warp_splat.color import COLOR_MAPS
+from warp_splat.formats.files import Unexpected
 from warp_splat.formats.model_folder import read_beside, write_beside
-from warp_splat.formats.reading import Unexpected
 
 EXPOSURES = "exposures.json"
 

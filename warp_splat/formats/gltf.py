@@ -15,10 +15,9 @@ import numpy as np
 from warp_splat import __version__
 from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import write_bytes, write_text
 from warp_splat.formats.coordinates import kept
+from warp_splat.formats.files import Unexpected, entries_of, reading, write_bytes, write_text
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document
-from warp_splat.formats.reading import Unexpected, entries_of, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report

@@ -13,7 +13,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from warp_splat.formats.reading import Unexpected, entries_of, json_object, numbers_of, whole_number
+from warp_splat.formats.files import Unexpected, entries_of, json_object, numbers_of, whole_number
 
 HEADER = struct.Struct("<4sII")  # of a .glb file: magic, version, length
 CHUNK = struct.Struct("<I4s")  # length, type

@@ -19,9 +19,8 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import write_text
 from warp_splat.formats.exchange import FORMATS, load_gaussians
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, reading, write_text
 from warp_splat.formats.splats import SplatFile
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter

@@ -14,8 +14,8 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.compressed_ply import is_compressed, read_compressed
 from warp_splat.formats.coordinates import comments_of, of_comments
+from warp_splat.formats.files import reading
 from warp_splat.formats.ply_container import ANTIALIASED, PlyTables, columns_of, write_parts, write_tables
-from warp_splat.formats.reading import reading
 from warp_splat.formats.splats import SplatArrays, SplatFile, check_shapes, finite_rows
 from warp_splat.text import Report
 

@@ -11,8 +11,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.reading import Unexpected
+from warp_splat.formats.files import Unexpected, atomic_write
 
 HEADER_BYTES = 64 * 1024  # forty times the longest header of the reference: no damaged file is searched to its end
 COUNT_DIGITS = 15  # more rows than any disk holds, and sums of such counts stay below 2**63

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from warp_splat.errors import InputError, reason_of
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.files import atomic_write
 
 COMPRESSION = 3  # of 0 to 9; Pillow's 6 takes 2.5 times as long, for 10 % less of a photograph
 

@@ -17,10 +17,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.palettes import ENTRIES, codebook, palette
-from warp_splat.formats.reading import (
+from warp_splat.formats.files import (
     Unexpected,
+    atomic_write,
     check_expansion,
     entries_of,
     json_object,
@@ -28,6 +27,7 @@ from warp_splat.formats.reading import (
     reading,
     whole_number,
 )
+from warp_splat.formats.palettes import ENTRIES, codebook, palette
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.formats.stored import from_smallest_three, logit, sigmoid, smallest_three
 from warp_splat.text import Report

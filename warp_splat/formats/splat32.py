@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, atomic_write, reading
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.formats.reading import Unexpected
+from warp_splat.formats.files import Unexpected
 from warp_splat.formats.stored import sigmoid
 from warp_splat.text import Report
 

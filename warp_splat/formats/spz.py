@@ -18,8 +18,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from warp_splat.formats.atomic import atomic_write
-from warp_splat.formats.reading import Unexpected, check_expansion, reading
+from warp_splat.formats.files import Unexpected, atomic_write, check_expansion, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
 from warp_splat.formats.stored import OTHERS, clipped, logit, sigmoid, unit_quats
 from warp_splat.text import Report

@@ -16,10 +16,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
 from warp_splat.formats.coordinates import kept
+from warp_splat.formats.files import Unexpected, atomic_write, reading
 from warp_splat.formats.gltf import COORDINATES, RENDER_MODE
-from warp_splat.formats.reading import Unexpected, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, new_panels, plain_axes
-from warp_splat.formats.atomic import write_text
+from warp_splat.formats.files import write_text
 from warp_splat.inspect.geometry import sample, worst_and_best
 from warp_splat.inspect.subject import THUMBNAIL, Finding, Subject
 from warp_splat.scene.types import visible

@@ -16,7 +16,7 @@ from warp_splat.color import to_srgb
 from warp_splat.config import MeshConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
-from warp_splat.formats.atomic import write_bytes
+from warp_splat.formats.files import write_bytes
 from warp_splat.gaussians import GaussianModel
 from warp_splat.meshing.fusion import BYTES, Drawn, Surface, agreed, as_pinhole, footprint, fused, surface_of, voxels_of
 from warp_splat.pruning.opened import Opened

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.files import atomic_write
 from warp_splat.scene.types import View
 
 SCALE = (1e-6, 1.0)  # of the colors

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warp_splat.errors import InputError
-from warp_splat.formats.reading import Unexpected, json_object, reading
+from warp_splat.formats.files import Unexpected, json_object, reading
 from warp_splat.scene.images import read_numbers, same_shape
 from warp_splat.scene.types import Scene, View
 

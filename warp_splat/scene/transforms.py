@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from warp_splat.errors import InputError
+from warp_splat.formats.files import reading
 from warp_splat.formats.ply import GRAY, load_points
-from warp_splat.formats.reading import reading
 from warp_splat.scene import images
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses

@@ -20,8 +20,8 @@ from tqdm import tqdm
 from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, reason_of
 from warp_splat.flags import check_numbers
-from warp_splat.formats.atomic import write_json
 from warp_splat.formats.coordinates import write_coordinates
+from warp_splat.formats.files import write_json
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap

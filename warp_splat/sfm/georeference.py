@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import AXES, MODEL_FROM_WORLD
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, reading
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.sfm.stages import opened
 from warp_splat.text import few

@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.ndimage import laplace
 
 from warp_splat.errors import InputError
-from warp_splat.formats.atomic import atomic_write
+from warp_splat.formats.files import atomic_write
 
 SHARPNESS_WIDTH = 960  # px; frames are shrunk to this width before they are judged, and noise with them
 QUALITY = 97  # of the JPEG files, 0 to 100

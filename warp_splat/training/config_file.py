@@ -8,9 +8,8 @@ from typing import Any
 
 from warp_splat.errors import InputError, reason_of
 from warp_splat.flags import default_of, fits, flags_of
-from warp_splat.formats.atomic import write_text
 from warp_splat.formats.checkpoint import EXPECTED, load_header
-from warp_splat.formats.reading import Unexpected, reading
+from warp_splat.formats.files import Unexpected, reading, write_text
 from warp_splat.training.options import TrainConfig, check_train
 
 NAME = "config.toml"

@@ -14,7 +14,7 @@ from warp_splat.compare import plots
 from warp_splat.compare.stability import arithmetic, pixel_loop, shapes
 from warp_splat.compare.stability.verdict import EPS, Case, Outcome
 from warp_splat.evaluation import report
-from warp_splat.formats.atomic import write_csv, write_json
+from warp_splat.formats.files import write_csv, write_json
 from warp_splat.text import format_table
 
 CASES = (*pixel_loop.CASES, *shapes.CASES, *arithmetic.CASES)

@@ -18,7 +18,7 @@ from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.volume import light as physics
 from warp_splat.compare.volume.light import Volume
 from warp_splat.evaluation.report import BLUE, GREEN, INK, ORANGE
-from warp_splat.formats.atomic import write_csv, write_json
+from warp_splat.formats.files import write_csv, write_json
 from warp_splat.text import format_table, table_of
 
 #: name: (integrator, evaluations of the medium per step, largest stable tau ds in theory, color, marker)
