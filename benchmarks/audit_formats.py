@@ -16,9 +16,8 @@ from audit_targets import FOLDER
 from scipy.spatial import cKDTree
 
 from warp_splat.audit.judged import exact_image, in_eight_bits
-from warp_splat.audit.program import stored
+from warp_splat.audit.program import screenshot, stored
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
-from warp_splat.audit.web import screenshot
 from warp_splat.evaluation.report import machine
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.files import write_text

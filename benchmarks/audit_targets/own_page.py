@@ -4,8 +4,7 @@ import functools
 import tempfile
 from pathlib import Path
 
-from warp_splat.audit.program import stored
-from warp_splat.audit.web import screenshot
+from warp_splat.audit.program import screenshot, stored
 from warp_splat.export_html.command import make_page
 from warp_splat.export_html.pack import shown
 

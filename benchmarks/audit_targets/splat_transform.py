@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warp_splat.audit.program import stored, write_files
-from warp_splat.audit.web import CACHE
+from warp_splat.audit.program import CACHE, stored, write_files
 
 PACKAGE, PROGRAM = "@playcanvas/splat-transform@2.7.1", CACHE / "node_modules/.bin/splat-transform"
 TURNED = np.array([-1.0, -1.0, 1.0])  # its world is turned by half around z against that of the file

@@ -1,9 +1,20 @@
-"""A program that reads files: Gaussians as PLY, cameras as the reference writes them; it writes PNG or EXR."""
+"""A program that reads files: Gaussians as PLY, cameras as the reference writes them; it writes PNG or EXR.
 
+A page in a headless Chromium, which shows a file of Gaussians from a camera.
+"""
+
+import functools
 import json
+import os
+import re
 import shlex
+import shutil
 import subprocess
 import tempfile
+import threading
+from collections.abc import Callable
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -63,5 +74,91 @@ def draw_by_program(command: str):
             import OpenImageIO as oiio  # noqa: PLC0415 - seldom needed
 
             return np.asarray(oiio.ImageBuf(str(places["exr"])).get_pixels(oiio.FLOAT))[..., :3]
+
+    return draw
+
+
+#: Without those of the second line, it draws a frame a second.
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+FLAGS += ["--disable-frame-rate-limit", "--disable-gpu-vsync"]
+CACHE = Path.home() / ".cache" / "warp_splat" / "web"  # where npm puts what it is asked for
+PACKAGES = re.compile(r'<meta name="npm" content="([^"]*)"')
+SHOW = """async ([camera, file]) => {
+  while (!window.show) await new Promise((resolve) => setTimeout(resolve, 20));
+  return await window.show(camera, file);
+}"""
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    """Says nothing, and lets no scene be kept: the next has the same name, maybe within the same second."""
+
+    def end_headers(self):
+        kept = self.path.startswith("/node_modules")
+        self.send_header("Cache-Control", "max-age=3600" if kept else "no-store")
+        super().end_headers()
+
+    def log_message(self, *_):
+        pass
+
+
+@functools.cache
+def _browser():
+    """A page of playwright's, the folder that is served, and its address."""
+    try:
+        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - seldom there
+    except ImportError as error:
+        raise InputError("playwright: it drives the browser, and is not there; pip install playwright.") from error
+    folder = Path(tempfile.mkdtemp())
+    (folder / "node_modules").symlink_to(CACHE / "node_modules")
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    found = os.environ.get("WARP_SPLAT_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
+    browser = sync_playwright().start().chromium.launch(executable_path=found, args=FLAGS)
+    return browser.new_page(), folder, f"http://127.0.0.1:{server.server_port}"
+
+
+def _missing(page: Path) -> list[str]:
+    """The packages that a page asks for and that are not there."""
+    packages = " ".join(PACKAGES.findall(page.read_text(encoding="utf-8"))).split()
+    return [name for name in packages if not (CACHE / "node_modules" / name.rsplit("@", 1)[0]).exists()]
+
+
+def screenshot(page: Path, camera, write: Callable[[Path], object], file: str = "scene.ply"):
+    """What ``page`` shows of the ``file`` that ``write`` puts into a folder, [H, W, 3] uint8; what ``show`` returns.
+
+    Raises:
+        InputError: if there is no playwright.
+    """
+    if missing := _missing(page):
+        CACHE.mkdir(parents=True, exist_ok=True)
+        subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(CACHE), *missing], check=True)
+    tab, folder, address = _browser()
+    (folder / "page").unlink(missing_ok=True)
+    (folder / "page").symlink_to(page.parent.resolve())
+    write(folder)
+    tab.set_viewport_size({"width": camera.width, "height": camera.height})
+    tab.goto(f"{address}/page/{page.name}")
+    returned = tab.evaluate(SHOW, [camera_entry(camera), f"/{file}"])
+    tab.screenshot(path=folder / "screen.png")
+    return load_png(folder / "screen.png"), returned
+
+
+def draw_by_page(page: str):
+    """A function that draws with a page whose ``window.show(camera, address)`` shows a PLY file from a camera.
+
+    The camera is as ``cameras.json`` has it. The page stands beside its scripts, and asks for packages of npm by
+    ``<meta name="npm" content="three@0.187.0">``: they are installed, and served as ``/node_modules``.
+
+    Raises:
+        InputError: if there is no such page, or no npm to fetch what it asks for.
+    """
+    if not Path(page).is_file():
+        raise InputError(f"{page}: expected a page with a function window.show(camera, address), found none.")
+    if _missing(Path(page)) and not shutil.which("npm"):
+        raise InputError(f"{page}: expected npm, which fetches {', '.join(_missing(Path(page)))}; install Node.js.")
+
+    def draw(means, quats, scales, opacities, sh, camera, background):
+        file = stored(means, quats, scales, opacities, sh)
+        return screenshot(Path(page), camera, lambda folder: write_files(folder, file, camera))[0]
 
     return draw

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.audit.program import draw_by_program
-from warp_splat.audit.web import draw_by_page
+from warp_splat.audit.program import draw_by_page, draw_by_program
 from warp_splat.compare.truth import PARAMETERS
 from warp_splat.compare.workloads import Workload
 from warp_splat.errors import InputError
