@@ -20,7 +20,7 @@ from warp_splat.formats.png import load_png
 from warp_splat.raster import drivers
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
-from warp_splat.rendering.certificates import write_maps
+from warp_splat.rendering.command import write_maps
 from warp_splat.runtime.pool import get_threads, set_threads
 from warp_splat.scene.types import Decoded, View
 

@@ -1,4 +1,7 @@
-"""Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed."""
+"""Pictures of how wrong each pixel of a view may be: colors on a logarithmic scale, and floats.
+
+Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed.
+"""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -6,7 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import torch
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from warp_splat.camera import Camera
@@ -17,16 +23,63 @@ from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
+from warp_splat.formats.files import atomic_write
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
-from warp_splat.rendering.certificates import write_maps
 from warp_splat.rendering.finished import Finished
 from warp_splat.rendering.popping import popping_of
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
+
+SCALE = (1e-6, 1.0)  # of the colors
+DPI = 100
+
+
+def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[View], folder: Path) -> float:
+    """Write ``NAME/00000.png`` and ``NAME/00000.exr`` in ``folder`` for each of ``views``, of which ``find`` finds one.
+
+    Returns:
+        The largest number of all.
+
+    Raises:
+        InputError: if a file cannot be written.
+    """
+    largest = 0.0
+    for index, view in enumerate(views):
+        values = find(view.camera).cpu().numpy()
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        largest = max(largest, float(values.max()))
+        save_scaled(folder / name / f"{index:05d}.png", values)
+        save_exr(folder / name / f"{index:05d}.exr", values)
+    return largest
+
+
+def save_scaled(path: Path, values: np.ndarray) -> None:
+    """Positive ``values`` [H, W] as colors, with the scale beside them."""
+    height, width = values.shape
+    figure = Figure(figsize=(width / DPI + 1.0, height / DPI), dpi=DPI)
+    axes = figure.add_axes((0.0, 0.0, width / (width + DPI), 1.0))
+    axes.set_axis_off()
+    shown = axes.imshow(values.clip(*SCALE), norm=LogNorm(*SCALE), cmap="turbo", aspect="auto")
+    figure.colorbar(shown, cax=figure.add_axes(((width + 0.1 * DPI) / (width + DPI), 0.05, 0.2 * DPI / width, 0.9)))
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def save_exr(path: Path, values: np.ndarray) -> None:
+    """``values`` [H, W] as floats of 32 bits.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    spec = oiio.ImageSpec(values.shape[1], values.shape[0], 1, "float")
+    output = oiio.ImageOutput.create(str(path))
+    if not (output and output.open(str(path), spec) and output.write_image(values[..., None]) and output.close()):
+        raise InputError(f"{path}: it cannot be written: {oiio.geterror() or output.geterror()}; name another folder.")
+
 
 OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}
 WARM_UP, TIMED, FPS = 10, 100, 25  # frames of --orbit; frames per second of any video
