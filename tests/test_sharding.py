@@ -13,8 +13,7 @@ import torch
 from commands import ROOT, SCENE
 
 from warp_splat.errors import InputError
-from warp_splat.formats.blocks import load_own, save_in_blocks
-from warp_splat.formats.checkpoint import save_checkpoint
+from warp_splat.formats.checkpoint import load_own, save_checkpoint, save_in_blocks
 from warp_splat.formats.curve import along_curve, keys_of
 from warp_splat.runtime import watch
 from warp_splat.runtime.rows import Rows

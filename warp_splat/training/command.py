@@ -12,8 +12,7 @@ from tqdm import tqdm
 
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
-from warp_splat.formats.blocks import load_own
-from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.formats.checkpoint import Checkpoint, load_own
 from warp_splat.runtime import pool
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join

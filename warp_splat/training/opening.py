@@ -10,8 +10,7 @@ from tqdm import tqdm
 from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
-from warp_splat.formats.blocks import load_own
-from warp_splat.formats.checkpoint import LAST, Checkpoint, remove_leftovers
+from warp_splat.formats.checkpoint import LAST, Checkpoint, load_own, remove_leftovers
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.ply import save_points
 from warp_splat.kernels.compiler import PORTABLE

@@ -18,8 +18,7 @@ from warp_splat.evaluation import report
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views
 from warp_splat.formats import model_folder
-from warp_splat.formats.blocks import save_in_blocks
-from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint
+from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint, save_in_blocks
 from warp_splat.formats.colmap_text import write_colmap
 from warp_splat.formats.exposures import write_exposures
 from warp_splat.formats.files import write_json
