@@ -13,7 +13,7 @@ import torch
 import wrong_renderer
 from audit_targets import own
 
-from warp_splat.audit import web
+from warp_splat.audit import program
 from warp_splat.audit.judged import measure
 from warp_splat.audit.renderer import Answer, Renderer, function_of
 from warp_splat.audit.rules import find_rules
@@ -191,7 +191,7 @@ def test_nothing_is_read_off_a_picture_that_shows_nothing(color):
 
 
 def test_a_page_whose_packages_cannot_be_fetched_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(web, "CACHE", tmp_path)
+    monkeypatch.setattr(program, "CACHE", tmp_path)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(InputError, match=r"spark.html: expected npm, which fetches three@.*; install Node.js"):
         function_of(audit_targets.OTHERS["spark"].place)

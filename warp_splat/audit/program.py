@@ -1,6 +1,6 @@
-"""A program that reads files: Gaussians as PLY, cameras as the reference writes them; it writes PNG or EXR.
+"""Renderers that read files: Gaussians as PLY, cameras as the reference writes them.
 
-A page in a headless Chromium, which shows a file of Gaussians from a camera.
+A program writes PNG or EXR. A page, in a headless Chromium, shows the file from a camera.
 """
 
 import functools

@@ -1,6 +1,6 @@
-"""Pictures of how wrong each pixel of a view may be: colors on a logarithmic scale, and floats.
+"""Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed.
 
-Pictures of a trained model: its views with their metrics, or frames of a camera path, as a video or timed.
+With ``--bound``, how wrong each pixel of a view may be, too: colors on a logarithmic scale, and floats.
 """
 
 import time
