@@ -108,7 +108,8 @@ def test_every_picture_is_shown():
 def test_flags_exist(page):
     flags = [item for config_type, *_ in COMMANDS.values() for item in flags_of(config_type)]
     known = {name for item in flags for name in (f"--{item.name}", *item.metadata.get("names", ()))}
-    foreign = {"--help", "--version", "--no", "--nproc-per-node", "--logdir", "--with"}  # of torchrun, TensorBoard, uv
+    torchrun = {"--nproc-per-node", "--max-restarts"}
+    foreign = torchrun | {"--help", "--version", "--no", "--logdir", "--with"}  # of TensorBoard, uv
     code = " ".join(re.findall(r"`([^`\n]+)`", prose(page)) + [text for kind, text in blocks(page) if not kind])
     used = {flag for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", code) if not flag.startswith("--no-")}
     assert used <= known | foreign | benchmark_flags()
