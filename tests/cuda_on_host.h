@@ -272,7 +272,8 @@ struct Launch {
             bytes(argument.data(), argument.size());
             for (size_t pointers = number(); pointers; --pointers) {
                 const size_t place = number(), which = number();
-                memcpy(&argument[place], &memory[which], sizeof(char*));
+                char* const to = memory[which] + number();
+                memcpy(&argument[place], &to, sizeof(char*));
             }
             arguments.push_back(argument);
         }

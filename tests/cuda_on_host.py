@@ -7,6 +7,7 @@ the renderer works in fibers, and repeated by the program: the same arguments, a
 
 import ctypes
 import json
+import math
 import os
 import re
 import shutil
@@ -16,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -49,76 +51,124 @@ class Launch:
 
     kernel: wp.Kernel
     backward: bool
+    shape: tuple[int, ...]  # of its indices
     blocks: int
     block_dim: int
-    arguments: list[tuple[bytes, list[tuple[int, int]]]]  # and where which pointer stands
+    arguments: list[tuple[bytes, list[tuple[int, int, int]]]]  # and where what stands: a place in memory
     memory: list[np.ndarray]  # before
     after: list[np.ndarray]
 
 
 @contextmanager
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Launch]]:
-    """Every launch in blocks of what is run inside."""
-    wp.init()  # or arguments cannot be packed
-    launches, launch_tiled = [], wp.launch_tiled
+def recorded(monkeypatch: pytest.MonkeyPatch, named: dict[int, int] | None = None) -> Iterator[list[Launch]]:
+    """Every launch in blocks of what is run inside; with ``named`` those in no blocks as well.
 
-    def record(kernel, dim, inputs, outputs, block_dim, adjoint=False, adj_inputs=(), adj_outputs=(), **where):
+    Args:
+        monkeypatch: takes the place of Warp's functions meanwhile.
+        named: addresses that kernels get as numbers, and how many bytes are there; it may grow meanwhile.
+    """
+    wp.init()  # or arguments cannot be packed
+    launches, launch, launch_tiled = [], wp.launch, wp.launch_tiled
+
+    def record(kernel, dim, inputs, outputs, block_dim=None, adjoint=False, adj_inputs=(), adj_outputs=(), **where):
         names = kernel.adj.args
         given = [*inputs, *outputs, *([*adj_inputs, *adj_outputs] if adjoint else [])]
         packed = [
             pack_arg(kernel, names[i % len(names)].type, "", value, "cpu", i >= len(names))
             for i, value in enumerate(given)
         ]
-        found = dict.fromkeys(array.data for value in packed for _, array in arrays_of(value) if array.data)
-        sizes = {data: max(size_of(array) for value in packed for _, array in arrays_of(value) if array.data == data)
-                 for data in found}  # fmt: skip
-        read = lambda: [np.frombuffer(ctypes.string_at(*item), np.uint8).copy() for item in sizes.items()]  # noqa: E731
-        numbers = {data: number for number, data in enumerate(sizes)}
+        pointers = [
+            [*spans_of(value, names[i % len(names)].type), *named_spans(bytes(value), named or {})]
+            for i, value in enumerate(packed)
+        ]
+        spans = joined([span for here in pointers for _, span in here])
+        read = lambda: [np.frombuffer(ctypes.string_at(a, b - a), np.uint8).copy() for a, b in spans]  # noqa: E731
         arguments = [
-            (bytes(value), [(place, numbers[array.data]) for place, array in arrays_of(value) if array.data])
-            for value in packed
+            (bytes(value), [(place, *whereabouts(span.start, spans)) for place, span in here])
+            for value, here in zip(packed, pointers, strict=True)
         ]
         before = read()
         more = {"adjoint": True, "adj_inputs": adj_inputs, "adj_outputs": adj_outputs} if adjoint else {}
-        launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, **more, **where)
-        launches.append(Launch(kernel, adjoint, *dim, block_dim, arguments, before, read()))
+        if block_dim:
+            launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, **more, **where)
+            shape = (*dim, block_dim)
+        else:
+            launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **more, **where)
+            shape, block_dim = (dim,), kernel.module.options["block_dim"]
+        blocks = -(-math.prod(shape) // block_dim)
+        launches.append(Launch(kernel, adjoint, shape, blocks, block_dim, arguments, before, read()))
 
     with monkeypatch.context() as patch:
         patch.setattr(wp, "launch_tiled", record)
+        if named is not None:
+            patch.setattr(wp, "launch", record)
         yield launches
 
 
-def arrays_of(value, place: int = 0) -> Iterator[tuple[int, ctypes.Structure]]:
-    """Arrays among an argument's fields, and the byte at which each begins."""
+class Span(NamedTuple):
+    """Memory that an argument points to."""
+
+    start: int
+    end: int
+
+
+def spans_of(value, kind, place: int = 0) -> Iterator[tuple[int, Span]]:
+    """Arrays among an argument's fields: the byte at which each begins, and what it points to."""
     if hasattr(value, "strides"):
-        yield place, value
-    elif isinstance(value, ctypes.Structure):
-        for name, *_ in value._fields_:
-            yield from arrays_of(getattr(value, name), place + getattr(type(value), name).offset)
+        size = wp.types.type_size_in_bytes(kind.dtype)
+        size += sum((value.shape[i] - 1) * value.strides[i] for i in range(value.ndim))
+        if value.data and all(value.shape[i] for i in range(value.ndim)):
+            yield place, Span(value.data, value.data + size)
+    elif isinstance(value, ctypes.Structure) and hasattr(kind, "vars"):
+        for name, variable in kind.vars.items():
+            yield from spans_of(getattr(value, name), variable.type, place + getattr(type(value), name).offset)
 
 
-def size_of(array) -> int:
-    """Bytes of an array without gaps."""
-    return array.shape[0] * array.strides[0] if all(array.shape[i] for i in range(array.ndim)) else 0
+def named_spans(words: bytes, named: dict[int, int]) -> Iterator[tuple[int, Span]]:
+    """Likewise of addresses that are numbers."""
+    for place in range(0, len(words) - 7, 8):
+        if (address := int.from_bytes(words[place : place + 8], "little")) in named:
+            yield place, Span(address, address + named[address])
+
+
+def joined(spans: list[Span]) -> list[Span]:
+    """In order, those that overlap as one."""
+    found: list[Span] = []
+    for span in sorted(spans):
+        if found and span.start < found[-1].end:
+            found[-1] = Span(found[-1].start, max(found[-1].end, span.end))
+        else:
+            found.append(span)
+    return found
+
+
+def whereabouts(address: int, spans: list[Span]) -> tuple[int, int]:
+    """In which of them an address lies, and how many bytes from its start."""
+    return next((i, address - span.start) for i, span in enumerate(spans) if span.start <= address < span.end)
+
+
+def compiled(launch: Launch, folder: Path, ending: str) -> tuple[str, str, int]:
+    """The ".cu" or ".ptx" of its module, its kernel's name in there, and the bytes of shared memory it asks for."""
+    if not folder.exists():
+        wp.compile_aot_module(launch.kernel.module, arch=90, module_dir=folder, use_ptx=True)
+    (text,) = (path.read_text() for path in folder.glob(f"*{ending}"))
+    (sizes,) = (json.loads(path.read_text()) for path in folder.glob("*.meta"))
+    (name,) = (
+        name.removesuffix("_smem_bytes")
+        for name in sizes
+        if name.startswith(launch.kernel.get_mangled_name()) and ("_backward_" in name) == launch.backward
+    )
+    return text, name, sizes[f"{name}_smem_bytes"]
 
 
 def build(launch: Launch, sanitizer: str, folder: Path) -> Path:
     """The program that repeats ``launch`` under "thread" or "address", compiled in ``folder``."""
-    module, kernel = launch.kernel.module, launch.kernel
-    wp.compile_aot_module(module, arch=90, module_dir=folder / "aot", use_ptx=True)
-    (source,) = (path.read_text() for path in (folder / "aot").glob("*.cu"))
-    (sizes,) = (json.loads(path.read_text()) for path in (folder / "aot").glob("*.meta"))
-    (name,) = (
-        name.removesuffix("_smem_bytes")
-        for name in sizes
-        if name.startswith(kernel.get_mangled_name()) and ("_backward_" in name) == launch.backward
-    )
+    source, name, shared = compiled(launch, folder / "aot", ".cu")
     copy_headers(folder / "native")
     source = re.sub(REPLACED[0][0], REPLACED[0][1], source.replace("#define WP_NO_CRT\n", ""))
     for instruction, code in INSTRUCTIONS:
         source = re.sub(instruction, code, source)
-    shared = max(sizes[f"{name}_smem_bytes"], 1)
-    (folder / "program.cpp").write_text(PROGRAM.format(shared=shared, source=source, kernel=name))
+    (folder / "program.cpp").write_text(PROGRAM.format(shared=max(shared, 1), source=source, kernel=name))
     flags = ["-std=c++17", "-O1", "-g", "-w", "-fpermissive", f"-fsanitize={sanitizer}"]
     flags += ["-I", HERE, "-I", folder / "native"]
     subprocess.run([COMPILER, *flags, folder / "program.cpp", "-o", folder / "program"], check=True)

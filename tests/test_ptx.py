@@ -1,0 +1,110 @@
+"""What NVIDIA's compiler makes of the kernels, interpreted by tests/ptx.py, against the same kernels in fibers.
+
+It checks the code's generation, the layout of parameters, and the arithmetic of addresses.
+"""
+
+from collections.abc import Callable
+
+import cubins
+import pytest
+import torch
+import warp as wp
+from cuda_on_host import Launch, compiled, recorded
+from ptx import execute
+from test_binning import crowded
+from test_cuda_on_host import CASES, adjoint_of, check_memory, differentiate, small
+from test_densify import steps, tables_of
+
+from warp_splat import RasterOptions
+from warp_splat.raster.drivers import CUDA, using
+from warp_splat.training.loss import image_loss
+
+pytestmark = pytest.mark.skipif(
+    90 not in wp.get_cuda_supported_archs(), reason="Warp is built without CUDA's compiler."
+)
+
+
+def differentiate_all(*case) -> None:
+    differentiate(small(), *case)
+
+
+def loss() -> None:
+    image, target = torch.rand(2, 70, 80, 3, generator=torch.Generator().manual_seed(0))
+    image_loss(image.requires_grad_(), target).backward()
+
+
+def sum_rows(*widths: int) -> None:
+    """Of splats of many tiles, too."""
+    bins, slots, _ = crowded(40, sum(widths))
+    CUDA.gather(bins, slots, [torch.zeros(40, width) for width in widths])
+
+
+def adam(named: dict[int, int], sparse: bool) -> None:
+    tables = tables_of(203, torch.float32)
+    named |= {tensor.data_ptr(): tensor.nbytes for table in tables for tensor in table}
+    steps(tables, 1, torch.arange(203, dtype=torch.int32) % 3 if sparse else None)
+
+
+#: What is run in fibers, given the addresses that kernels take as numbers.
+RUNS: dict[str, Callable[[dict], None]] = {
+    **{name: lambda _, case=case: differentiate_all(*case) for name, case in CASES.items()},
+    "ellipsoid": lambda _: differentiate_all("manual", RasterOptions(projection="ellipsoid")),
+    "most weights": lambda _: differentiate_all("manual", RasterOptions(strongest=cubins.STRONGEST_MOST)),
+    "loss": lambda _: loss(),
+    "sums": lambda _: sum_rows(*cubins.WIDTHS[:4]),
+    "sums, channels": lambda _: sum_rows(*cubins.WIDTHS[:3], cubins.CHANNEL_WIDTHS[-1]),
+    "adam": lambda named: adam(named, False),
+    "adam, sparse": lambda named: adam(named, True),
+}
+IN_THE_GATE = ("manual", "loss", "adam")
+#: Of benchmarks/cubins.py's, those that none of these runs.
+NOT_RUN = {
+    *("project, rolling shutter", "project, OPENCV", "adjoint of OPENCV", "project, OPENCV_FISHEYE"),
+    *("adjoint of OPENCV_FISHEYE", "adjoint of pose", "adjoint of intrinsics", "activate", "adjoint of activate"),
+    *("map of colors", "adjoint of the map", "environment", "adjoint of environment", "observe", "magnitudes"),
+    *("list tiles, many", "gather tiles, many"),
+}
+
+
+def launches_of(run, monkeypatch) -> list[Launch]:
+    named: dict[int, int] = {}
+    with using(CUDA), recorded(monkeypatch, named) as launches:
+        RUNS[run](named)
+    return launches
+
+
+def check(launch, folder, before="", after=""):
+    """Of code in which ``before`` is replaced: it leaves in memory what the fibers did."""
+    text, name, shared = compiled(launch, folder, ".ptx")
+    assert before in text
+    check_memory(execute(text.replace(before, after), name, launch, shared), launch)
+
+
+@pytest.mark.parametrize(
+    "run", [pytest.param(run, marks=pytest.mark.slow if run in IN_THE_GATE else pytest.mark.long) for run in RUNS]
+)
+def test_every_kernel(run, monkeypatch, tmp_path):
+    launches = launches_of(run, monkeypatch)
+    assert launches
+    for number, launch in enumerate(launches):
+        check(launch, tmp_path / str(number))
+
+
+def test_wrong_code_is_found(monkeypatch, tmp_path):
+    launch = adjoint_of(launches_of("manual", monkeypatch))
+    folder = tmp_path / "adjoint"
+    check(launch, folder)
+    for before, after in (
+        *(("shfl.sync.bfly", "shfl.sync.down"), ("ex2.approx.ftz", "rcp.approx.ftz"), ("mad.lo.s32", "mul.lo.s32")),
+        *(("setp.geu.f32", "setp.lt.f32"), ("mul.lo.s64", "add.s64"), ("min.f32", "max.f32")),
+    ):
+        with pytest.raises(AssertionError):
+            check(launch, folder, before, after)
+    with pytest.raises(NotImplementedError, match=r"does not know 'fma\.rz\.f32"):
+        check(launch, folder, "fma.rn.f32", "fma.rz.f32")
+
+
+@pytest.mark.long
+def test_what_is_run(monkeypatch):
+    seen = {launch.kernel.module for run in RUNS for launch in launches_of(run, monkeypatch)}
+    assert {name for name, module in cubins.modules().items() if module not in seen} == NOT_RUN
