@@ -18,7 +18,7 @@ from commands import ROOT, SCENE, python
 from test_sharding import GROWTHS, SCHEDULE, train
 
 from warp_splat.errors import InputError
-from warp_splat.formats.blocks import load_own
+from warp_splat.formats.checkpoint import load_own
 from warp_splat.runtime.rows import Rows
 
 pytestmark = [
