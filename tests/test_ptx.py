@@ -4,6 +4,7 @@ It checks the code's generation, the layout of parameters, and the arithmetic of
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cubins
 import pytest
@@ -11,12 +12,17 @@ import torch
 import warp as wp
 from cuda_on_host import Launch, compiled, recorded
 from ptx import execute
+from scenes import FISHEYE, OPENCV
 from test_binning import crowded
 from test_cuda_on_host import CASES, adjoint_of, check_memory, differentiate, small
 from test_densify import steps, tables_of
+from test_sky import made
 
-from warp_splat import RasterOptions
+from warp_splat import Camera, CameraParameters, RasterOptions
+from warp_splat.gaussians import Activate
+from warp_splat.raster.behind import put_behind
 from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.expose import expose
 from warp_splat.training.loss import image_loss
 
 pytestmark = pytest.mark.skipif(
@@ -31,6 +37,26 @@ def differentiate_all(*case) -> None:
 def loss() -> None:
     image, target = torch.rand(2, 70, 80, 3, generator=torch.Generator().manual_seed(0))
     image_loss(image.requires_grad_(), target).backward()
+
+
+def through(camera) -> None:
+    differentiate(replace(small(), camera=camera), "manual", RasterOptions())
+
+
+def activate() -> None:
+    sum(
+        x.square().sum() for x in Activate.apply(*(torch.randn(size, requires_grad=True) for size in ((203, 3), 203)))
+    ).backward()
+
+
+def put_sky_behind() -> None:
+    camera, leaves, upstream = made(37, 31, 8.0, None)
+    put_behind(*leaves, camera).backward(upstream)
+
+
+def map_colors() -> None:
+    image, numbers = torch.rand(30, 40, 3, requires_grad=True), torch.full((12,), 0.1, requires_grad=True)
+    expose(image, "affine", numbers, None, 0.0).square().sum().backward()
 
 
 def sum_rows(*widths: int) -> None:
@@ -50,6 +76,15 @@ RUNS: dict[str, Callable[[dict], None]] = {
     **{name: lambda _, case=case: differentiate_all(*case) for name, case in CASES.items()},
     "ellipsoid": lambda _: differentiate_all("manual", RasterOptions(projection="ellipsoid")),
     "most weights": lambda _: differentiate_all("manual", RasterOptions(strongest=cubins.STRONGEST_MOST)),
+    "opencv": lambda _: through(replace(small().camera, lens=OPENCV)),
+    "fisheye": lambda _: through(replace(small().camera, lens=FISHEYE)),
+    "camera": lambda _: through(CameraParameters(small().camera)),
+    "rolling shutter": lambda _: through(
+        Camera.rolling(small().camera, replace(small().camera, translation=small().camera.translation + 0.02))
+    ),
+    "sky": lambda _: put_sky_behind(),
+    "map of colors": lambda _: map_colors(),
+    "activate": lambda _: activate(),
     "loss": lambda _: loss(),
     "sums": lambda _: sum_rows(*cubins.WIDTHS[:4]),
     "sums, channels": lambda _: sum_rows(*cubins.WIDTHS[:3], cubins.CHANNEL_WIDTHS[-1]),
@@ -59,9 +94,7 @@ RUNS: dict[str, Callable[[dict], None]] = {
 IN_THE_GATE = ("manual", "loss", "adam")
 #: Of benchmarks/cubins.py's, those that none of these runs.
 NOT_RUN = {
-    *("project, rolling shutter", "project, OPENCV", "adjoint of OPENCV", "project, OPENCV_FISHEYE"),
-    *("adjoint of OPENCV_FISHEYE", "adjoint of pose", "adjoint of intrinsics", "activate", "adjoint of activate"),
-    *("map of colors", "adjoint of the map", "environment", "adjoint of environment", "observe", "magnitudes"),
+    *("adjoint of OPENCV", "adjoint of OPENCV_FISHEYE", "observe", "magnitudes"),
     *("list tiles, many", "gather tiles, many"),
 }
 
