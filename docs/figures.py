@@ -81,6 +81,11 @@ def rolling_price() -> float:
     return max(float(row["learned"]) / float(row["still"]) for row in found)
 
 
+def simulated(renderer: str, column: int) -> float:
+    """A figure of simulation.json."""
+    return next(float(row[column]) for row in data("simulation")["rows"] if row[0] == renderer)
+
+
 def shutter(way: str, key: str) -> list[float]:
     """Figures of shutter.json, of one way to draw."""
     return [record[key] for record in data("shutter")["records"] if record["way"] == way]

@@ -276,6 +276,14 @@ def sentences() -> dict[str, list[tuple]]:
             ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
             ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
         ],
+        "simulation.md": [
+            (
+                "ours draws {} times as many pictures",
+                round(f.simulated("ours, 1 thread", 2) / f.simulated("Newton's", 2)),
+            ),
+            ("mean error of a color is {},", f.small(f.simulated("Newton's", 4))),
+            ("Ours errs by at most {}.", f.small(f.simulated("ours, 1 thread", 3))),
+        ],
         "cameras.md": [
             (
                 "All {} get there, after {} steps at most, and end within {} degrees, {} mm and {} %.",

@@ -249,6 +249,9 @@ def test_code(page, tmp_path, monkeypatch):
             exec(text, names)
             if "from orthographic" in text:
                 exec(textwrap.dedent(ORTHOGRAPHIC), names)
+        elif language == "diff":  # before, and after
+            for side in "-+":
+                exec("".join(f"{line[1:]}\n" for line in text.splitlines() if line[:1] in (" ", side)), names)
     assert "report" not in names or names["report"].ok
     assert all(names[name].grad.isfinite().all() for name in ("means", "quats", "scales", "opacities", "sh"))
 

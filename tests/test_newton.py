@@ -289,6 +289,10 @@ def test_what_newtons_sensor_is_told_this_one_understands(simulation):
         sensor.update(state, transforms, lens, **made, world_indices=worlds)
         found.append({name: (array.shape, array.dtype, array.device) for name, array in made.items()})
     assert found[0] == found[1]
+    tiled = wp.zeros((2, 3, HEIGHT, WIDTH), dtype=wp.uint32)  # [worlds, cameras], as its tiled camera has them
+    sensor.update(state, transforms, lens, color_image=tiled[:, 1], world_indices=worlds)
+    np.testing.assert_array_equal(tiled.numpy()[:, 1], made["color_image"].numpy())
+    assert not tiled.numpy()[:, ::2].any()
     indices = made["shape_index_image"].numpy()
     assert [set(np.unique(index)) - {2**32 - 1} for index in indices] == [{0, 2}, {0, 1}]
 
