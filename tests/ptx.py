@@ -34,10 +34,9 @@ def listed(text: str) -> list[str]:
 
 @dataclass
 class Run:
-    """What is in the launch's memory afterwards, and the names of the instructions that were taken."""
+    """What is in the launch's memory afterwards."""
 
     memory: list[np.ndarray]
-    opcodes: set[str]
 
 
 class Grid:
@@ -220,18 +219,17 @@ class Grid:
     # Control.
 
     def run(self) -> Run:
-        self.places, opcodes = np.zeros(self.count, np.int64), set()
+        self.places = np.zeros(self.count, np.int64)
         while self.places.min() != END:
             place = self.choose()
             if place not in self.compiled:
                 self.compiled[place] = [self.compile(text) for text in self.code[place] if not jumps(text)]
-                opcodes |= {STATEMENT.match(text)[3] for text in self.code[place]}
             for instruction in self.compiled[place]:
                 instruction()
             self.places[self.active] = self.following(place)
         content = self.spaces["global"].content
         memory = [content[base : base + len(array)] for base, array in zip(self.bases, self.launch.memory, strict=True)]
-        return Run(memory, opcodes)
+        return Run(memory)
 
     def choose(self) -> int:
         """The place of the active threads: the first at which some need not wait."""
