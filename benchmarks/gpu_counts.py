@@ -162,6 +162,7 @@ class Scene:
     halves: int  # of a tile that they touch
     warps: int  # of 16 x 2 pixels in which one blends it, eight in a tile
     pairs: int  # Gaussians in pixels, blended
+    by_tile: np.ndarray  # [T, 3] of the above: walked, blocks, halves
 
 
 def count_scene(model: GaussianModel, camera: Camera) -> Scene:
@@ -177,7 +178,7 @@ def count_scene(model: GaussianModel, camera: Camera) -> Scene:
     work, (walked, blocks, halves, warps) = count(gaussians, camera, options), found.sum(0).tolist()
     return Scene(
         *(len(gaussians.means), len(bins.gaussians), camera.width * camera.height, len(bins.ranges)),
-        *(len(bins.instances), walked, blocks, halves, warps, int(work.pairs)),
+        *(len(bins.instances), walked, blocks, halves, warps, int(work.pairs), found[:, :3].numpy()),
     )
 
 

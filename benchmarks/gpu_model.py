@@ -8,8 +8,9 @@ warps by four per cycle and multiprocessor. Launches and operations of torch are
 in fibers. With a result of ``gpu.py``, its stages stand beside the model's.
 """
 
+import heapq
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,6 +66,9 @@ CARD_HEADERS = (
     *(f"{name}: {what} ms" for name in SCENES for what in ("blend", "its adjoint", "step")),
 )
 ADJOINT_HEADERS = ("scene", "adjoint", "found", "instructions", "shuffles", "barriers", "atomic additions")
+LOAD_HEADERS = ("scene", "warps of the adjoint", "warps", "longest", "mean", "slots busy: ms", "2 cycles", "4 cycles")
+RESIDENT = 16  # of these warps on a multiprocessor, by their registers
+PIECE = 256  # tile instances of a list that is split
 ADD_ROW = 24  # of gather for a row: nine loads, nine additions, its place, the loop
 
 
@@ -172,6 +176,58 @@ def adjoint_rows(scenes: dict[str, Scene]) -> list[list]:
     return rows
 
 
+def load_rows(scenes: dict[str, Scene], card: Card) -> list[list]:
+    """The adjoint with its load balance: tiles by warps, and how else they might be shared out.
+
+    Of two warps each has half of the blocks, and both stage all. A list that is split goes on from the state of pixels
+    between its pieces, which the forward pass would have to keep.
+    """
+    passes, rows = instructions(card.arch)["manual", "adj_blend"] - 8 * BLOCK, []
+    for name, scene in scenes.items():
+        walked, blocks, halves = scene.by_tile.T.astype(float)
+        whole = (STAGED + passes) * walked + BLOCK * blocks
+        half = STAGED * walked + 0.5 * (passes * halves + BLOCK * blocks)
+        pieces = np.maximum(np.ceil(walked / PIECE), 1).astype(int)
+        ways = {
+            "one for a tile": whole,
+            "two of four pixels a lane": np.repeat(half, 2),
+            f"one for {PIECE} of a list": np.repeat(whole / pieces, pieces),
+            "one for a tile, the longest first": np.sort(whole)[::-1],
+        }
+        for way, each in ways.items():
+            least = 1e3 * each.sum() / (ISSUED * card.processors * 1e6 * card.clock)
+            ends = [f"{last_end(each, card, cycles):.3f}" for cycles in (2, 4)]
+            rows.append([name, way, len(each), f"{each.max():.0f}", f"{each.mean():.0f}", f"{least:.3f}", *ends])
+    return rows
+
+
+def last_end(warps: np.ndarray, card: Card, cycles: float) -> float:
+    """Milliseconds until the last of ``warps``, instructions each, has ended; they start in this order.
+
+    Those on a multiprocessor share what it issues, and each has one instruction in ``cycles`` cycles at most.
+    """
+    waiting = iter(warps.tolist())
+    issued, times, ends = [0.0] * card.processors, [0.0] * card.processors, [[] for _ in range(card.processors)]
+    for place, work in zip(range(RESIDENT * card.processors), waiting, strict=False):
+        heapq.heappush(ends[place % card.processors], work)
+
+    def next_end(place: int) -> tuple[float, int]:
+        rate = min(ISSUED / len(ends[place]), 1.0 / cycles)
+        return times[place] + (ends[place][0] - issued[place]) / rate, place
+
+    due = [next_end(place) for place in range(card.processors) if ends[place]]
+    heapq.heapify(due)
+    now = 0.0
+    while due:
+        now, place = heapq.heappop(due)
+        times[place], issued[place] = now, heapq.heappop(ends[place])
+        if (work := next(waiting, None)) is not None:
+            heapq.heappush(ends[place], issued[place] + work)
+        if ends[place]:
+            heapq.heappush(due, next_end(place))
+    return now / (1e3 * card.clock)
+
+
 def measured_rows(path: Path, card: Card, scenes: dict[str, Scene]) -> list[list]:
     """Stages as gpu.py measured them, over the model's least times."""
     rows = []
@@ -202,6 +258,9 @@ def main() -> None:
         (CARD_HEADERS, card_rows(scenes), "The longer of both times, stage by stage."),
         (ADJOINT_HEADERS, adjoint_rows(scenes), "For a tile instance that is walked, on sm_90."),
     ]
+    note = "Modeled: an H200. Slots busy: no load balance; else the last warp's end, with so many cycles between two "
+    note += "instructions of a warp: 4 if each needs the one before."
+    tables.append((LOAD_HEADERS, load_rows(scenes, CARDS["H200"]), note))
     if arguments.measured:
         rows = measured_rows(arguments.measured, CARDS[arguments.card], scenes)
         headers = ("scene", "stage", "measured ms", "modeled ms", "ratio")
@@ -212,7 +271,7 @@ def main() -> None:
     print(text)
     if arguments.out:
         (arguments.out / "gpu_model.md").write_text(f"{text}\n")
-        data = {"scenes": {name: asdict(scene) for name, scene in scenes.items()}}
+        data = {"scenes": {name: asdict(replace(scene, by_tile=[])) for name, scene in scenes.items()}}
         data["counts"] = {stage: here.tolist() for stage, here in counts.items()}
         write_json(arguments.out / "gpu_model.json", data)
 

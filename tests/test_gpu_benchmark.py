@@ -10,6 +10,7 @@ import gpu_model
 import gpu_results
 import gpu_training
 import made_up
+import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -207,8 +208,11 @@ def test_scene():
     assert scene.halves <= min(2 * scene.walked, scene.blocks) and scene.blocks <= 4 * scene.halves
 
 
+NO_TILES = np.zeros((0, 3))
+
+
 def test_a_card_of_twice_the_rates_takes_half_the_time():
-    scene = gpu_counts.Scene(1000, 900, 5000, 20, 3000, 2500, 9000, 3500, 8000, 40_000)
+    scene = gpu_counts.Scene(1000, 900, 5000, 20, 3000, 2500, 9000, 3500, 8000, 40_000, NO_TILES)
     card = gpu_model.CARDS["H200"]
     twice = card._replace(clock=2 * card.clock, bandwidth=2 * card.bandwidth)
     slow, fast = (gpu_model.times(scene, one) for one in (card, twice))
@@ -217,9 +221,21 @@ def test_a_card_of_twice_the_rates_takes_half_the_time():
         assert pair == pytest.approx([2 * value for value in fast[stage]])
 
 
+def test_warps_that_share_a_multiprocessor_end_when_they_should():
+    card = gpu_model.CARDS["H200"]
+    slots, cycle = gpu_model.RESIDENT * card.processors, 1 / (1e3 * card.clock)
+    for warps, cycles, expected in [
+        (np.full(slots, 800), 2, 3200),  # four instructions a cycle for sixteen warps
+        (np.full(slots + 1, 800), 4, 6400),  # another wave of one, at its own pace
+        (np.full(card.processors, 800), 4, 3200),  # one on each
+        (np.r_[np.full(slots - card.processors, 400), np.full(card.processors, 800)], 2, 1600 + 800),
+    ]:
+        assert gpu_model.last_end(warps, card, cycles) == pytest.approx(expected * cycle)
+
+
 def test_measured_stages_stand_beside_the_model(tmp_path):
     listed, blocks = [1_300_000] * 2, (3_000_000, 1_600_000)
-    scene = gpu_counts.Scene(1_000_000, 900_000, 534_100, 2170, *listed, *blocks, 3_000_000, 40_000_000)
+    scene = gpu_counts.Scene(1_000_000, 900_000, 534_100, 2170, *listed, *blocks, 3_000_000, 40_000_000, NO_TILES)
     row = {f"{stage} ms": "2.0" for stage in gpu_model.STAGES} | {"size": "980 x 545", "Gaussians": 1_000_000}
     (tmp_path / "gpu.json").write_text(json.dumps({"tables": {"Training step": [row, row | {"Gaussians": 5}]}}))
     rows = gpu_model.measured_rows(tmp_path / "gpu.json", gpu_model.CARDS["H200"], {"ball": scene})
