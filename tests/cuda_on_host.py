@@ -24,6 +24,8 @@ import pytest
 import warp as wp
 from warp._src.context import pack_arg  # what wp.launch hands to a kernel
 
+from warp_splat.runtime import pool
+
 HERE = Path(__file__).parent
 COMPILER = shutil.which("g++")
 #: Of the headers that compute with tiles: which branch is taken, and C++ where CUDA's is more lenient.
@@ -98,11 +100,16 @@ def recorded(monkeypatch: pytest.MonkeyPatch, named: dict[int, int] | None = Non
         blocks = -(-math.prod(shape) // block_dim)
         launches.append(Launch(kernel, adjoint, shape, blocks, block_dim, arguments, before, read()))
 
-    with monkeypatch.context() as patch:
-        patch.setattr(wp, "launch_tiled", record)
-        if named is not None:
-            patch.setattr(wp, "launch", record)
-        yield launches
+    threads = pool.get_threads()
+    pool.set_threads(1)  # or another thread's part of a launch writes between what is read before and after
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(wp, "launch_tiled", record)
+            if named is not None:
+                patch.setattr(wp, "launch", record)
+            yield launches
+    finally:
+        pool.set_threads(threads)
 
 
 class Span(NamedTuple):
