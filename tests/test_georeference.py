@@ -13,8 +13,8 @@ from warp_splat.formats.coordinates import MODEL_FROM_WORLD, read_coordinates, w
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import write_cameras
 from warp_splat.formats.splats import SplatArrays, SplatFile
-from warp_splat.inspect.command import check_coordinates
 from warp_splat.inspect.subject import Subject
+from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene

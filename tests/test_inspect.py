@@ -13,9 +13,9 @@ from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, wri
 from test_scene_input import BAD
 
 from warp_splat.cli import main
-from warp_splat.inspect import command, geometry
-from warp_splat.inspect.command import forecast
+from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.subject import read_subject
+from warp_splat.inspect.verdicts import forecast
 
 
 @pytest.fixture
@@ -216,7 +216,7 @@ def test_other_endings_and_two_kinds_of_light(tmp_path, capsys):
 def test_the_forecast_knows_what_a_photograph_takes(monkeypatch):
     """float32 in linear light instead of bytes, a byte for each pixel of masks and of alpha; within a bound."""
     free = [2**40]
-    monkeypatch.setattr(command.psutil, "virtual_memory", lambda: SimpleNamespace(available=free[-1]))
+    monkeypatch.setattr(verdicts.psutil, "virtual_memory", lambda: SimpleNamespace(available=free[-1]))
     sizes, told = [(1600, 1000)] * 5000, []
     for kinds in ((False, False, False), (False, True, False), (False, True, True), (True, True, True)):
         told.append(float(re.search(r"about ([\d.]+) GiB", forecast(sizes, 10, *kinds)[0])[1]))

@@ -21,8 +21,8 @@ from scene_files import (
 )
 
 from warp_splat import InputError, Lens
-from warp_splat.inspect.command import check_loading
 from warp_splat.inspect.subject import read_subject
+from warp_splat.inspect.verdicts import check_loading
 
 
 def test_transforms_cameras_points_and_axes(tmp_path):
