@@ -260,7 +260,8 @@ def main() -> None:
     ]
     note = "Modeled: an H200. Slots busy: no load balance; else the last warp's end, with so many cycles between two "
     note += "instructions of a warp: 4 if each needs the one before."
-    tables.append((LOAD_HEADERS, load_rows(scenes, CARDS["H200"]), note))
+    loads = load_rows(scenes, CARDS["H200"])
+    tables.append((LOAD_HEADERS, loads, note))
     if arguments.measured:
         rows = measured_rows(arguments.measured, CARDS[arguments.card], scenes)
         headers = ("scene", "stage", "measured ms", "modeled ms", "ratio")
@@ -272,6 +273,7 @@ def main() -> None:
     if arguments.out:
         (arguments.out / "gpu_model.md").write_text(f"{text}\n")
         data = {"scenes": {name: asdict(replace(scene, by_tile=[])) for name, scene in scenes.items()}}
+        data["loads"] = [dict(zip(LOAD_HEADERS, row, strict=True)) for row in loads]
         data["counts"] = {stage: here.tolist() for stage, here in counts.items()}
         write_json(arguments.out / "gpu_model.json", data)
 

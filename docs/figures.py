@@ -243,6 +243,12 @@ def data_of_cubins() -> list[dict]:
     return json.loads(text("cuda/cubins.json"))["records"]
 
 
+def loads(scene: str, way: str, *columns: str) -> list[str]:
+    """Modeled ms of the adjoint on a card, its warps shared out in this way."""
+    (row,) = (row for row in data("gpu_model")["loads"] if (row["scene"], row["warps of the adjoint"]) == (scene, way))
+    return [two(float(row[column])) for column in columns or ("2 cycles", "4 cycles")]
+
+
 def blend_gain() -> float:
     """Scalars against lanes, the forward pass on one thread."""
     found = data("blend")["seconds"]

@@ -327,6 +327,16 @@ def sentences() -> dict[str, list[tuple]]:
                 "Its adjoints have {} to {} registers,",
                 *f.span(f.registers("manual", "stepwise", "reversible", "stored"), str),
             ),
+            ("the adjoint of the ball takes {} to {} ms,", *f.loads("ball", "one for a tile")),
+            ("ms, not {}: its 2,170 tiles", *f.loads("ball", "one for a tile", "slots busy: ms")),
+            (
+                "pixels a lane take {} to {} ms for the ball's adjoint, but {} to {} for the crowd's, {} to {} now",
+                *f.loads("ball", "two of four pixels a lane"),
+                *f.loads("crowd", "two of four pixels a lane"),
+                *f.loads("crowd", "one for a tile"),
+            ),
+            ("Lists split at 256 take {} to {} (ball)", *f.loads("ball", "one for 256 of a list")),
+            ("the longest tiles first, {} (crowd)", f.loads("crowd", "one for a tile, the longest first")[1]),
             ("registers, {} % (`stored` {}).", f.resident("manual"), f.resident("stored")),
             (
                 "projection and colors have {} and {} registers, {} %:",

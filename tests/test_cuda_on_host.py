@@ -41,6 +41,18 @@ def differentiate(scene, mode, options, features=None):
     sum((x * torch.randn(x.shape, generator=generator)).sum() for x in shown if x is not None).backward()
 
 
+def sum_magnitudes():
+    """Of gradients, which gsplat's function asks for."""
+    scene = small()
+    leaves = [getattr(scene, name).detach().clone().requires_grad_() for name in PARAMETERS]
+    camera, pose = scene.camera, torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = torch.tensor(camera.rotation), torch.tensor(camera.translation)
+    lens = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    more = {"sh_degree": int(scene.sh.shape[1] ** 0.5) - 1, "absgrad": True}
+    image, *_ = rasterization(*leaves, pose[None], lens[None], camera.width, camera.height, **more)
+    image.square().sum().backward()
+
+
 #: What is rendered; each case compiles the kernels that those before it have not.
 CASES = {
     **{mode: (mode, RasterOptions()) for mode in ADJOINTS},
@@ -123,16 +135,9 @@ def test_more_than_a_batch(monkeypatch, tmp_path):
 @pytest.mark.long
 @BOTH
 def test_magnitudes(sanitizer, monkeypatch, tmp_path):
-    """Sums of magnitudes, which gsplat's function asks for; it repeats kernels that others watch."""
-    scene = small()
-    leaves = [getattr(scene, name).detach().clone().requires_grad_() for name in PARAMETERS]
-    camera, pose = scene.camera, torch.eye(4)
-    pose[:3, :3], pose[:3, 3] = torch.tensor(camera.rotation), torch.tensor(camera.translation)
-    lens = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    more = {"sh_degree": int(scene.sh.shape[1] ** 0.5) - 1, "absgrad": True}
+    """It repeats kernels that others watch."""
     with using(CUDA), recorded(monkeypatch) as launches:
-        image, *_ = rasterization(*leaves, pose[None], lens[None], camera.width, camera.height, **more)
-        image.square().sum().backward()
+        sum_magnitudes()
     (launch,) = (launch for launch in launches if launch.kernel.key.startswith("make_adj_channels"))
     check([launch], sanitizer, tmp_path)
 
