@@ -83,9 +83,10 @@ def test_emulated_arm_computes_the_same_bytes_in_vectors():
             assert packed > scalar, (processor, kernel)
 
 
-#: What torch, NumPy, BLAS and the C library do on an old processor.
+#: What torch, NumPy, BLAS, MKL and the C library do on an old processor.
 OLD = {
     "ATEN_CPU_CAPABILITY": "default",
+    "MKL_CBWR": "COMPATIBLE",  # another maker's processor, too: the roots of torch are MKL's
     "NPY_DISABLE_CPU_FEATURES": " ".join(dispatched),
     "OPENBLAS_CORETYPE": "Nehalem",
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F",

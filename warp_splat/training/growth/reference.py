@@ -170,10 +170,9 @@ def _log(x: float) -> float:
 def rotate(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """Rotate vectors [N, 3] by quaternions [N, 4] (w, x, y, z) of any norm but 0."""
     w, x, y, z = (quats * quats).unbind(1)  # one operation after another: torch's functions of rows differ by processor
-    unit = quats / (w + x + y + z).sqrt()[:, None].clamp_min(1e-12)
-    w, axis = unit[:, :1], unit[:, 1:]
+    axis, square = quats[:, 1:], (w + x + y + z)[:, None].clamp_min(1e-24)  # and no root: that one, too
     twist = 2.0 * _cross(axis, vectors)
-    return vectors + w * twist + _cross(axis, twist)
+    return vectors + (quats[:, :1] * twist + _cross(axis, twist)) / square
 
 
 def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
