@@ -171,6 +171,7 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["no_module:draw"], "that can be imported"),
         (["x", "--command", "prog {ply}"], "{out}"),
         (["x", "--command", "false"], "{out} (or {exr}) in it, found 'false'"),
+        (["x", "--command", "no_such_program {out}"], "a program that can be run, found 'no_such_program'"),
         (["x", "--command", "prog {scene} {out}"], "expected {ply}, {cameras} and {out}"),
         (["x", "--command", "prog '{out}"], "expected {ply}, {cameras} and {out}"),
         (["wrong_renderer:torch"], "expected a function, found module"),

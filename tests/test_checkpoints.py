@@ -214,6 +214,8 @@ def test_a_process_that_torchrun_starts_again_goes_on_from_its_own_checkpoint(tm
     goes_on = lambda: parse(words).data.start_checkpoint == str(tmp_path)  # noqa: E731
     assert not goes_on()
     monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
+    assert not goes_on()  # somebody set it by hand
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     monkeypatch.chdir(tmp_path)
     assert goes_on() and parse(words).learn.iterations == 50
     assert not parse(["train", "-s", str(SCENE)]).data.start_checkpoint

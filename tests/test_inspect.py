@@ -16,6 +16,7 @@ from warp_splat.cli import main
 from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.subject import read_subject
 from warp_splat.inspect.verdicts import forecast
+from warp_splat.sfm import stages
 
 
 @pytest.fixture
@@ -58,13 +59,27 @@ def test_a_good_scene_has_no_finding(tmp_path, capsys):
     }  # fmt: skip
 
 
-def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys):
-    shutil.copytree(SCENE / "images", tmp_path / "photos")
-    count = len(list((tmp_path / "photos").iterdir()))
-    assert main(["inspect", str(tmp_path / "photos")]) == 1
-    told = capsys.readouterr()
-    assert f"Cameras of {count} photographs will take about " in told.out and "photographs alone" in told.err
-    assert f"{count * (count - 1) // 2} pairs" in told.out
+def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys, monkeypatch):
+    """Unless they are few, cannot be read, or there is no room to try some."""
+    photos = shutil.copytree(SCENE / "images", tmp_path / "photos")
+    names = sorted(photos.iterdir())
+    count = len(names)
+    for done, said in (
+        (lambda: None, True),
+        (lambda: monkeypatch.setattr(stages, "opened", no_room), False),
+        (lambda: monkeypatch.undo() or [name.write_text("no picture") for name in names], False),
+        (lambda: [name.unlink() for name in names[29:]], False),
+    ):
+        done()
+        assert main(["inspect", str(photos)]) == 1
+        told = capsys.readouterr()
+        assert "photographs alone" in told.err
+        assert (f"Cameras of {count} photographs will take about " in told.out) == said
+        assert (f"{count * (count - 1) // 2} pairs" in told.out) == said
+
+
+def no_room(*_):
+    raise RuntimeError("No registered database factory succeeded")
 
 
 def test_the_reprojection_error_is_that_of_pycolmap(capsys):

@@ -1,6 +1,7 @@
 """Gaussians in Newton's simulations: pictures against float64, meshes between them, gradients, memory."""
 
 import gc
+import re
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -308,8 +309,11 @@ def test_refused_in_one_sentence(simulation):
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
     with pytest.raises(InputError, match="mesh_index: expected mesh_depth beside it"):
         simulation.sensor.update(state, transforms, camera, shape_index_image=named, mesh_index=named)
-    with pytest.raises(InputError, match=r"world_indices: expected 2 of 0..1, got \[0, 2\]"):
-        simulation.sensor.update(state, transforms, camera, world_indices=[0, 2])
+    for worlds in ([0, 2], [0.5, 1.0], [0], 1):
+        with pytest.raises(InputError, match=rf"world_indices: expected 2 of 0..1, got {re.escape(str(worlds))}"):
+            simulation.sensor.update(state, transforms, camera, world_indices=worlds)
+    with pytest.raises(InputError, match="camera_fov: expected radians between 0 and pi, got 0"):
+        camera_of_fov(WIDTH, HEIGHT, 0)
 
 
 def test_any_number_of_threads_gives_the_same_bytes(simulation):

@@ -118,7 +118,8 @@ def parse(arguments: list[str]) -> Any:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
-    if config_type is TrainConfig and os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0":
+    by_torchrun = "TORCHELASTIC_RUN_ID" in os.environ
+    if config_type is TrainConfig and by_torchrun and os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0":
         values = _restarted(values)
     given = values
     if values.get("config"):

@@ -49,7 +49,7 @@ def draw_by_program(command: str):
     """A function that draws with ``prog {ply} {cameras} {out}``; also ``{background}``, as r,g,b, and ``{exr}``.
 
     Raises:
-        InputError: if the command names no output, has other braces, or a quote without its end.
+        InputError: if the command names no output or no program, has other braces, or a quote without its end.
     """
     try:
         parts = [part.format(**dict.fromkeys(PLACES, "")) for part in shlex.split(command)]
@@ -57,6 +57,9 @@ def draw_by_program(command: str):
         parts = []
     if not parts or not ("{out}" in command or "{exr}" in command):
         raise InputError(f"--command: expected {{ply}}, {{cameras}} and {{out}} (or {{exr}}) in it, found {command!r}.")
+
+    if not shutil.which(parts[0]):
+        raise InputError(f"--command: expected a program that can be run, found {parts[0]!r}; check its name.")
 
     def draw(means, quats, scales, opacities, sh, camera, background):
         with tempfile.TemporaryDirectory() as name:

@@ -29,9 +29,8 @@ def inspect(config: InspectConfig) -> int:
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out {page}: expected the name of a page, which ends in .html; found {page.suffix!r}.")
     if not has_cameras(source):
-        alone = source.is_dir() and not (source / "point_cloud").is_dir()
-        if alone and (told := time_of_cameras(source)):
-            print(told)
+        if source.is_dir() and not (source / "point_cloud").is_dir():
+            time_of_cameras(source, print)
         read_photos(source, config.images, print)  # says what is missing
     subject, findings = read_subject(source, config.images)
     findings += verdicts.check_cameras(subject)

@@ -144,15 +144,16 @@ class SensorSplatCamera:
             if array is not None and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
         given = world_indices.numpy() if isinstance(world_indices, wp.array) else world_indices
-        chosen = range(views) if given is None else [int(world) for world in given]
-        if len(chosen) != views or not all(0 <= world < len(self._worlds) for world in chosen):
-            raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {list(chosen)}.")
+        chosen = np.arange(views) if given is None else np.asarray(given)
+        whole = chosen.shape == (views,) and chosen.dtype.kind in "iu"
+        if not whole or not all(0 <= world < len(self._worlds) for world in chosen):
+            raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {chosen.tolist()}.")
         camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))
         options = replace(
             self.options, depth=forward_depth_image is not None, strongest=int(shape_index_image is not None)
         )
         recorded = open_tape() is not None
-        for view, world in enumerate(chosen):
+        for view, world in enumerate(chosen.tolist()):
             pieces, layout = self._worlds[world]
             means, quats, sh = self._place(view, pieces, layout, state, camera_transforms, recorded)
             of = lambda array: None if array is None else array[view]  # noqa: B023, E731 - called at once
@@ -228,7 +229,13 @@ class SensorSplatCamera:
 
 
 def camera_of_fov(width: int, height: int, camera_fov: float) -> Camera:
-    """The pinhole of Newton's ``compute_camera_rays_pinhole``; ``camera_fov`` is vertical, in radians."""
+    """The pinhole of Newton's ``compute_camera_rays_pinhole``; ``camera_fov`` is vertical, in radians.
+
+    Raises:
+        InputError: if no pinhole sees so far.
+    """
+    if not 0.0 < camera_fov < math.pi:
+        raise InputError(f"camera_fov: expected radians between 0 and pi, got {camera_fov}.")
     focal = 0.5 * height / math.tan(0.5 * camera_fov)
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(3), np.zeros(3))
 

@@ -12,35 +12,47 @@ from warp_splat.sfm import stages
 from warp_splat.sfm.matching import match, pairs_compared
 
 TRIED = 6  # photographs, of which each pair is matched
+LEAST = 30  # of fewer a trial would take too large a share of the work itself
 MAPPING = 1.3e-4, 4.5e-4  # seconds for each feature, the least and the most of five captures (AMD EPYC, Intel Xeon)
 
 
-def time_of_cameras(source: Path) -> str | None:
-    """A sentence on ``warp-splat sfm`` with the photographs below ``source``; None if there are too few to tell.
+def time_of_cameras(source: Path, say: Callable[[str], object]) -> None:
+    """Say how long ``warp-splat sfm`` takes with the photographs below ``source``; nothing if that cannot be told.
 
     Features and pairs of TRIED photographs are timed on this machine. What mapping takes is known by its order only.
     """
     root = photo_root(source)
     names = find_files(root, PHOTOS)
     count = len(names)
-    if pycolmap is None or count <= TRIED:
-        return None
+    if pycolmap is None or count < LEAST:
+        return
+    say(f"Trying {TRIED} of {count} photographs ...")
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     config = SfmConfig(str(source), "", matching="exhaustive", threads=CORES, quiet=True)
     tried = [names[index * count // TRIED] for index in range(TRIED)]
+    try:
+        extraction, features, matching = _measured(root, tried, config)
+    except RuntimeError:  # of pycolmap: no room for temporary files, for one; who needs the cameras will be told
+        return
+    _, pairs = pairs_compared("auto", count)
+    extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
+    least, most = (extraction + matching + rate * features * count / 60 for rate in MAPPING)
+    if features:
+        say(
+            f"Cameras of {count} photographs will take about {least:.1f} to {most:.1f} min on {CORES} threads: "
+            f"features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping the rest."
+        )
+
+
+def _measured(root: Path, tried: list[str], config: SfmConfig) -> tuple[float, float, float]:
+    """Seconds of all threads for a photograph, its features, and seconds for a pair, as means of those ``tried``."""
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
-        extraction = _seconds(lambda: stages.extract(database, root, [tried], config)) / TRIED * count
+        extraction = _seconds(lambda: stages.extract(database, root, [tried], config))
         with stages.opened(database) as connection:
-            features = connection.num_keypoints() / TRIED * count
-        _, pairs = pairs_compared("auto", count)
-        matching = _seconds(lambda: match(database, config, print)) / (TRIED * (TRIED - 1) / 2) * pairs
-    least, most = (rate * features for rate in MAPPING)
-    minutes = [(extraction + matching) / CORES / 60 + mapping / 60 for mapping in (least, most)]
-    return (
-        f"Cameras of {count} photographs will take about {minutes[0]:.1f} to {minutes[1]:.1f} min on {CORES} threads: "
-        f"features {extraction / CORES / 60:.1f}, {pairs} pairs {matching / CORES / 60:.1f}, mapping the rest."
-    )
+            features = connection.num_keypoints()
+        matching = _seconds(lambda: match(database, config, print))
+    return extraction / len(tried), features / len(tried), matching / (len(tried) * (len(tried) - 1) / 2)
 
 
 def _seconds(work: Callable[[], object]) -> float:
