@@ -26,14 +26,13 @@ def ran(folder, names=()):
     return {line["name"]: line for line in lines}
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+@pytest.fixture
+def folder(tmp_path):
     """With a scene of three photographs and their depth."""
-    folder = tmp_path_factory.mktemp("pretended")
-    scene = write_colmap(folder / "scene", NAMES)
+    scene = write_colmap(tmp_path / "scene", NAMES)
     for name in NAMES:
         write_floats(scene / "depths" / f"{name[0]}.exr", np.full((32, 48, 1), 0.2, np.float32))
-    return folder
+    return tmp_path
 
 
 def check(found):
