@@ -304,8 +304,10 @@ def test_refused_in_one_sentence(simulation):
         SensorSplatCamera(empty)
     state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
     camera = camera_of_fov(WIDTH, HEIGHT, FOV)
-    with pytest.raises(InputError, match=r"rgb_image: expected shape \(2, 32, 40\), got \(3, 32, 40\)"):
+    with pytest.raises(InputError, match=r"rgb_image: expected \(2, 32, 40\) of vec3f, got \(3, 32, 40\) of vec3f"):
         simulation.sensor.update(state, transforms, camera, **images(3, rgb_image=wp.vec3))
+    with pytest.raises(InputError, match=r"color_image: expected .* of uint32, got .* of vec3f"):
+        simulation.sensor.update(state, transforms, camera, **images(2, color_image=wp.vec3))
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
     with pytest.raises(InputError, match="mesh_index: expected mesh_depth beside it"):
         simulation.sensor.update(state, transforms, camera, shape_index_image=named, mesh_index=named)

@@ -109,6 +109,10 @@ BAD = {
         plain_photos,
         ["model (sparse/), transforms_train.json or transforms.json", "1 photographs alone", "warp-splat sfm"],
     ),
+    "photos-of-phones": (
+        file_case("a.heic", "x"),
+        ["found neither and no photographs", "convert its 1 files such as 'a.heic' to JPEG or PNG"],
+    ),
     "model": (folder_case("point_cloud"), ["found a trained model", "folder of its scene"]),
     "resolution-0": (colmap_case(options={"resolution": 0}), ["resolution", "got 0"]),
     "resolution-absurd": (colmap_case(options={"resolution": 1_000_000}), [".png", "1000000", "-r"]),

@@ -114,7 +114,7 @@ def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
     expected = exact_image(workload)
     np.save(out / "expected.npy", expected)
     save_png(out / "expected.png", (in_eight_bits(expected) * 255).astype(np.uint8))
-    count = f"{name}: {len(workload.gaussians.means)} Gaussians on {background}"
+    count = f"{name}: {(many := len(workload.gaussians.means))} Gaussian{'s' * (many > 1)} on {background}"
     if answer is None:
         return 1
     np.save(out / "found.npy", answer.image)

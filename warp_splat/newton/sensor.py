@@ -135,11 +135,14 @@ class SensorSplatCamera:
         """
         views = len(camera_transforms)
         shape = (views, camera.height, camera.width)
-        outputs = {"rgb_image": rgb_image, "color_image": color_image, "forward_depth_image": forward_depth_image}
-        outputs |= {"shape_index_image": shape_index_image, "mesh_color": mesh_color, "mesh_depth": mesh_depth}
-        for name, array in {**outputs, "mesh_index": mesh_index}.items():
-            if array is not None and array.shape != shape:
-                raise InputError(f"{name}: expected shape {shape}, got {array.shape}.")
+        reals = {"rgb_image": rgb_image, "forward_depth_image": forward_depth_image, "mesh_depth": mesh_depth}
+        packed = {"color_image": color_image, "shape_index_image": shape_index_image}
+        packed |= {"mesh_color": mesh_color, "mesh_index": mesh_index}
+        for name, array in {**reals, **packed}.items():
+            kind = wp.vec3 if name == "rgb_image" else wp.uint32 if name in packed else wp.float32
+            if array is not None and (array.shape, array.dtype) != (shape, kind):
+                found = f"{array.shape} of {array.dtype.__name__}"
+                raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
         for name, array in (("mesh_color", mesh_color), ("mesh_index", mesh_index)):
             if array is not None and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")

@@ -12,7 +12,16 @@ import numpy as np
 from warp_splat.color import from_srgb
 from warp_splat.config import LENSES
 from warp_splat.errors import InputError
-from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, find_mask, is_video, photo_root, sfm_hint
+from warp_splat.scene.photos import (
+    OTHER_PHOTOS,
+    PHOTOS,
+    ImageFinder,
+    find_files,
+    find_mask,
+    is_video,
+    photo_root,
+    sfm_hint,
+)
 from warp_splat.scene.types import Scene, View, visible
 from warp_splat.text import Report
 
@@ -157,7 +166,9 @@ def read_photos(
     photographs = find_files(photo_root(source), PHOTOS)
     if photographs:
         raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
-    raise InputError(f"{source}: {expected}, found neither and no photographs; give another folder as source.")
+    others = find_files(photo_root(source), OTHER_PHOTOS)
+    hint = f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG" if others else "give another folder"
+    raise InputError(f"{source}: {expected}, found neither and no photographs; {hint}.")
 
 
 def has_cameras(source: str | Path) -> bool:

@@ -71,9 +71,12 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         options = {"threads": machine.threads, "seed": config.learn.seed % 2**31, "quiet": quiet}
         options["keep_lens"] = data.lens == "native"
         source = scene_for(source, processes.count, **options)
+    more = -(iterations - done) % processes.images  # whole steps
+    if more and not config.learn.minutes:
+        say(f"A step trains on {processes.images} images: --iterations {iterations} ends after {iterations + more}.")
     config = config.changed(
         quiet=quiet,
-        iterations=iterations + -(iterations - done) % processes.images,  # whole steps
+        iterations=iterations + more,
         model_path=processes.first(str(folder)),
         device=device.type,
         portable=PORTABLE,  # which the variable of the environment may have set
