@@ -17,7 +17,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.evaluation.report import machine
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.finished import make_renderer
-from warp_splat.runtime import pool
+from warp_splat.runtime import launch, pool
 from warp_splat.text import cells_of, format_table
 
 ROOT = Path(__file__).parents[1]
@@ -93,6 +93,20 @@ def write_table(
         out.mkdir(parents=True, exist_ok=True)
         (out / f"{name}.md").write_text(f"{table}\n\n{note} Measured by `benchmarks/{name}.py` on {machine()}.\n")
         (out / f"{name}.json").write_text(json.dumps(measured, indent=1) + "\n")
+
+
+def transcribe(name: str, out: Path | None, measure: Callable[[Path, Callable[[str], None]], object]) -> None:
+    """What ``measure`` says and on which machine, printed and written to ``<out>/<name>.txt``, beside its own files."""
+    out, log = out or ROOT / "output" / "compare", []
+
+    def say(text: str) -> None:
+        print(text, flush=True)
+        log.append(text)
+
+    launch.prepare("cpu", 0)
+    measure(out, say)
+    say(f"\nMeasured on {machine()}, {pool.get_threads()} threads.")
+    (out / f"{name}.txt").write_text("\n".join([*log, ""]))
 
 
 def versions() -> str:

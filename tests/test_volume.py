@@ -1,17 +1,17 @@
-"""The physics under the splats, against closed forms, quadrature and stiff solvers of SciPy; and the files of `run`."""
+"""The physics under the splats, against closed forms, quadrature and stiff solvers of SciPy; the benchmark's files."""
 
 import json
 
+import footprints
+import light as physics
 import numpy as np
 import pytest
+import volume as measure
+from light import Volume
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
-from warp_splat.compare import through_lenses
 from warp_splat.compare.scenes import make_camera
-from warp_splat.compare.volume import light as physics
-from warp_splat.compare.volume import measure
-from warp_splat.compare.volume.light import Volume
 from warp_splat.errors import InputError
 
 BACKGROUND = np.array([0.2, 0.8, 0.4])
@@ -237,14 +237,14 @@ def test_run_writes_its_files(tmp_path, monkeypatch):
         assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", through_lenses.CAMERAS)
+@pytest.mark.parametrize("name", footprints.CAMERAS)
 def test_footprints_through_lenses_are_exact_in_the_limit(name):
     """The smaller Gaussians are, the better lines and planes describe what the lens makes of them."""
-    camera, most = through_lenses.CAMERAS[name]
-    errors = {projection: [] for projection in through_lenses.PROJECTED}
+    camera, most = footprints.CAMERAS[name]
+    errors = {projection: [] for projection in footprints.PROJECTED}
     for size in (0.08, 0.02):
-        volume = through_lenses.made_volume(camera, min(most, 60.0), size)  # away from the poles of a panorama
-        images = through_lenses.footprint_images(volume, camera)
+        volume = footprints.made_volume(camera, min(most, 60.0), size)  # away from the poles of a panorama
+        images = footprints.footprint_images(volume, camera)
         light = np.nansum(np.abs(images["truth"] - volume.background))
         for projection, found in errors.items():
             found.append(np.nansum(np.abs(images[projection] - images["truth"])) / light)

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import torch
 
-from warp_splat.compare import adjoints, plots, through_lenses, trained
+from warp_splat.compare import adjoints, plots, trained
 from warp_splat.compare.stability import cases
-from warp_splat.compare.volume import measure
 from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
@@ -31,15 +30,12 @@ def run(config: CompareConfig) -> int:
     unknown = [mode for mode in config.modes if mode not in ADJOINTS]
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
-    chosen = [f"--{name}" for name in ("stability", "volume", "cameras") if getattr(config, name)]
-    if len(chosen) > 1:
-        raise InputError(f"{', '.join(chosen)}: expected one of them, got {len(chosen)}; run the command for each.")
-    if chosen and (config.scene or config.full):
-        raise InputError(f"--scene, --full: these belong to the comparison without {chosen[0]}.")
-    if chosen and config.device == "cuda":
-        raise InputError(f"--device cuda: {chosen[0]} computes on the CPU only; use --device cpu.")
-    scenes = {} if chosen else named_scenes(config.scene, print)
-    wanted = "cpu" if chosen else config.device
+    if config.stability and (config.scene or config.full):
+        raise InputError("--scene, --full: these belong to the comparison without --stability.")
+    if config.stability and config.device == "cuda":
+        raise InputError("--device cuda: --stability computes on the CPU only; use --device cpu.")
+    scenes = {} if config.stability else named_scenes(config.scene, print)
+    wanted = "cpu" if config.stability else config.device
     device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
     out, log = Path(config.out), []
     with atomic_write(out / ".writable") as path:  # to fail before all measuring, not after
@@ -53,16 +49,12 @@ def run(config: CompareConfig) -> int:
     code = 0
     if config.stability:
         code = int(cases.run_cases(out, config.modes, say) > 0)
-    elif config.volume:
-        measure.compare_with_physics(out, say)
-    elif config.cameras:
-        through_lenses.compare_cameras(out, say)
     else:
         _compare_pixel_loops(config, scenes, device, out, say)
         trained.run_trainings(out, config.modes, scenes, config.full, say, device.type)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
-    name = chosen[0].removeprefix("--") if chosen else "compare"
+    name = "stability" if config.stability else "compare"
     write_text(out / f"{name}.txt", "\n".join([*log, ""]))
     print(f"Tables and plots: {out}")
     return code

@@ -7,7 +7,7 @@ r = 1 - |a3|^2 that is, without a difference of large numbers,
     the covariance, divided by k^2, A (I - a3 a3')^-1 A' / r
     hence the rows of A (a_i + (a_i a3) / (r + sqrt(r)) a3) / sqrt(r)
 
-We take k = 2. Against the volume (warp_splat.compare.volume) its footprint is better than the affine one by 4 to 7 dB,
+We take k = 2. Against the volume (benchmarks/volume.py) its footprint is better than the affine one by 4 to 7 dB,
 that of k = 3 worse by 1 to 6.
 """
 

@@ -1,6 +1,8 @@
-"""Splats against physics, measured: how three integrators fare on stiff media, and what each splatting shortcut costs.
+"""Splats against the emission-absorption equation: integrators on stiff media, and what splatting's shortcuts cost.
 
-The physics is :mod:`warp_splat.compare.volume.light`; here are the media and scenes, the measurements and tables.
+The physics, in float64, is benchmarks/light.py; here are the media and scenes, the measurements and tables.
+
+    python benchmarks/volume.py [--out docs/compare]
 """
 
 import itertools
@@ -10,13 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import light as physics
+import maps
 import numpy as np
+from common import parse, transcribe
+from light import Volume
 
 from warp_splat.camera import Camera
 from warp_splat.compare import plots
 from warp_splat.compare.scenes import make_camera
-from warp_splat.compare.volume import light as physics
-from warp_splat.compare.volume.light import Volume
 from warp_splat.evaluation.report import BLUE, GREEN, INK, ORANGE
 from warp_splat.formats.files import write_csv, write_json
 from warp_splat.text import format_table, table_of
@@ -149,14 +153,14 @@ def compare_with_physics(out: Path, say: Callable[[str], None] = print) -> dict[
     curves = ("tau_ds", "errors")  # in the JSON only
     write_csv(out / "volume.csv", [{key: row[key] for key in row if key not in curves} for row in flat])
     plot_integrators(out / "volume_stiff.png", integrators, limits)
-    maps = {
+    rows = {
         name.replace(" at", "\nat"): [
             ("truth", images[name]["truth"], None),
             *((rung, images[name]["truth"], images[name][rung]) for rung in PARENT),
         ]
         for name in PICTURED
     }
-    plots.plot_maps(out / "volume_maps.png", maps, 4.2, LEAST_ERROR)
+    maps.plot_maps(out / "volume_maps.png", rows, 4.2, LEAST_ERROR)
     return results
 
 
@@ -288,3 +292,11 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
         panel.line("", record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, lw=1.4)
         panel.line("stability limit for constant tau", [theory] * 2, [1e-16, 1e3], color=INK, lw=1, ls="--")
     plots.draw_panels(path, panels, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
+
+
+def main() -> None:
+    transcribe("volume", parse(__doc__).out, compare_with_physics)
+
+
+if __name__ == "__main__":
+    main()

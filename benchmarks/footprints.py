@@ -1,9 +1,11 @@
 """What a projection through a lens costs: its footprints against rays through the lens, its gradients, its run time.
 
 A pixel's ray is where the lens, in float64, sees that pixel's center. The truth of a footprint is "no overlap" of
-:mod:`.volume.light`: each Gaussian's exact optical depth along the ray, composited as the renderer does. What is left
+benchmarks/light.py: each Gaussian's exact optical depth along the ray, composited as the renderer does. What is left
 is the projection's own error. Gradients are those of a random loss, of cameras that learn: without and with a rolling
 shutter.
+
+    python benchmarks/footprints.py [--out docs/compare]
 """
 
 import itertools
@@ -13,16 +15,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import light
+import maps
 import numpy as np
 import torch
+from common import parse, transcribe
+from light import Volume
 
 from warp_splat.camera import Camera
-from warp_splat.compare import oracle, plots
+from warp_splat.compare import oracle
 from warp_splat.compare.exact_cameras import exact_camera
 from warp_splat.compare.scenes import distinct_depths, make_camera, to_world
 from warp_splat.compare.truth import random_upstream
-from warp_splat.compare.volume import light
-from warp_splat.compare.volume.light import Volume
 from warp_splat.config import ADJOINTS, PROJECTIONS, RasterOptions
 from warp_splat.formats.files import write_csv
 from warp_splat.lenses import Lens
@@ -75,12 +79,12 @@ def compare_cameras(out: Path, say: Callable[[str], None] = print) -> list[dict[
     Raises:
         InputError: if a file cannot be written.
     """
-    maps, records = {}, []
+    rows, records = {}, []
     for name, (camera, most) in CAMERAS.items():
         ways = {projection: (camera, RasterOptions(projection=projection)) for projection in PROJECTED}
         ways["pinhole"] = replace(camera, lens=None), RasterOptions()
         seconds = measure_times(_made_splats(camera, most, TIMED), ways)
-        row = maps[name.replace(", ", "\n").replace("_", "\n")] = []
+        row = rows[name.replace(", ", "\n").replace("_", "\n")] = []
         for size in SIZES:
             images = footprint_images(made_volume(camera, most, size), camera)
             row.append((f"truth, {size} rad", images["truth"], None))
@@ -97,7 +101,7 @@ def compare_cameras(out: Path, say: Callable[[str], None] = print) -> list[dict[
     _report_gradients(gradients, say)
     write_csv(out / "cameras.csv", [{"table": "footprints", **r} for r in records])
     write_csv(out / "cameras_gradients.csv", gradients)
-    plots.plot_maps(out / "cameras.png", maps, 1.6 * len(maps), LEAST)
+    maps.plot_maps(out / "cameras.png", rows, 1.6 * len(rows), LEAST)
     return records
 
 
@@ -207,3 +211,11 @@ def _report_gradients(records: Sequence[Mapping[str, Any]], say: Callable[[str],
     ]
     headers = ["camera", "projection", *(part.replace("_", " ") for part in parts)]
     say(format_table([*headers, "ns a Gaussian", "times one that does not"], rows))
+
+
+def main() -> None:
+    transcribe("cameras", parse(__doc__).out, compare_cameras)
+
+
+if __name__ == "__main__":
+    main()

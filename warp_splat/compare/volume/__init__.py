@@ -1,1 +1,0 @@
-"""Splats against the emission-absorption equation, in float64."""
