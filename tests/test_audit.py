@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -99,6 +100,12 @@ def test_a_broken_rule_is_found_in_eight_bits(broken, name, says, options):
     assert says in rules_of(eight_bit=True, **broken).sentences[name]
 
 
+def test_blending_in_eight_bits_is_not_taken_for_a_stop():
+    """160 faint layers let four levels through, as a stop at 0.015 would."""
+    assert "does not stop" in rules_of(eight_bit=True, rounded=True).sentences["stop"]
+    assert "below 0.0" in rules_of(eight_bit=True, t_min=0.02).sentences["stop"]
+
+
 @pytest.fixture
 def importable(monkeypatch):
     """Processes of their own find wrong_renderer."""
@@ -144,6 +151,15 @@ def test_a_program_is_audited_and_its_finding_made_small(tmp_path):
     assert len(load_ply(tmp_path / "out" / "scene.ply").splats.means) < len(SCENES["cloud"][1]()[0]["means"]) / 4
     assert len(json.loads((tmp_path / "out" / "cameras.json").read_text())) == 1
     assert not load_png(tmp_path / "out" / "found.png").any() and load_png(tmp_path / "out" / "expected.png").any()
+
+
+@pytest.mark.slow
+def test_a_module_of_the_folder_where_one_stands_is_audited(tmp_path):
+    """By the installed command, and by the process that draws."""
+    (tmp_path / "mine.py").write_text("def draw(*given):\n    return given[-1].expand(48, 64, 3)\n")
+    command = [Path(sys.executable).parent / "warp-splat", "audit", "mine:draw", "--case", "one"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("one: 1 Gaussians on ") and "off by 0.719" in done.stdout, done.stderr
 
 
 @pytest.mark.slow

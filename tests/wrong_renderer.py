@@ -29,6 +29,7 @@ class Wrong:
     background: str = "asked"
     shift: float = 0.0
     projection: str = "affine"
+    rounded: bool = False  # to 8 bits after each Gaussian, from the farthest on
 
 
 def draw(rules, means, quats, scales, opacities, sh, camera, background):
@@ -52,6 +53,7 @@ def draw(rules, means, quats, scales, opacities, sh, camera, background):
     }[rules.order]
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     image, through = torch.zeros(camera.height, camera.width, 3).double(), torch.ones(x.shape).double()
+    layers = []
     going = torch.ones_like(through, dtype=torch.bool)
     colors = from_torch(decoded_srgb, splats.color) if rules.space in ("decoded", "linear") else splats.color
     for i in torch.argsort(key, stable=True).tolist():
@@ -67,10 +69,15 @@ def draw(rules, means, quats, scales, opacities, sh, camera, background):
         after = through * (1 - alpha)
         going = going & ~(used & (after < rules.t_min))
         alpha = torch.where(going, alpha, 0.0)
+        layers.append((alpha[..., None], colors[i]))
         image = image + (through * alpha)[..., None] * colors[i]
         through = through * (1 - alpha)
     behind = {"asked": background.double(), "black": torch.zeros(3), "white": torch.ones(3)}[rules.background]
     image = image + through[..., None] * behind
+    if rules.rounded:
+        image = behind.expand(image.shape)
+        for alpha, color in reversed(layers):
+            image = (255 * (alpha * color + (1 - alpha) * image)).round() / 255
     return from_torch(srgb, image) if rules.space in ("encoded", "linear") else image
 
 

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import sys
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ def audit(config: AuditConfig) -> int:
     Raises:
         InputError: for a target, scene or command that there is not.
     """
+    sys.path.append("")  # modules of the folder where one stands, which an installed command does not see otherwise
     place = config.program or config.target
     draw_by_program(place) if config.program else function_of(place)
     if config.case and config.case not in SCENES:

@@ -141,8 +141,9 @@ def find_clamp(prober: Prober) -> str:
 
 
 def find_stop(prober: Prober) -> str:
-    """What is left of the light behind 160 layers."""
-    left = 1 - prober.cover([CENTER] * 160, np.linspace(3, 5, 160), 9.0, 0.1)[24, 32]
+    """What is left of the light behind many faint layers, where blending in 8 bits stops, or fewer strong ones."""
+    layers = ((160, 0.1), (20, 0.6))
+    left = 1 - max(prober.cover([CENTER] * n, np.linspace(3, 5, n), 9.0, opacity)[24, 32] for n, opacity in layers)
     if left < max(2 * prober.seen, 2e-7):
         prober.options["t_min"] = 0.0 if prober.seen < 1e-6 else oracle.STOP
         return f"A pixel does not stop while its transmittance is above {max(left, prober.seen):.1g}."
@@ -237,7 +238,7 @@ def find_sort(prober: Prober) -> str:
             (1, 0): "The order is reversed: the farther Gaussian is in front.",
         }.get(both, "Two Gaussians behind each other do not look as in either order.")
     wide = make_camera(65, 49, 30.0, seed=None)
-    arrays = balls(wide, [[60.5, 24.5], [24.5, 24.5]], [3.0, 3.3], [9.0, 12.0], 0.7, colors)
+    arrays = balls(wide, [[56.5, 24.5], [24.5, 24.5]], [3.0, 3.3], [14.0, 16.0], 0.7, colors)
     arrays["scales"] = arrays["scales"] * [1.0, 1.0, 0.1]  # balls as large would reach behind the camera
     key = front(0, 1, wide), front(1, 0, wide)
     return {
