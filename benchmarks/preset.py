@@ -10,8 +10,8 @@ import json
 from pathlib import Path
 
 from common import MODELS, SCENE, parse, run_training, write_table
+from panels import Panel, draw_panels
 
-from warp_splat.compare.plots import Panel, draw_panels
 from warp_splat.evaluation.report import BLUE, ORANGE
 
 EMBEDDED = {"embedded": [], "embedded, fast": ["--preset", "fast"]}

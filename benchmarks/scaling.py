@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from common import ROOT, option, parse, write_table
 from made_up import make_trainer
+from panels import Panel, draw_panels
 
-from warp_splat.compare.plots import Panel, draw_panels
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.evaluation.report import BLUE, INK, ORANGE
 from warp_splat.raster.drivers import CPU

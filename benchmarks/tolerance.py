@@ -12,11 +12,11 @@ from pathlib import Path
 import matplotlib
 import torch
 from common import interleaved, option, parse, write_table
+from knobs import KNOBS
 from made_up import cameras, make_crowd
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
-from warp_splat.compare.adjoints import KNOBS
 from warp_splat.compare.stability import cases, verdict
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ALPHA_MIN, RasterOptions

@@ -17,9 +17,9 @@ import maps
 import numpy as np
 from common import parse, transcribe
 from light import Volume
+from panels import Panel, draw_panels
 
 from warp_splat.camera import Camera
-from warp_splat.compare import plots
 from warp_splat.compare.scenes import make_camera
 from warp_splat.evaluation.report import BLUE, GREEN, INK, ORANGE
 from warp_splat.formats.files import write_csv, write_json
@@ -272,10 +272,10 @@ def _integrator_table(records: Sequence[Mapping[str, Any]]) -> str:
 
 def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limits: Sequence[Mapping[str, Any]]) -> None:
     """Draw error against run time, a panel for each optical depth, and error against tau ds around the limits."""
-    panels = []
+    drawn = []
     for optical_depth in OPTICAL_DEPTHS:
         title, x = f"optical depth {plain(optical_depth)}", f"run time for {RAYS} rays [ms]"
-        panels.append(panel := plots.Panel(title, x))
+        drawn.append(panel := Panel(title, x))
         for place, (name, (*_, color, marker)) in enumerate(METHODS.items()):
             for stable in (True, False):
                 chosen = [r for r in integrators if (r["optical_depth"], r["method"]) == (optical_depth, name)]
@@ -286,12 +286,12 @@ def plot_integrators(path: Path, integrators: Sequence[Mapping[str, Any]], limit
                 seconds, line = [1e3 * r["seconds"] for r in chosen], {"ls": "-", "lw": 1.4} if stable else {}
                 panel.marks(label, seconds, errors, (color, marks), **line)
     title = f"step limit at {plain(LIMIT_DEPTHS[-1])}"
-    panels.append(panel := plots.Panel(title, "tau ds at the peak of tau", ticks=True))
+    drawn.append(panel := Panel(title, "tau ds at the peak of tau", ticks=True))
     for record in limits[-len(METHODS) :]:  # those of the densest medium
         theory, color = record["theory"], METHODS[record["method"]][3]
         panel.line("", record["tau_ds"], np.minimum(record["errors"], 1e6), color=color, lw=1.4)
         panel.line("stability limit for constant tau", [theory] * 2, [1e-16, 1e3], color=INK, lw=1, ls="--")
-    plots.draw_panels(path, panels, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
+    draw_panels(path, drawn, 3, 2.3, "largest error of the radiance (colors 0 to 1)", ylim=(1e-16, 1e3))
 
 
 def main() -> None:

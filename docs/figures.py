@@ -182,7 +182,7 @@ def lost(variant: str) -> float:
 
 def nearer() -> list[float]:
     """How much closer modes are than seeds, before the first densification (rms)."""
-    found = re.findall(r"\| (modes|seeds) .*\| +([\d.e-]+) \|", text("compare/compare.txt"))
+    found = re.findall(r"\| (modes|seeds) .*\| +([\d.e-]+) \|", text("compare/training.txt"))
     values = [float(value) for _, value in found]
     return [seeds / modes for modes, seeds in zip(values[::2], values[1::2], strict=True)]
 

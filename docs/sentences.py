@@ -120,7 +120,7 @@ TABLES = {
 def sentences() -> dict[str, list[tuple]]:
     """By page: pieces of its text, with ``{}`` for a figure, and the figures."""
     measured = f.quoted("compare/compare.txt", r"Measured on (.*), 2 threads")[0]
-    over_modes, over_seeds = f.quoted("compare/compare.txt", r"is ([\d.]+) dB over modes and ([\d.]+) dB over seeds")
+    over_modes, over_seeds = f.quoted("compare/training.txt", r"is ([\d.]+) dB over modes and ([\d.]+) dB over seeds")
     exponentials = [f.knob(scene, "exp_degree 3") for scene in f.scenes("knobs")]
     stops = [f.knob(scene, "t_min 0.01") for scene in f.scenes("knobs")]
     default_stops = [f.knob(scene, "t_min 0.0001")[0] for scene in f.scenes("knobs")]

@@ -1,6 +1,6 @@
 """Commands for ``test_pretend_cuda.py``, one after another in a process that has a pretended GPU; what came of each.
 
-    PYTHONPATH=tests/pretend_cuda python tests/pretended_runs.py FOLDER [NAME ...]
+    PYTHONPATH=tests/pretend_cuda:benchmarks python tests/pretended_runs.py FOLDER [NAME ...]
 
 FOLDER holds a scene of three photographs. A line of JSON for each command: how it ended, and where the host waited.
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from fake_viser import FakeClient, FakeServer, drawn
+from knobs import run_knobs
 
 from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
 from warp_splat.cli import main
@@ -100,7 +101,7 @@ def call_as_gsplat() -> None:
 def compare() -> None:
     """What ``warp-splat compare`` measures, of a scene small enough for fibers."""
     workload = layered(10).to(torch.device("cuda"))
-    assert adjoints.run_adjoints([workload], ADJOINTS, str) and adjoints.run_knobs([workload], str)
+    assert adjoints.run_adjoints([workload], ADJOINTS, str) and run_knobs([workload], str)
 
 
 def view(folder: Path) -> None:

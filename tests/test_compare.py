@@ -1,12 +1,13 @@
-"""The comparison: what it measures is right, it measures what it says, and its trainings write every file."""
+"""The comparison: what it measures is right, and it measures what it says."""
 
-import csv
 import json
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 
+import compare_plots
+import knobs
 import numpy as np
 import pytest
 import torch
@@ -14,20 +15,18 @@ import warp as wp
 from scenes import SCENES
 
 from warp_splat import RasterOptions, cli
-from warp_splat.compare import adjoints, oracle, plots, trained, truth, workloads
+from warp_splat.compare import adjoints, oracle, truth, workloads
+from warp_splat.compare.plots import plot_errors
 from warp_splat.compare.stability import cases
 from warp_splat.config import ADJOINTS
 from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant
-from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.raster.data import Gaussians, alphas_of
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, view
-from warp_splat.scene import load_scene
-from warp_splat.scene.embedded import embedded_scene
 
 PLAIN = RasterOptions()
 ROOT = Path(__file__).parents[1]
@@ -103,7 +102,7 @@ def test_layered_scenes_are_as_deep_as_they_say():
 
 def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     monkeypatch.setattr(adjoints, "REPEATS", 2)
-    monkeypatch.setattr(adjoints, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
+    monkeypatch.setattr(knobs, "KNOBS", {"t_min": (1e-2, 1e-4), "alpha_min": (1 / 255, 0.0)})
     scenes = [workloads.layered(10), workload()]
     measured, lines = adjoints.run_adjoints(scenes, ["stepwise"], lambda _: None), []
     rows = adjoints.records(measured)
@@ -118,12 +117,13 @@ def test_measuring_writes_tables_and_plots(tmp_path, monkeypatch):
     assert by_name["degree1", "central differences", "opacities"]["relative_error"] < 0.05
     assert by_name["degree1", "central differences", "opacities"]["note"].endswith("extrapolated")
     lines += adjoints.adjoint_table(measured).splitlines()
-    plots.plot_errors(tmp_path / "errors.png", measured)
-    plots.plot_memory(tmp_path / "memory.png", measured)
-    plots.plot_stages(tmp_path / "stages.png", measured, ["manual", "stepwise"])
-    turned = adjoints.run_knobs(scenes, lambda _: None)
-    plots.plot_knobs(tmp_path / "knobs.png", turned)
-    lines += adjoints.knob_table(turned).splitlines()
+    plot_errors(tmp_path / "errors.png", measured)
+    written = json.loads(json.dumps([asdict(item) for item in measured]))
+    compare_plots.plot_memory(tmp_path / "memory.png", written)
+    compare_plots.plot_stages(tmp_path / "stages.png", written)
+    turned = knobs.run_knobs(scenes, lambda _: None)
+    knobs.plot_knobs(tmp_path / "knobs.png", turned)
+    lines += knobs.knob_table(turned).splitlines()
     assert len({len(line) for line in lines}) == 2  # two tables, every line as long as its header
     exact = {item.variant: item.image_error for item in turned if item.scene == "degree1"}
     assert exact["alpha_min 0"] < 1e-5 < exact["alpha_min 0.003922 *"] and exact["t_min 0.0001 *"] < 1e-3
@@ -168,7 +168,7 @@ def test_stored_that_does_not_fit_is_a_row(monkeypatch):
         ("--scene nowhere", "nowhere"),
         pytest.param("--device cuda", "--device cuda", marks=WITHOUT_GPU),
         ("--device cuda --stability", "--device cuda: --stability computes on the CPU only"),
-        ("--stability --full", "--scene, --full: these belong to the comparison without --stability"),
+        ("--stability --scene nowhere", "--scene: expected none with --stability"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, message, tmp_path, fails):
@@ -191,96 +191,10 @@ def test_command_runs_the_catalog(failed, code, tmp_path, monkeypatch):
     [
         ("benchmarks/volume.py", "volume.txt volume.csv volume.json volume_stiff.png volume_maps.png"),
         ("benchmarks/footprints.py", "cameras.txt cameras.csv cameras_gradients.csv cameras.png"),
-        ("-m warp_splat.compare --stability --modes manual", "stability.txt stability.csv stability.png"),
+        ("-m warp_splat.compare --stability --modes manual", "stability.txt stability.csv stability.json"),
     ],
 )
 def test_whole_commands(command, files, tmp_path):
     """At their default size; 0: no verdict failed."""
     subprocess.run([sys.executable, *command.split(), "--out", tmp_path], cwd=ROOT, check=True)
     assert all((tmp_path / name).stat().st_size > 0 for name in files.split())
-
-
-STEPS = 24
-SCHEDULE = {**trained.SHORT, "iterations": STEPS, "densify_from_iter": 10, "densification_interval": 12}
-
-
-@pytest.fixture(scope="module")
-def scene():
-    """Half of the points; 33 x 31 pixels; two views held out."""
-    whole = load_scene(embedded_scene(), eval=True, resolution=8, report=str)
-    return replace(whole, test=whole.test[:2], points=whole.points[::2], colors=whole.colors[::2])
-
-
-@pytest.fixture
-def tiny(monkeypatch):
-    monkeypatch.setattr(trained, "SHORT", SCHEDULE)
-    monkeypatch.setattr(trained, "SEEDS", (0, 1))
-    monkeypatch.setattr(trained, "EVALUATIONS", 4)
-
-
-def test_short_schedule_is_whole_within_its_steps():
-    assert set(EMBEDDED_DEFAULTS[""]) < set(trained.SHORT)
-    assert trained.SHORT["iterations"] == trained.SHORT["position_lr_max_steps"] == 300
-    assert trained.COMPARED[-1] < 2 * trained.SHORT["densification_interval"] < trained.SHORT["densify_until_iter"]
-
-
-def test_run_writes_its_files(tiny, scene, tmp_path):
-    said = []
-    results = trained.run_trainings(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)
-    assert set(json.loads((tmp_path / "new/training.json").read_text())) == set(results)
-    assert results["schedule"]["iterations"] == STEPS
-    with open(tmp_path / "new/training.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    columns = "scene variant seed psnr ssim gaussians longest_list lists_cut iterations_per_second refused".split()
-    assert list(rows[0]) == columns
-    late = [f"cap {cap}, rendering only" for cap in trained.CAPS]
-    further = [*(f"cap {cap}" for cap in trained.CAPS), "ellipsoid"]
-    names = [(row["variant"], row["seed"]) for row in rows]
-    assert names[:6] == [(name, "0") for name in ["manual", "stepwise", *further]]
-    assert names[6:8] == [("manual", "1"), ("stepwise", "1")]
-    assert names[8:] == [(name, seed) for seed in "01" for name in late]
-    assert [record["variant"] for record in results["summary"]] == ["manual", "stepwise", *further, *late]
-    for name, magic in (("training_modes.png", b"\x89PNG"), ("training_cap.jpg", b"\xff\xd8")):
-        assert (tmp_path / "new" / name).read_bytes().startswith(magic)
-    text = "\n".join(said)
-    assert "against manual" in text and "seeds do: the standard deviation" in text
-    assert {d["steps"] for d in results["equality"]["embedded"]["parameters"]} == {1, 10}
-    of = {row["variant"]: row for row in rows if row["seed"] == "0"}
-    assert float(of["manual"]["longest_list"]) < 2048  # a cap that no list reaches changes nothing
-    assert of["cap 2048"]["psnr"] == of["cap 2048, rendering only"]["psnr"] == of["manual"]["psnr"]
-    assert float(of["cap 128"]["lists_cut"]) > 0
-
-
-def test_modes_train_alike(scene, monkeypatch):
-    monkeypatch.setattr(trained, "EVALUATIONS", STEPS)
-    monkeypatch.setattr(trained, "COMPARED", ())
-    losses = []
-    for mode in ADJOINTS:
-        trainer = trained.make_trainer(scene, {**SCHEDULE, "densify_until_iter": 0}, 0, adjoint=mode)
-        list(trained.train_run(trainer, result := trained.Trained("", mode, 0), {}))
-        losses.append([record["loss"] for record in result.history])
-    assert np.mean(losses[0][-5:]) < 0.9 * np.mean(losses[0][:5])
-    np.testing.assert_allclose(losses[1:], [losses[0]] * 3, rtol=1e-3)
-
-
-def test_cap_of_one_entry_costs_quality(scene):
-    qualities = []
-    for cap in (None, 1):
-        trainer = trained.make_trainer(scene, SCHEDULE, 0, max_steps=cap)
-        list(trained.train_run(trainer, result := trained.Trained("", "", 0), {}))
-        qualities.append(result.history[-1]["psnr"])
-    assert qualities[1] < qualities[0] - 1
-
-
-def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("warp_splat.runtime.launch.available_memory", lambda device: 0)
-    said = []
-    results = trained.run_trainings(
-        tmp_path, ["manual", "stored"], {"embedded": scene, "other": scene}, say=said.append
-    )
-    assert {record["scene"] for record in results["summary"]} == {"embedded", "other"}
-    record = results["summary"][1]
-    assert record["variant"] == "stored" and "take" in record["refused"]
-    assert "stored (refused)" in "\n".join(said)
-    assert json.loads((tmp_path / "training.json").read_text())["summary"][1]["psnr"] is None
-    assert results["equality"] == {"embedded": {}, "other": {}}  # one mode is compared with none

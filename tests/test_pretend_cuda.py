@@ -10,7 +10,7 @@ from pretended_runs import CHANGES, STEPS, TRAININGS
 from scene_files import write_colmap, write_floats
 
 HERE = Path(__file__).parent
-PRETENDING = f"{HERE / 'pretend_cuda'}:{HERE.parent}:{HERE}"
+PRETENDING = f"{HERE / 'pretend_cuda'}:{HERE.parent}:{HERE}:{HERE.parent / 'benchmarks'}"
 NAMES = ("a.png", "b.png", "c.png")
 #: Commands that others see most of.
 SELDOM = ("grid", "stepwise", "reversible", "stored", "clean", "compare", "bound", "profile", "resume")

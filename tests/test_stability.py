@@ -5,6 +5,7 @@ import json
 from dataclasses import replace
 from fractions import Fraction
 
+import compare_plots
 import numpy as np
 import pytest
 import torch
@@ -146,18 +147,20 @@ def test_a_point_is_placed_at_its_pixel():
 
 def test_run_writes_and_counts(tmp_path, monkeypatch):
     """With few cases: the table, the files, and the number of failed verdicts."""
-    chains = [case for case in cases.CASES if case.name.startswith("chain_1")]
+    chains = [case for case in cases.CASES if case.name.startswith(("chain_1", "recovery_100"))]
     wrong = verdict.Case("wrong", "none", "fails", lambda _mode: failing, modal=False)
     failing = verdict.Outcome("nothing", 1.0, 0.0, None, 0.0, "-", ("stated, and not so",))
     monkeypatch.setattr(cases, "CASES", (*chains, wrong))
     lines = []
     assert cases.run_cases(tmp_path / "out", ["manual"], lines.append) == 1
     assert "FAIL" in lines[0] and any("stated, and not so" in line for line in lines)
-    verdicts = json.loads((tmp_path / "out/stability.json").read_text())["verdicts"]
+    written = json.loads((tmp_path / "out/stability.json").read_text())
+    verdicts = written["verdicts"]
     with (tmp_path / "out/stability.csv").open(newline="") as file:
         assert [line["case"] for line in csv.DictReader(file)] == [verdict["case"] for verdict in verdicts]
     assert len(verdicts) == len(chains) + 1
-    assert (tmp_path / "out/stability.png").stat().st_size > 10_000
+    compare_plots.plot_stability(tmp_path / "stability.png", written)
+    assert (tmp_path / "stability.png").stat().st_size > 10_000
 
 
 def test_a_verdict_names_the_modes_that_failed():

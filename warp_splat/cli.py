@@ -46,7 +46,7 @@ COMMANDS = {
     "mesh": (MeshConfig, "meshing.command.mesh", "write the surface of a trained model as triangles"),
     "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
     "audit": (AuditConfig, "audit.command.audit", "measure any renderer of Gaussians against float64"),
-    "compare": (CompareConfig, "compare.command.run", "compare adjoints, knobs and models: error against run time"),
+    "compare": (CompareConfig, "compare.command.run", "compare adjoints: error against run time and memory"),
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.

@@ -253,13 +253,12 @@ class ExportHtmlConfig:
 
 @dataclass
 class CompareConfig(OnDevice):
-    """Options of the comparison; without ``--stability``: adjoints, knobs, training."""
+    """Options of the comparison; without ``--stability``: adjoints on scenes."""
 
     scene: str = flag("", "scene (COLMAP, nerf-synthetic, transforms.json) to measure on, besides our own", "-s")
     out: str = flag("output/compare", "folder for tables (CSV, JSON) and plots", "-o")
     modes: list[str] = flag(list(ADJOINTS), "adjoints to compare", many=str)
     stability: bool = flag(False, "the catalog of stiff and extreme cases instead")
-    full: bool = flag(False, "train by the whole schedule instead of 300 steps")
 
 
 @dataclass

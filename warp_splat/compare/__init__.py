@@ -1,1 +1,1 @@
-"""Adjoints, knobs and shortcuts of splatting compared: error against run time."""
+"""Adjoints of the pixel loop compared: error against run time; and the float64 renderer that says what is true."""

@@ -1,13 +1,9 @@
-"""Adjoint against adjoint, and knob against default: error, time and memory, by scene and parameter.
+"""Adjoint against adjoint: error, time and memory, by scene and parameter.
 
 All variants share everything but the kernel that turns upstream gradients in blocks of pixels into a row per tile
 instance (:mod:`warp_splat.raster.drivers` says where they differ). Beside the modes of ``rasterize`` stand
 ``generated`` (``reversible`` with its inverse as the only rule by hand), ``plain`` (the loop recorded naively: wrong),
 ``tape`` (``manual`` between Warp's arrays, with what that adds), the thesis's loop cap, and central differences.
-
-Knobs are of the forward pass: what each value saves, and what it costs in image and gradient. The truth of a knob is
-float64 with this knob at its most exact and the others at their defaults: no early stop for ``t_min``, no cut for
-``alpha_min``, the plain definition for the others.
 """
 
 import time
@@ -20,7 +16,7 @@ import torch
 
 from warp_splat.compare.truth import TAPE, Error, Truth, compute_truth, errors_of, gradients_of, run_passes
 from warp_splat.compare.workloads import CAPS, Workload
-from warp_splat.config import ALPHA_MIN, EXP_DEGREES, EXTENTS, T_MIN, RasterOptions
+from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
 from warp_splat.runtime import timers
@@ -31,15 +27,6 @@ REPEATS = 5
 BUDGET = 12.0  # s for the repeats of a workload; slow ones get fewer
 DIFFERENCES = 12  # parameters at which central differences are computed
 STEP = 3e-3  # of central differences, relative to the opacity or what is left to 1
-
-#: Knob: the values it is turned to while all else stays at its default (exp_degree none is the C library's, exact).
-KNOBS: dict[str, tuple] = {
-    "t_min": (1e-2, 1e-3, T_MIN, 1e-6, 1e-8, 0.0),
-    "alpha_min": (4 * ALPHA_MIN, ALPHA_MIN, 1e-3, 1e-4, 0.0),
-    "extent": EXTENTS,
-    "exp_degree": EXP_DEGREES,
-    "max_steps": (None, 2048, 512, 128),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,32 +201,14 @@ def adjoint_table(measurements: Sequence[Measurement]) -> str:
         ratio = (median(item.backward) or 0.0) / (median(manual[item.scene].backward) or 1.0)
         relative = f"{ratio:.2f}" if ratio < 100 else f"{ratio:.0e}"
         shown = {"error": error, "of": name, "memory": memory, "relative": relative if item.backward else None}
-        found.append({**_shown(item), **shown})
+        found.append({**timed_cells(item), **shown})
     errors = {"scene": "{scene}", "variant": "{variant}", "error": "{error:.1e}", "of": "{of}"}
     times = {"forward ms": "{forward}", "backward ms": "{backward}", "x manual": "{relative}"}
     return table_of(found, {**errors, **times, "peak MiB": "{memory:.1f}"})
 
 
-def knob_table(measurements: Sequence[Measurement]) -> str:
-    """A row per scene and setting: image and gradient error against everything blended, times against the default."""
-    found = []
-    for item in measurements:
-        name, error = item.worst
-        relative = item.both / knob_default(measurements, item).both
-        found.append({**_shown(item), "image": item.image_error, "error": error, "of": name, "relative": relative})
-    errors = {"image error": "{image:.1e}", "gradient error": "{error:.1e}", "of": "{of}"}
-    times = {"forward ms": "{forward}", "backward ms": "{backward}", "x default": "{relative:.2f}"}
-    return table_of(found, {"scene": "{scene}", "setting": "{variant}", **errors, **times})
-
-
-def knob_default(measurements: Sequence[Measurement], item: Measurement) -> Measurement:
-    """The same knob at its default, on the same scene."""
-    knob = item.variant.split()[0]
-    here = (other for other in measurements if other.scene == item.scene and other.variant.split()[0] == knob)
-    return next(other for other in here if other.variant.endswith("*"))
-
-
-def _shown(item: Measurement) -> dict[str, str]:
+def timed_cells(item: Measurement) -> dict[str, str]:
+    """Scene, variant and times of a measurement, as tables show them."""
     backward = _milliseconds(item.backward) + " extrapolated" * item.extrapolated
     return {"scene": item.scene, "variant": item.variant, "forward": _milliseconds(item.forward), "backward": backward}
 
@@ -259,36 +228,3 @@ def median(seconds: Sequence[float]) -> float | None:
 def half_range(seconds: Sequence[float]) -> float | None:
     """Half of the range between the quartiles, or None."""
     return float(np.subtract(*np.percentile(seconds, [75, 25])) / 2) if seconds else None
-
-
-def turned_knobs() -> list[Variant]:
-    """Every knob at every value; the default, marked by a star, once for each."""
-    default = RasterOptions()
-    return [
-        Variant(f"{knob} {_plain(value)}{' *' * (value == getattr(default, knob))}", "manual", {knob: value})
-        for knob, values in KNOBS.items()
-        for value in values
-    ]
-
-
-def run_knobs(workloads: Sequence[Workload], say: Callable[[str], None]) -> list[Measurement]:
-    """Every setting on every workload."""
-    results = []
-    for workload in workloads:
-        start = time.perf_counter()
-        most = {knob: {knob: 0.0} if knob in ("t_min", "alpha_min") else {} for knob in KNOBS}
-        exact = {knob: replace(workload, options=replace(workload.options, **most[knob])) for knob in KNOBS}
-        truths = {knob: compute_truth(exact[knob]) for knob in KNOBS}
-        found = {
-            variant: first_run(workload, truths[next(iter(variant.changes))], variant) for variant in turned_knobs()
-        }
-        time_all(workload, found)
-        results += found.values()
-        say(f"{workload.name}: knobs measured in {time.perf_counter() - start:.0f} s")
-    return results
-
-
-def _plain(value) -> str:
-    if value is None:
-        return "none"
-    return value if isinstance(value, str) else f"{value:.4g}"

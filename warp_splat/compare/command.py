@@ -6,7 +6,8 @@ from pathlib import Path
 
 import torch
 
-from warp_splat.compare import adjoints, plots, trained
+from warp_splat.compare import adjoints
+from warp_splat.compare.plots import plot_errors
 from warp_splat.compare.stability import cases
 from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
@@ -16,7 +17,6 @@ from warp_splat.formats.files import atomic_write, write_csv, write_json, write_
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch, pool
-from warp_splat.scene.types import Scene
 
 DIRECTIONS = 4  # per parameter
 
@@ -30,8 +30,8 @@ def run(config: CompareConfig) -> int:
     unknown = [mode for mode in config.modes if mode not in ADJOINTS]
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")
-    if config.stability and (config.scene or config.full):
-        raise InputError("--scene, --full: these belong to the comparison without --stability.")
+    if config.stability and config.scene:
+        raise InputError("--scene: expected none with --stability, whose cases are made up.")
     if config.stability and config.device == "cuda":
         raise InputError("--device cuda: --stability computes on the CPU only; use --device cpu.")
     scenes = {} if config.stability else named_scenes(config.scene, print)
@@ -50,8 +50,7 @@ def run(config: CompareConfig) -> int:
     if config.stability:
         code = int(cases.run_cases(out, config.modes, say) > 0)
     else:
-        _compare_pixel_loops(config, scenes, device, out, say)
-        trained.run_trainings(out, config.modes, scenes, config.full, say, device.type)
+        _compare_modes(all_workloads(scenes, device, say), config.modes, out, say)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
     name = "stability" if config.stability else "compare"
@@ -60,43 +59,19 @@ def run(config: CompareConfig) -> int:
     return code
 
 
-def _compare_pixel_loops(
-    config: CompareConfig, scenes: dict[str, Scene], device: torch.device, out: Path, say: Callable[[str], None]
-) -> None:
-    """Adjoints on every workload; knobs on the layered scene and those trained longest."""
+def _compare_modes(workloads: list[Workload], modes: list[str], out: Path, say: Callable[[str], None]) -> None:
+    """Adjoints on every workload; for the scenes in training, the whole image's gradients by finite differences."""
     print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
-    workloads = all_workloads(scenes, device, say)
-    measured = adjoints.run_adjoints(workloads, config.modes, say)
+    measured, checks = adjoints.run_adjoints(workloads, modes, say), {}
     say(f"\n{adjoints.adjoint_table(measured)}\n")
-    _write(out, "adjoints", measured)
-    plots.plot_errors(out / "adjoints.png", measured)
-    plots.plot_memory(out / "memory.png", measured)
-    plots.plot_stages(out / "stages.png", measured, config.modes)
-    _check_directions(workloads, out, say)
-    turned = adjoints.run_knobs(_for_knobs(workloads), say)
-    say(f"\n{adjoints.knob_table(turned)}\n")
-    _write(out, "knobs", turned)
-    plots.plot_knobs(out / "knobs.png", turned)
-
-
-def _check_directions(workloads: list[Workload], out: Path, say: Callable[[str], None]) -> None:
-    """The gradients of the whole image against finite differences, for the scenes in training."""
-    found = {}
+    write_csv(out / "adjoints.csv", adjoints.records(measured))
+    write_json(out / "adjoints.json", [asdict(item) for item in measured])
+    plot_errors(out / "adjoints.png", measured)
     for workload in workloads:
         if "," in workload.name:
             *geometry, sh_dc, sh_rest = workload.gaussians
             scene = (*geometry, (sh_dc, sh_rest), workload.camera, workload.background)
             check = check_gradients(*scene, options=workload.options, directions=DIRECTIONS)
             say(f"{workload.name}: along random directions, against finite differences\n\n{check}\n")
-            found[workload.name] = [asdict(row) for row in check.rows]
-    write_json(out / "directions.json", found)
-
-
-def _for_knobs(workloads: list[Workload]) -> list[Workload]:
-    last = {workload.name.split(",")[0]: workload for workload in workloads if "," in workload.name}
-    return [workload for workload in workloads if workload.name == "1000 layers"] + list(last.values())
-
-
-def _write(out: Path, name: str, measured: list[adjoints.Measurement]) -> None:
-    write_csv(out / f"{name}.csv", adjoints.records(measured))
-    write_json(out / f"{name}.json", [asdict(item) for item in measured])
+            checks[workload.name] = [asdict(row) for row in check.rows]
+    write_json(out / "directions.json", checks)

@@ -10,10 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from warp_splat.compare import plots
 from warp_splat.compare.stability import arithmetic, pixel_loop, shapes
 from warp_splat.compare.stability.verdict import EPS, Case, Outcome
-from warp_splat.evaluation import report
 from warp_splat.formats.files import write_csv, write_json
 from warp_splat.text import format_table
 
@@ -38,10 +36,10 @@ class Row:
 
 
 def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = print) -> int:
-    """Measure every case in every mode; print the table, write it and the plot.
+    """Measure every case in every mode; print the table and write it.
 
     Args:
-        out: folder for ``stability.json``, ``stability.csv`` and ``stability.png``.
+        out: folder for ``stability.json`` and ``stability.csv``.
         modes: of the adjoint, some of ``warp_splat.config.ADJOINTS``.
         say: prints a line.
 
@@ -56,7 +54,6 @@ def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = prin
                 say(f"{row.case.name} {mode}: {'; '.join(outcome.failures)}")
     out.mkdir(parents=True, exist_ok=True)
     _write(out, rows)
-    plot(out / "stability.png", rows)
     failed = sum(bool(outcome.failures) for row in rows for outcome in row.outcomes.values())
     say(f"{failed} of {sum(len(row.outcomes) for row in rows)} verdicts failed.")
     return failed
@@ -97,24 +94,3 @@ def _write(out: Path, rows: Sequence[Row]) -> None:
     }
     write_json(out / "stability.json", measured)
     write_csv(out / "stability.csv", [{**line, "failures": "; ".join(line["failures"])} for line in flat])
-
-
-def plot(path: Path, rows: Sequence[Row]) -> None:
-    """Draw the growth of rounding along a chain against its bound, and the error of two formulas for a determinant."""
-    chain = plots.Panel("error of gradients and of T, n layers", "n")
-    outcomes = {row.case.name: row.outcomes for row in rows}
-    lengths, modes = list(pixel_loop.CHAINS), list(outcomes[f"chain_{pixel_loop.CHAINS[0]}"])
-    chain.line("n eps", lengths, [n * EPS for n in lengths], color=report.INK, lw=1.0, ls="--")
-    for place, mode in enumerate(modes):
-        # side by side, or equal errors would hide each other
-        shifted = [n * 1.25 ** (place - 0.5 * (len(modes) - 1)) for n in lengths]
-        chain.marks(mode, shifted, [outcomes[f"chain_{n}"][mode].gradient_error for n in lengths], plots.STYLES[mode])
-    recovered = [arithmetic.recovery_error(n) for n in lengths]
-    chain.line("T recovered", lengths, recovered, color="#999999", lw=1.2)
-    needle = plots.Panel("error of det, worst of all angles", "scale ratio of the needle")
-    for name, errors in arithmetic.determinant_errors().items():
-        label, style = {"usual": ("a c - b²", "stepwise"), "ours": ("sum of squares", "manual")}[name]
-        needle.marks(label, arithmetic.RATIOS, errors, plots.STYLES[style], ls="-")
-    needle.line("", arithmetic.RATIOS, [1.0] * len(arithmetic.RATIOS), color=report.INK, ls="--")
-    needle.notes.append(((arithmetic.RATIOS[0], 1.0), "no digit right", (0, 4), "left"))
-    plots.draw_panels(path, [chain, needle], 2, 2.8)

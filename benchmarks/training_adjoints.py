@@ -8,6 +8,8 @@ the embedded scene hold some hundreds, so smaller caps are tried, too.
 The short schedule is that of the embedded scene shrunk to 300 steps: densification at steps 100 and 150, the SH degree
 up every 100 steps, the rate of the means at its end at step 300. PSNR is measured 12 times, on 8 held-out views at most
 (all 7 of the embedded scene); time is that of training steps alone. Adjoints take three seeds, the others the first.
+
+    python benchmarks/training_adjoints.py [-s SCENE] [--full] [--out docs/compare]
 """
 
 import itertools
@@ -21,9 +23,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from common import SCENE, option, parse, transcribe
+from panels import Panel, draw_panels
 
-from warp_splat.compare import plots
-from warp_splat.compare.workloads import CAPS, SHORT
+from warp_splat.compare.workloads import CAPS, SHORT, named_scenes
+from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import psnr, ssim
@@ -79,7 +83,6 @@ def run_trainings(
     scenes: Mapping[str, Scene],
     full: bool = False,
     say: Callable[[str], None] = print,
-    device: str = "cpu",
 ) -> dict[str, Any]:
     """Train all variants: about three minutes on two cores for four modes, an hour with ``full``.
 
@@ -89,7 +92,6 @@ def run_trainings(
         scenes: by name, with views held out.
         full: train by the embedded scene's whole schedule instead of the short one.
         say: receives a line for each run when those of its seed are done, and the tables.
-        device: to train on.
 
     Returns:
         ``schedule``, ``runs``, ``summary`` (by variant) and ``equality`` (by scene), as written to training.json.
@@ -98,7 +100,7 @@ def run_trainings(
         InputError: if a file cannot be written.
     """
     out, names = Path(out), list(dict.fromkeys(("manual", *modes)))
-    schedule = {**(EMBEDDED_DEFAULTS[""] if full else SHORT), "device": device}
+    schedule = EMBEDDED_DEFAULTS[""] if full else SHORT
     variants: dict[str, dict[str, Any]] = {name: {"adjoint": name} for name in names}
     variants |= {f"cap {cap}": {"max_steps": cap} for cap in CAPS} | {"ellipsoid": {"projection": "ellipsoid"}}
     results: dict[str, Any] = {"schedule": schedule, "runs": [], "summary": [], "equality": {}}
@@ -265,7 +267,7 @@ def plot_modes(path: Path, runs: Sequence[Trained], modes: Sequence[str]) -> Non
     """Draw PSNR over iterations and over seconds of training steps, by scene: each seed thin, their mean bold."""
     panels = []
     for scene, key in itertools.product(dict.fromkeys(r.scene for r in runs), ("iteration", "seconds")):
-        panels.append(panel := plots.Panel(f"{scene}: test PSNR [dB]", key))
+        panels.append(panel := Panel(f"{scene}: test PSNR [dB]", key))
         for mode, (color, dash) in zip(modes, STYLES, strict=False):
             histories = [r.history for r in runs if (r.scene, r.variant, r.refused) == (scene, mode, "")]
             curves = [[[record[k] for record in history] for k in (key, "psnr")] for history in histories]
@@ -273,7 +275,7 @@ def plot_modes(path: Path, runs: Sequence[Trained], modes: Sequence[str]) -> Non
                 panel.line("", x, y, color=color, lw=0.5, alpha=0.5)
             if curves:
                 panel.line(mode, *np.mean(curves, 0), ls=dash, color=color, lw=1.8)
-    plots.draw_panels(path, panels, 2, 2.8, xscale="linear", yscale="linear")
+    draw_panels(path, panels, 2, 2.8, xscale="linear", yscale="linear")
 
 
 def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Trained]) -> None:
@@ -285,3 +287,18 @@ def plot_cap(path: Path, views: Sequence[View], runs: Sequence[Trained]) -> None
     renders = {"no cap": of["manual"][index], **{k: of[k][index] for k in (cap, f"{cap}, rendering only")}}
     rows = [(name, photo, render, f"{psnr(render, photo):.2f} dB") for name, render in renders.items()]
     report.contact_sheet(path, {"": rows})
+
+
+def main() -> None:
+    full = option("--full", action="store_true", help="train by the whole schedule instead of 300 steps")
+    arguments = parse(__doc__, SCENE, full)
+    scenes = named_scenes(str(arguments.scene or ""), print)
+
+    def measure(out: Path, say: Callable[[str], None]) -> None:
+        run_trainings(out, ADJOINTS, scenes, arguments.full, say)
+
+    transcribe("training", arguments.out, measure)
+
+
+if __name__ == "__main__":
+    main()
