@@ -210,6 +210,13 @@ class ConvertConfig:
 
 
 @dataclass
+class MergeConfig:
+    """Trainings of the blocks of a scene (train --block) to make one model of."""
+
+    folder: str = argument("the folder that holds those of their trainings; the model is written here")
+
+
+@dataclass
 class SimplifyConfig(FinishedModel):
     """A model to make smaller."""
 

@@ -37,8 +37,7 @@ def merged(splats: SplatArrays, count: int, cameras: Sequence[Camera]) -> tuple[
         splats.means[rest].astype(np.float64), importance(bounded, cameras)[rest], count - len(alone)
     )
     order, starts = np.append(alone, rest[order]), np.append(np.arange(len(alone)), len(alone) + starts)
-    ordered, bounded = (SplatArrays(*(array[order] for array in arrays)) for arrays in (splats, bounded))
-    return ordered, _matched(bounded, starts), starts
+    return splats.take(order), _matched(bounded.take(order), starts), starts
 
 
 def importance(splats: SplatArrays, cameras: Sequence[Camera]) -> np.ndarray:

@@ -48,7 +48,7 @@ def shown(splats: SplatArrays, most: int = 0) -> SplatArrays:
     rows = np.flatnonzero((opacities >= ALPHA_MIN) & splats.quats.any(axis=1))
     if 0 < most < len(rows):
         rows = np.sort(rows[np.argsort(-sizes(splats)[rows], kind="stable")[:most]])
-    return SplatArrays(*(array[rows] for array in splats))
+    return splats.take(rows)
 
 
 def texels(coefficients: int) -> int:
@@ -65,7 +65,7 @@ def parts(splats: SplatArrays, origin: np.ndarray, coarse: SplatArrays | None = 
         coarse: CHUNK others of degree 0, which become the first part.
     """
     starts = range(0, max(1, len(splats.means)), CHUNK)
-    chunks = [SplatArrays(*(array[start : start + CHUNK] for array in splats)) for start in starts]
+    chunks = [splats.take(slice(start, start + CHUNK)) for start in starts]
     if coarse is not None:
         chunks = [coarse, *chunks]
     found = {f"gaussians{index}": _compressed(_core(chunk, origin)) for index, chunk in enumerate(chunks)}

@@ -42,5 +42,4 @@ def keys_of(means: torch.Tensor, rows: Rows = ALONE) -> torch.Tensor:
 
 def arranged(splats: SplatArrays) -> SplatArrays:
     """The Gaussians in the order of :func:`along_curve`."""
-    order = along_curve(torch.from_numpy(splats.means)).numpy()
-    return SplatArrays(*(array[order] for array in splats))
+    return splats.take(along_curve(torch.from_numpy(splats.means)).numpy())

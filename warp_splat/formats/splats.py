@@ -29,6 +29,10 @@ class SplatArrays(NamedTuple):
     scales: np.ndarray  # [N, 3] natural logarithms of world units
     quats: np.ndarray  # [N, 4] w x y z, not necessarily of unit length
 
+    def take(self, rows: np.ndarray | slice) -> "SplatArrays":
+        """Some of the Gaussians."""
+        return SplatArrays(*(array[rows] for array in self))
+
 
 class SplatFile(NamedTuple):
     """What a file of Gaussians says."""
@@ -57,7 +61,7 @@ def finite_rows(splats: SplatArrays, path, report: Report) -> SplatArrays:
     if finite.all():
         return splats
     report(f"{path}: left out {np.count_nonzero(~finite)} of {count} Gaussians with values that are not finite.")
-    return SplatArrays(*(array[finite] for array in splats))
+    return splats.take(finite)
 
 
 def sizes(splats: SplatArrays) -> np.ndarray:

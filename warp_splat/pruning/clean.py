@@ -21,7 +21,7 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.pruning.opened import Opened, output_of, print_quality, write
 from warp_splat.pruning.score import ViewSetting, weights
-from warp_splat.pruning.thinning import model_of, rows_of, tuned
+from warp_splat.pruning.thinning import model_of, tuned
 
 SHOWN = 3  # views on the sheet: those that changed most
 
@@ -39,7 +39,7 @@ def clean(config: CleanConfig) -> int:
     found = floaters(before, opened.setting, config.views, config.near)
     if found.all():
         raise InputError(f"{config.model}: nothing would be left; choose lower --views or --near.")
-    splats = rows_of(before, np.flatnonzero(~found))
+    splats = before.take(np.flatnonzero(~found))
     if config.steps:
         parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}

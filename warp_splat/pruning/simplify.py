@@ -16,7 +16,7 @@ from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
 from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
-from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, rows_of, tuned
+from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
 from warp_splat.rendering.changes import largest_change
 from warp_splat.rendering.finished import Finished
 from warp_splat.text import format_table
@@ -192,7 +192,7 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     require_some(finished)
     file = finished.file
     order = np.argsort(-sizes(file.splats), kind="stable")
-    keep = lambda count: rows_of(file.splats, np.sort(order[:count]))  # noqa: E731
+    keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, len(order), lambda count: written_bytes(output, file._replace(splats=keep(count))))
     write(output, file, keep(count))
     return 0

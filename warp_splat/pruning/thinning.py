@@ -33,11 +33,6 @@ LEARNED = {"pose", "sky"}  # parts of which the model has what they found
 NEVER = 2**31  # a step that does not come
 
 
-def rows_of(splats: SplatArrays, rows: np.ndarray) -> SplatArrays:
-    """Some of the Gaussians."""
-    return SplatArrays(*(array[rows] for array in splats))
-
-
 class Thinning:
     """The Gaussians of a model in the order in which it can do without them.
 
@@ -54,10 +49,10 @@ class Thinning:
         """The ``count`` that are needed most, in their order."""
         rows = self._kept[min(known for known in self._kept if known >= count)]
         while len(rows) > count:
-            model = model_of(rows_of(self.splats, rows), self.setting)
+            model = model_of(self.splats.take(rows), self.setting)
             rows = rows[_costliest(model, self.setting, max(count, math.ceil(AT_ONCE * len(rows)))).cpu().numpy()]
             self._kept[len(rows)] = rows
-        return rows_of(self.splats, rows)
+        return self.splats.take(rows)
 
 
 def model_of(splats: SplatArrays, setting: ViewSetting) -> GaussianModel:

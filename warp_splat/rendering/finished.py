@@ -101,6 +101,7 @@ class Finished:
             raise InputError(f"{self.path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
         flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
         names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
+        names["block"] = str(trained.get("block", ""))
         return load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
 
     def refined(self, scene: Scene) -> Scene:

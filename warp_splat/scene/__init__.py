@@ -44,6 +44,7 @@ def load_scene(
     invert_masks: bool = False,
     start: str = "",
     lens: str = "undistort",
+    block: str = "",
     memory: float | None = None,
     report: Report = print,
 ) -> Scene:
@@ -60,6 +61,7 @@ def load_scene(
         start: a file of Gaussians to start from instead of the scene's points.
         lens: "undistort" resamples photographs with distortion as pinholes would have taken them; "native" keeps them,
             and their cameras have lenses.
+        block: "K/N": only the photographs and points of one of the N blocks into which the scene is cut.
         memory: bytes for photographs: those that do not fit are decoded whenever they are asked for, and of many even
             those that do only once they are. None: all are decoded now.
         report: called with a line for each thing that the user should know: undistortion, a choice of models, ...
@@ -83,6 +85,7 @@ def load_scene(
     elif not test:
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
+    from warp_splat.scene.blocks import block_of  # noqa: PLC0415  keeps `import warp_splat` light
     from warp_splat.scene.colmap import read_tracks  # noqa: PLC0415  keeps `import warp_splat` light
     from warp_splat.scene.decoding import load_views  # noqa: PLC0415
     from warp_splat.scene.start import load_start, random_points  # noqa: PLC0415
@@ -92,6 +95,15 @@ def load_scene(
         file, points, colors = load_start(start, report)
     elif drawn:
         points, colors = random_points([photo.camera for photo in train])
+    part = block_of(block, points, [photo.camera for photo in train]) if block else None
+    if part:
+        counts = len(train), len(points)
+        train, test = ([photo for photo in some if part.shown(photo.camera, points)] for some in (train, test))
+        if not train:
+            raise InputError(f"--block {block}: expected photographs that show it, found none; take fewer blocks.")
+        rows = part.starts([photo.camera for photo in train], points)
+        points, colors, file = points[rows], colors[rows], file and file._replace(splats=file.splats.take(rows))
+        report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")
     require_visible(train, points, start or source)
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
     train_views, test_views = views[: len(train)], views[len(train) :]
@@ -101,7 +113,7 @@ def load_scene(
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
     require_one_kind([(view.name, view.linear) for view in train_views + test_views], source)
     tracks = partial(read_tracks, Path(source)) if takes_colmap(Path(source)) else dict
-    return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source), bound)
+    return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source), bound, part)
 
 
 def _drop_masked(views: list[View], source: str | Path, report: Report) -> list[View]:

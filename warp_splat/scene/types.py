@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
 from warp_splat.formats.coordinates import UP, read_coordinates
 from warp_splat.formats.splats import SplatFile
+
+if TYPE_CHECKING:
+    from warp_splat.scene.blocks import Block
 
 
 def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -132,6 +135,7 @@ class Scene:
     find_tracks: Callable[[], dict[str, Sightings]] = dict  # by the names of views
     source: Path | None = None  # its folder
     memory: PhotoMemory = field(default_factory=PhotoMemory)
+    block: "Block | None" = None  # that it is, of a larger scene
 
     @cached_property
     def tracks(self) -> dict[str, Sightings]:

@@ -59,6 +59,8 @@ def _train(config: TrainConfig, processes: Processes) -> int:
         config = plan_training(scene, config, processes, say)
     config, weighed = settle_parts(config, scene, processes, say)
     trainer = Trainer(scene, config, processes)
+    if config.data.block and (learned := list(trainer.optimizer.parts)):
+        raise InputError(f"--block: expected no part that learns, got {learned[0]}: each block would learn another.")
     trainer.told = weighed + trainer.told
     _tell(trainer, run, say)
     with model_folder.claimed(run.folder) if processes.rank == 0 else nullcontext(), _memory_explained(trainer):

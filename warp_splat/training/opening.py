@@ -117,7 +117,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     start = data.start_ply if not begun or os.path.isfile(data.start_ply) else ""  # if it has gone
     same = {
         name: getattr(data, name)
-        for name in ("images", "resolution", "white_background", "eval", "invert_masks", "lens")
+        for name in ("images", "resolution", "white_background", "eval", "invert_masks", "lens", "block")
     }
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)

@@ -32,6 +32,7 @@ class DataOptions:
     lens: str = data("undistort", "photographs with distortion: as pinholes would take them, or as is", choices=LENSES)
     loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=("srgb", "log"))
     start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
+    block: str = data("", "K/N: of the N blocks into which the scene is cut, train the K-th; see warp-splat merge")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")
 
 
@@ -219,6 +220,7 @@ FIXED_OPTIONS = {
     "optimizer_type": "the moments of one are not those of the other",
     "growth": "the statistics of one are not those of the other",
     "portable": "with it, kernels round otherwise",
+    "block": "its Gaussians are those of its block",
     "seed": "random numbers continue from the checkpoint's",
     "preset": "other options are those of the checkpoint; name the ones to change",
 }

@@ -24,6 +24,7 @@ from warp_splat.formats.exposures import write_exposures
 from warp_splat.formats.files import write_json
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
+from warp_splat.scene.blocks import write_block
 from warp_splat.text import format_table
 from warp_splat.training.config_file import OF_ONE_RUN
 from warp_splat.training.plan import as_flags
@@ -184,6 +185,8 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         "peak_memory_mb": peak_memory(),
         "dropped": run.dropped,
     }
+    if trainer.scene.block and run.iteration >= trainer.config.learn.end:
+        write_block(run.folder, trainer.scene.block)
     metrics, absent = choose_metrics(trainer.config.report.lpips_weights)
     for sentence in absent:
         say(sentence)

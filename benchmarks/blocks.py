@@ -1,0 +1,133 @@
+"""Blocks of a scene, trained apart and merged, against one training of all of it: what it costs at their borders.
+
+A made street of 400 photographs, and with -s a scene of photographs. All views are seen as often: a block with a third
+of the photographs trains a third of the steps. A pixel belongs to the cell in which the undivided model has its depth.
+A view looks across a border if a tenth of its pixels belong to other cells than most do; pixels within 3 of another
+cell's are those of a seam.
+
+    python benchmarks/blocks.py --models output/blocks [-s SCENE] [--blocks 4] [--out docs/benchmarks]
+"""
+
+from pathlib import Path
+
+import numpy as np
+from common import MODELS, SCENE, option, parse, run_training, write_table
+from scipy.ndimage import maximum_filter, minimum_filter
+from street import make_street
+
+from warp_splat.camera import Camera
+from warp_splat.color import to_bytes
+from warp_splat.config import MergeConfig
+from warp_splat.gaussians import GaussianModel
+from warp_splat.presets import PRESETS
+from warp_splat.rendering.finished import Finished
+from warp_splat.scene import load_scene
+from warp_splat.scene.blocks import Block, merge_blocks
+from warp_splat.scene.types import View
+from warp_splat.training.options import TrainConfig, schedule_of
+
+ACROSS, SEAM = 0.1, 3
+COLUMNS = {
+    **{"scene": "{scene}", "model": "{model}", "Gaussians": "{file}", "across": "{across:.2f}"},
+    **{"within": "{within:.2f}", "seams": "{seams:.2f}", "elsewhere": "{rest:.2f}"},
+    **{"starts from": "{largest}", "views": "{views}", "MB": "{mb:.0f}", "steps": "{steps}"},
+}
+
+
+def flags_of(source: Path, share: float, iterations: int, width: int) -> list:
+    """Of a training with a share of all views, its schedule as much shorter."""
+    fast = schedule_of(TrainConfig(**PRESETS["fast"]))
+    scale = share * iterations / fast["iterations"]
+    schedule = [word for name, steps in fast.items() for word in (f"--{name}", round(steps * scale))]
+    flags = ["-s", source, "-r", width, "--eval", "--preset", "fast", "--growth", "reference", "--device", "cpu"]
+    return [*flags, *schedule, "--threads", 1]
+
+
+def cells_in(camera: Camera, depth: np.ndarray, block: Block) -> np.ndarray:
+    """The number of the cell in which each pixel has its ``depth`` [H, W]; its shape."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    points = ((rays * depth[..., None]).reshape(-1, 3) - camera.translation) @ camera.rotation
+    held = [block._replace(number=number).holds(points) for number in range(len(block.cells))]
+    return np.argmax(held, 0).reshape(depth.shape)
+
+
+def errors_of(folder: Path, views: list[View]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The squared errors of each view [H, W], and its depths [H, W]."""
+    finished = Finished(folder)
+    draw, errors, depths = finished.renderer(GaussianModel.from_splats(finished.file.splats)), [], []
+    for view in views:
+        output = draw(view.camera, True)
+        difference = to_bytes(output.image, False) / 255.0 - view.picture / 255.0
+        errors.append((difference**2).mean(2))
+        depths.append(output.depth.numpy())
+    return errors, depths
+
+
+def decibels(errors: list) -> float:
+    """The mean PSNR of pictures, or of one list of pixels."""
+    return float(np.mean([-10 * np.log10(error.mean()) for error in errors])) if errors else float("nan")
+
+
+def compare(name: str, source: Path, models: Path, count: int, iterations: int, width: int) -> list[dict]:
+    """Rows of the table: trained as one, and as ``count`` blocks."""
+    whole, folder, trained = models / name / "whole", models / name / "blocks", []
+    load = lambda block: load_scene(source, eval=True, resolution=width, block=block, report=str)  # noqa: E731
+    scene, names = load(""), [f"{number + 1}/{count}" for number in range(count)]
+    result = run_training(whole, flags_of(source, 1.0, iterations, width))
+    records = [{"model": "one training", "largest": len(scene.points), "views": len(scene.train), "results": [result]}]
+    blocks = [load(block) for block in names]
+    for block, part in zip(names, blocks, strict=True):
+        flags = flags_of(source, len(part.train) / len(scene.train), iterations, width)
+        trained.append(run_training(folder / block.replace("/", "_"), [*flags, "--block", block]))
+    merge_blocks(MergeConfig(str(folder)))
+    largest = max(blocks, key=lambda part: len(part.points))
+    views = f"{min(len(part.train) for part in blocks)} to {max(len(part.train) for part in blocks)}"
+    records.append({"model": f"{count} blocks", "largest": len(largest.points), "views": views, "results": trained})
+    across, within, seams = [], [], []
+    for place, record in zip((whole, folder), records, strict=True):
+        errors, depths = errors_of(place, scene.test)
+        if not across and not within:
+            for index, depth in enumerate(depths):
+                cells = cells_in(scene.test[index].camera, depth, blocks[0].block)
+                (across if (cells != np.bincount(cells.ravel()).argmax()).mean() > ACROSS else within).append(index)
+                near = maximum_filter(cells, 2 * SEAM + 1) != minimum_filter(cells, 2 * SEAM + 1)
+                seams.append(near)
+        record |= {
+            "scene": f"{name}: {len(across)} of {len(scene.test)} across",
+            "file": len(Finished(place).file.splats.means),
+        }
+        record |= {"across": decibels([errors[i] for i in across]), "within": decibels([errors[i] for i in within])}
+        record["seams"] = decibels([np.concatenate([error[near] for error, near in zip(errors, seams, strict=True)])])
+        record["rest"] = decibels([np.concatenate([error[~near] for error, near in zip(errors, seams, strict=True)])])
+        record["mb"] = max(one["peak_memory_mb"] for one in record["results"])
+        record["steps"] = sum(one["iterations"] for one in record["results"])
+    return records
+
+
+def main() -> None:
+    arguments = parse(
+        __doc__,
+        MODELS,
+        SCENE,
+        option("--blocks", type=int, default=4),
+        option("--iterations", type=int, default=3600, help="of the undivided training"),
+        option("-r", "--resolution", type=int, default=160, help="width of the pictures [px]"),
+    )
+    make_street(arguments.models / "street" / "scene")
+    scenes = {"street": arguments.models / "street" / "scene"}
+    if arguments.scene:
+        scenes[arguments.scene.name] = arguments.scene
+    rest = (arguments.models, arguments.blocks, arguments.iterations, arguments.resolution)
+    records = [row for name, source in scenes.items() for row in compare(name, source.resolve(), *rest)]
+    note = (
+        f"PSNR [dB] of held-out views, {arguments.resolution} px wide, after {arguments.iterations} steps by --preset "
+        "fast and --growth reference, a block fewer in proportion to its photographs. Across: views of which a tenth "
+        f"or more lies in other cells than most of it; seams: pixels within {SEAM} of another cell's; starts from: "
+        "points of the largest block; MB: peak of the largest training; steps: of all trainings."
+    )
+    write_table("blocks", arguments.out, COLUMNS, records, note, {"records": records})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""Blocks of a scene: every place has one owner, photographs go where they look, and a merge is what its parts were."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from commands import SCENE, train
+from scene_files import LENS, texture, write_image
+
+from warp_splat.camera import Camera
+from warp_splat.cli import main
+from warp_splat.errors import InputError
+from warp_splat.formats.checkpoint import LAST
+from warp_splat.formats.ply import save_points
+from warp_splat.scene import load_scene
+from warp_splat.scene.blocks import FILE, block_of
+
+APART = 100.0
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
+def test_each_place_has_one_owner_and_each_block_its_share(count):
+    random = np.random.default_rng(0)
+    points = random.normal(size=(10_000, 3)) * (30, 1, 9)
+    camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(3), np.zeros(3))
+    blocks = [block_of(f"{number + 1}/{count}", points, [camera]) for number in range(count)]
+    places = np.concatenate(
+        [points, random.uniform(-1e6, 1e6, (10_000, 3)), blocks[0].cells.reshape(-1, 3)[:, [0, 1, 2]]]
+    )
+    places = places[np.abs(places).max(1) < 1e30]
+    assert (sum(block.holds(places).astype(int) for block in blocks) == 1).all()
+    shares = [block.holds(points).mean() for block in blocks]
+    np.testing.assert_allclose(shares, 1 / count, atol=1e-3)
+    up = blocks[0].cells[:, :, 1]  # y, as the camera says: nobody cuts there
+    assert len(np.unique(up)) == 2
+
+
+@pytest.fixture
+def two_things(tmp_path):
+    """Two clouds of points far apart, three photographs of each, and one between them that shows the second one."""
+    cloud = np.random.default_rng(0).uniform(-1, 1, (60, 3))
+    frames = []
+    for index, x in enumerate((0, 0, 0, APART, APART, APART, 0.6 * APART)):
+        matrix = np.eye(4)  # of OpenGL: it looks along -z
+        matrix[:3, 3] = x + 0.1 * index, 0, 6
+        if index == 6:
+            matrix[:3, :3], matrix[:3, 3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]], (0.6 * APART, 0, 0)
+        frames.append({"file_path": f"{index}.png", "transform_matrix": matrix.tolist()})
+        write_image(tmp_path / f"{index}.png", texture())
+    points = np.concatenate([cloud, cloud + np.array((APART, 0, 0))]).astype(np.float32)
+    save_points(tmp_path / "points.ply", points, np.zeros(points.shape, np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps({**LENS, "ply_file_path": "points.ply", "frames": frames}))
+    return tmp_path, points
+
+
+def test_a_block_has_what_shows_it(two_things):
+    folder, points = two_things
+    for block, names, own in (("1/2", "012", points[:60]), ("2/2", "3456", points[60:])):
+        scene = load_scene(folder, block=block)
+        assert [view.name for view in scene.train] == [f"{name}.png" for name in names]
+        np.testing.assert_array_equal(scene.points, own)
+
+
+@pytest.mark.parametrize("block", ["0/2", "3/2", "2", "a/b", "1/2/3", "-1/2", "/2", "1/1000", "2/100"])
+def test_a_block_that_cannot_be_is_refused(two_things, block):
+    with pytest.raises(InputError, match=f"--block {block}: expected"):
+        load_scene(two_things[0], block=block)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A training of the first of two blocks, to its end."""
+    folder = tmp_path_factory.mktemp("blocks") / "one"
+    assert train(folder, "--block", "1/2") == 0
+    return folder
+
+
+def put(trained, folder, *numbers):
+    """Trainings of blocks with the model of another."""
+    for number in numbers:
+        shutil.copytree(trained, folder / str(number))
+        facts = json.loads((trained / FILE).read_text())
+        (folder / str(number) / FILE).write_text(json.dumps({**facts, "number": int(number)}))
+
+
+def test_a_merge_of_one_model_by_blocks_is_that_model(trained, tmp_path, capsys):
+    """Whatever the cells are: nothing is lost, nothing comes twice. And render.py knows what to compare it with."""
+    put(trained, tmp_path, 0, 1)
+    for _ in range(2):  # again, after one block was trained anew
+        assert main(["merge", str(tmp_path)]) == 0
+    (ply,), (one,) = (list(place.glob("point_cloud/*/point_cloud.ply")) for place in (tmp_path, trained))
+    assert ply.read_bytes() == one.read_bytes()
+    cameras = [json.loads((place / "cameras.json").read_text()) for place in (tmp_path, trained)]
+    assert len(cameras[0]) == len(cameras[1]) == len(list((SCENE / "images").iterdir()))
+    assert main(["render", "-m", str(tmp_path), "--skip_train"]) == 0
+    assert "Holding out every 8th image by name" in capsys.readouterr().out
+
+
+def spoil(old, new, name=FILE):
+    def change(folder):
+        path = folder / "1" / name
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    return change
+
+
+#: What a merge finds: the numbers of the blocks, and what is wrong with them.
+WRONG = {
+    "found none": ((), None),
+    "found a training": ((0, 1), lambda folder: (folder / LAST).touch()),
+    "found 0 of block 2/2": ((0,), None),
+    "found 2 of block 1/2, 0 of block 2/2": ((0, "00"), None),
+    "expected the number of blocks of": ((0, 1), spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], ')),
+    "expected the cells of": ((0, 1), spoil("3.4", "3.1")),
+    "expected the antialiasing of": ((0, 1), spoil("antialiasing=False", "antialiasing=True", "cfg_args")),
+    "expected a block as training writes it": ((0, 1), spoil('"number"', '"numbers"')),
+}
+
+
+@pytest.mark.parametrize("found", WRONG)
+def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
+    numbers, spoiled = WRONG[found]
+    put(trained, tmp_path, *numbers)
+    if spoiled:
+        spoiled(tmp_path)
+    assert found in fails("merge", tmp_path)
+
+
+def test_what_a_block_cannot_have(trained, tmp_path, fails):
+    assert "expected no part that learns" in fails(
+        "train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts", "exposure"
+    )
+    assert "--block 2/2: expected 1/2" in fails("train", "--resume", trained, "--block", "2/2")
