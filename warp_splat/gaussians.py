@@ -10,9 +10,10 @@ import torch
 from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
-from warp_splat.formats.curve import ALONE, arranged, keys_of
-from warp_splat.formats.exchange import load_gaussians, save_gaussians
-from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.curve import ALONE, along_curve, keys_of
+from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.ply import save_ply_parts
+from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.falloff import LN_2
 from warp_splat.kernels.harmonics import C0
@@ -22,6 +23,7 @@ from warp_splat.runtime.launch import arrays_of, launch_in_lanes
 from warp_splat.runtime.rows import Rows
 
 INITIAL_OPACITY = 0.1
+CHUNK = 2**16  # Gaussians that are taken at once, where all together would take much memory
 SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance to the nearest points
 
 
@@ -56,6 +58,21 @@ class Activate(torch.autograd.Function):
         outputs = [torch.empty_like(tensor) for tensor in ctx.saved_tensors]
         _launch_activation(make_adj_activate, [*ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs)], outputs)
         return tuple(outputs)
+
+
+class Taken(torch.autograd.Function):
+    """Some rows of a leaf, whose gradient holds those rows alone."""
+
+    @staticmethod
+    def forward(ctx, leaf, rows):
+        ctx.rows, ctx.shape = rows, leaf.shape
+        return leaf[rows]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, adj_rows):
+        known = {"is_coalesced": True, "check_invariants": False}  # indices ascend
+        return torch.sparse_coo_tensor(ctx.rows[None], adj_rows, ctx.shape, **known), None
 
 
 class GaussianModel:
@@ -124,18 +141,24 @@ class GaussianModel:
         )
 
     def gradients(self, degree: int) -> list[torch.Tensor]:
-        """The gradients, without those of the SH coefficients above ``degree``, which are zero. Views, not copies."""
+        """The gradients, without those of the SH coefficients above ``degree``, which are zero. Views, not copies.
+
+        Nor sparse ones, which are of one image.
+        """
         found = {name: leaf.grad for name, leaf in self.parameters.items() if leaf.grad is not None}
+        found = {name: grad for name, grad in found.items() if not grad.is_sparse}
         if "sh_rest" in found:
             found["sh_rest"] = found["sh_rest"][:, : (degree + 1) ** 2 - 1]
         return list(found.values())
 
-    def activated(self, degree: int | None = None) -> Gaussians:
-        """As the renderer takes them.
+    def activated(self, degree: int | None = None, rows: torch.Tensor | None = None) -> Gaussians:
+        """As the renderer takes them; with ``rows`` (indices) only those, and gradients are sparse.
 
         At ``degree`` 0, sh_rest is empty, so that none of the 45 numbers gets a gradient.
         """
         raw = self.parameters
+        if rows is not None:
+            raw = {name: Taken.apply(leaf, rows) for name, leaf in raw.items()}
         return Gaussians(
             raw["means"],
             raw["quats"],
@@ -144,17 +167,18 @@ class GaussianModel:
             raw["sh_rest"].detach()[:, :0] if degree == 0 else raw["sh_rest"],
         )
 
-    def splats(self) -> SplatArrays:
-        """The Gaussians as files have them."""
-        raw = {name: tensor.detach().cpu() for name, tensor in self.parameters.items()}  # the device may be full
+    def splats(self, rows: torch.Tensor | slice = slice(None)) -> SplatArrays:
+        """The Gaussians, or some ``rows``, as files have them."""
+        raw = {name: tensor.detach()[rows].cpu() for name, tensor in self.parameters.items()}  # the device may be full
         sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
         return SplatArrays(
             *(tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
         )
 
     def save(self, path: Path, antialiased: bool = False) -> None:
-        """Write a file of Gaussians, arranged: a PLY file in the reference's layout, or what else the name asks for."""
-        save_gaussians(path, SplatFile(arranged(self.splats()), antialiased))
+        """Write a PLY file in the reference's layout, arranged; a part after another, since memory may be short."""
+        parts = along_curve(self.parameters["means"].cpu()).split(CHUNK)
+        save_ply_parts(path, len(self), map(self.splats, parts), antialiased)
 
     @classmethod
     def load(cls, path: Path) -> GaussianModel:

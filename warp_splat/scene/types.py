@@ -17,6 +17,8 @@ from warp_splat.formats.splats import SplatFile
 if TYPE_CHECKING:
     from warp_splat.scene.blocks import Block
 
+EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
+
 
 def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Which of ``points`` [P, 3] show inside the camera's image, [P] bool: of a pinhole, those in front of it."""
@@ -160,8 +162,8 @@ class Scene:
 
     @property
     def evaluated(self) -> tuple[str, list[View]]:
-        """The views to judge by, with their name: those held out, or those for training if none are."""
-        return ("test", self.test) if self.test else ("train", self.train)
+        """The views to judge by, with their name: those held out; if none are, those for training, or EVALUATED."""
+        return ("test", self.test) if self.test else ("train", self.train[:: -(-len(self.train) // EVALUATED)])
 
     @property
     def extent(self) -> float:

@@ -136,7 +136,8 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say)
     if viewer:
         viewer.show_end()
     run.gaussians = trainer.processes.total(len(trainer.model))
-    trainer.model = trainer.model.arranged(trainer.processes)  # as in the file: at one depth, the first is in front
+    # as in the file: at one depth, the first is in front
+    trainer.optimizer.arrange(trainer.model.arranging(trainer.processes, [len(trainer.model)]))
     trainer.lead(lambda: finish(trainer, run, say))
     if viewer and run.iteration >= end:
         viewer.linger()

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ import torch
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
+from warp_splat.runtime.mapped import zeros_in_file
 from warp_splat.training.adam_step import HALF, load_adam, move
 from warp_splat.training.options import LearnOptions
 
@@ -59,20 +61,31 @@ class Optimizer:
             and forgets as much, as ``batch`` steps of one image.
         parts: groups of what parts learn, each with ``name``, ``params`` (one leaf of at least one axis) and ``lr``, a
             number or a function of the iteration; they learn in every step.
+        folder: where the Gaussians' parameters and moments live, in files; without it, in memory.
 
     Raises:
         InputError: if a leaf of a part is not dense float32.
     """
 
     def __init__(
-        self, model: GaussianModel, options: LearnOptions, extent: float, batch: int = 1, parts: Sequence[dict] = ()
+        self,
+        model: GaussianModel,
+        options: LearnOptions,
+        extent: float,
+        batch: int = 1,
+        parts: Sequence[dict] = (),
+        folder: Path | None = None,
     ):
+        self.folder = folder
         self.model, self.options, self.extent, self.scale = model, options, extent, math.sqrt(batch)
         self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
         for name, leaf in self.parts.items():
             if leaf.dtype != torch.float32 or not leaf.is_contiguous():
                 raise InputError(f"parameters of a part: expected dense float32, got {name} of {leaf.dtype}.")
         self.tables = {name: Table(leaf) for name, leaf in model.parameters.items()}
+        if folder:
+            for name, leaf in model.parameters.items():
+                self._put(name, self._zeros(leaf.shape).copy_(leaf.detach()), [])
         self.tables |= {group["name"]: Table(group["params"][0], group["lr"]) for group in parts}
         self.betas, self.eps = tuple(power(beta, batch) for beta in BETAS), EPS / self.scale
         self.set_iteration(0)
@@ -129,34 +142,59 @@ class Optimizer:
 
         With ``radii`` only on rows that are drawn, and without bias correction, as the reference's sparse_adam.
         """
-        moved, numbers, (beta1, beta2) = [], [], self.betas
+        moved, numbers, homes, shown, (beta1, beta2) = [], [], [], None, self.betas
         for name in names:
             table, grad, biases = self.tables[name], self.tables[name].leaf.grad, (1.0, 1.0)
-            table.moments = table.moments or [torch.zeros_like(table.leaf, dtype=self._kept_as(name)) for _ in MOMENTS]
+            table.moments = table.moments or [self._zeros(table.leaf.shape, self._kept_as(name)) for _ in MOMENTS]
             if radii is None:
                 table.steps += 1
             if grad is not None and grad.numel() > 0:  # degree 0: zeros would change nothing but the count
                 if radii is None:
                     biases = [1.0 - power(beta, table.steps) for beta in self.betas]
-                moved.append([table.leaf.detach(), grad.contiguous(), *table.moments])
+                tensors = [table.leaf.detach(), *table.moments]
+                if grad.is_sparse:  # only rows that the view shows are taken out of their file, and put back
+                    homes.append(tensors)
+                    shown, grad = grad._indices()[0], grad._values()
+                    tensors = [tensor[shown] for tensor in tensors]
+                moved.append([tensors[0], grad.contiguous(), *tensors[1:]])
                 rates = [table.rate / biases[0], self.eps, 1.0 / math.sqrt(biases[1])]
                 numbers.append([*rates, beta1, 1 - beta1, beta2, 1 - beta2])
-        if moved:
+        if shown is not None and radii is not None:
+            rows, radii = len(shown), radii[shown]
+        if moved and rows:
             move(moved, numbers, rows, radii, self.iteration)
+        for tensors, (values, _, *moments) in zip(homes, moved, strict=False):
+            for tensor, found in zip(tensors, (values, *moments), strict=True):
+                tensor.index_copy_(0, shown, found)
 
     def _kept_as(self, name: str) -> torch.dtype:
         """The type of a parameter's moments."""
         return HALF if self.options.half_moments and name not in self.parts else torch.float32
 
+    def _zeros(self, shape: Sequence[int], dtype: torch.dtype = torch.float32) -> torch.Tensor:
+        if self.folder:
+            return zeros_in_file(self.folder, shape, dtype)
+        return torch.zeros(*shape, dtype=dtype, device=self.model.device)
+
+    def _taken(self, tensor: torch.Tensor, rows: torch.Tensor, more: int = 0) -> torch.Tensor:
+        """The ``rows`` of a table, and zeros for some more."""
+        found = self._zeros((len(rows) + more, *tensor.shape[1:]), tensor.dtype)
+        torch.index_select(tensor, 0, rows, out=found[: len(rows)])
+        return found
+
     def replace(self, kept: torch.Tensor, added: dict[str, torch.Tensor]) -> None:
         """Keep the rows ``kept`` (indices), then append ``added`` (name -> rows) with zero moments."""
         for name in self.model.NAMES:
-            table, rows, nothing = self.tables[name], added[name], torch.zeros_like(added[name])
-            moments = [torch.cat([moment[kept], nothing.to(moment)]) for moment in table.moments]
-            self._put(name, torch.cat([table.leaf.detach()[kept], rows]), moments)
+            table, rows = self.tables[name], added[name]
+            values, *moments = (self._taken(old, kept, len(rows)) for old in (table.leaf.detach(), *table.moments))
+            values[len(kept) :] = rows
+            self._put(name, values, moments)
 
     def arrange(self, moved: Callable[[torch.Tensor], torch.Tensor]) -> None:
         """Put the rows, moments and all, into the order that ``moved`` gives them."""
+        if self.folder:
+            order = moved(torch.arange(len(self.model)))
+            moved = lambda rows: self._taken(rows, order)  # noqa: E731
         for name in self.model.NAMES:
             table = self.tables[name]
             self._put(name, moved(table.leaf.detach()), [moved(moment) for moment in table.moments])
@@ -180,7 +218,10 @@ class Optimizer:
         for name, table in self.tables.items():
             found[f"parameters.{name}"] = table.leaf.detach()
             if table.leaf.grad is not None:
-                found[f"gradients.{name}"] = table.leaf.grad
+                grad = table.leaf.grad
+                if grad.is_sparse:
+                    grad = self._zeros(grad.shape).index_copy_(0, grad._indices()[0], grad._values())
+                found[f"gradients.{name}"] = grad
             if table.moments:
                 found |= {f"{kind}.{name}": m.to(table.leaf) for kind, m in zip(MOMENTS, table.moments, strict=True)}
                 found[f"images.{name}"] = torch.tensor(table.steps * self.batch, dtype=torch.float64)
@@ -196,9 +237,7 @@ class Optimizer:
             moments = MOMENTS if any(f"{moment}.{name}" in arrays for moment in MOMENTS) else ()
             gradients = ("gradients",) if f"gradients.{name}" in arrays else ()
             found = {
-                kind: torch.empty(shape, device=table.leaf.device).copy_(
-                    torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape))
-                )
+                kind: self._zeros(shape).copy_(torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape)))
                 for kind in ("parameters", *gradients, *moments)
             }
             if name in self.parts:

@@ -148,6 +148,9 @@ class MachineOptions:
     )
     threads: int = machinery(0, "CPU threads of a process; 0: all cores, or its share (results do not depend on it)")
     shard: bool = machinery(False, "each process that torchrun starts holds a share of the Gaussians, not all of them")
+    out_of_core: bool = machinery(
+        False, "keep the Gaussians in a file in the output folder, in memory what views show; with sparse_adam"
+    )
     portable: bool = machinery(
         False, "multiply and add apart, as processors without fused multiply-adds do: slower, the same bytes there, too"
     )

@@ -169,6 +169,8 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     with run.saved.open("rb") as file:
         run.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     split, views = trainer.scene.evaluated
+    if split == "train" and len(views) < len(trainer.scene.train):
+        say(f"Evaluating {len(views)} of {len(trainer.scene.train)} training views (--eval holds some out instead).")
     write_json(run.folder / "history.json", run.history)  # now, since the evaluation may fail
     plot = run.folder / "training.png"
     if run.history:  # none, if it was stopped before the first evaluation and goes no further

@@ -18,7 +18,8 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.ply import save_ply_parts
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.gaussians import GaussianModel
+from warp_splat.gaussians import CHUNK, GaussianModel
+from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.data import Dropped, Splats2D
 from warp_splat.raster.project import project
 from warp_splat.runtime.shards import Shards
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 WIDTHS = (2, 3, 1, 3, 1, 2, 1)  # columns of a splat that travels: 52 bytes
 LEARNED = 5  # of these tensors: their gradients travel back, 40 bytes
-CHUNK = 2**16  # Gaussians that travel at once to be saved
 
 
 class Observed(NamedTuple):
@@ -39,6 +39,13 @@ class Observed(NamedTuple):
     means2d: torch.Tensor  # [n, 2], with a gradient
     radii: torch.Tensor  # [n]
     image: torch.Tensor  # [H, W, 3], of which there is but the shape
+
+    @classmethod
+    def of_all(cls, out: RenderOutput, rows: torch.Tensor, count: int) -> Observed:
+        """What ``out`` shows of ``rows`` alone, among ``count`` Gaussians."""
+        means2d, radii = out.means2d.new_empty(count, 2), out.radii.new_zeros(count)
+        means2d.grad = means2d.new_zeros(count, 2).index_copy_(0, rows, out.means2d.grad)
+        return cls(means2d, radii.index_copy_(0, rows, out.radii), out.image)
 
 
 class Blocks:

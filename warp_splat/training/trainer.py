@@ -19,12 +19,14 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.curve import along_curve
 from warp_splat.formats.exposures import Exposures
+from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.gaussians import GaussianModel
+from warp_splat.gaussians import CHUNK, GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians, Room, Splats2D
+from warp_splat.raster.project import project
 from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.distributed import ALONE, Processes
@@ -89,7 +91,8 @@ class Trainer:
         setting = Setting(scene, self.model, self.background, processes, seed, limit, config.learn.iterations)
         self.parts = [PARTS[name].load()(config.plugins[name], setting) for name in config.used_parts]
         groups = [group for parameters in having(self.parts, "parameters") for group in parameters()]
-        self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.images, groups)
+        folder = self._folder() if config.machine.out_of_core else None
+        self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.images, groups, folder)
         self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
         self.told = [sentence for told in having([self.growth], "told") for sentence in told()]
         self.dropped: Counter = Counter()  # of NOT_FINITE, on the device; prunings that would have emptied the scene
@@ -102,6 +105,19 @@ class Trainer:
         self.room = Room()  # for tile instances
         self._one = torch.ones((), device=self.device)
         self._radii = self.model.parameters["means"].new_zeros(len(self.model), dtype=torch.int32)  # in the last step
+
+    def _folder(self) -> Path:
+        """Where the Gaussians live, in files. Raises InputError if an option does not go with that."""
+        learn, images = self.config.learn, self.processes.images
+        refused = {
+            "--optimizer_type default, which changes all Gaussians in each step": learn.optimizer_type == "default",
+            "--half_moments": learn.half_moments,  # are rounded by the number of a row
+            "--device cuda": self.device.type == "cuda",
+            f"{images} images a step": images > 1,
+        }
+        for name in filter(refused.get, refused):
+            raise InputError(f"--out_of_core: expected sparse_adam, an image a step, a CPU, found {name}; change it.")
+        return prepare_folder(self.config.report.model_path)
 
     def differentiate(self, iteration: int) -> torch.Tensor:
         """Gradients of the loss of a step's views; returns the loss, a scalar. Means over all views of all processes.
@@ -130,7 +146,8 @@ class Trainer:
         camera, photograph = self.photographs.at_size(step.view, step.iteration)
         options = self.options_at(step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
-        out = self._render(camera, background, options, self.room, splats)
+        rows = self._shown(camera, options)
+        out = self._render(camera, background, options, self.room, splats, rows)
         out.means2d.retain_grad()
         image = self._through("image", out.image, out, step)
         photograph = self._through("photograph", photograph, step)
@@ -145,7 +162,7 @@ class Trainer:
             loss = loss + price.to(loss.dtype)
         loss.backward(self._one)
         if not splats:
-            self.see(out, step)
+            self.see(out if rows is None else Observed.of_all(out, rows, len(self.model)), step)
         dropped = (out.dropped.pixel_count, out.dropped.gaussian_count, out.invalid_count)
         self.dropped.update(dict(zip(NOT_FINITE, dropped, strict=True)))
         return loss.detach()
@@ -194,7 +211,8 @@ class Trainer:
         view = self.scene.train[0]
         step = Step(0, view)
         camera = self._through("camera", view.camera.resized(TILE, TILE), step)
-        out = self._render(camera, self.behind, self._through("asks", self.options, step))
+        options = self._through("asks", self.options, step)
+        out = self._render(camera, self.behind, options, rows=self._shown(camera, options))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.zero_grad()
         self.optimizer.load()
@@ -258,6 +276,15 @@ class Trainer:
         self.optimizer.set_iteration(iteration)
         self.degree = min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree)
 
+    def _shown(self, camera: Camera | CameraParameters, options: RasterOptions) -> torch.Tensor | None:
+        """The Gaussians that a view needs, where they live in a file; None: all."""
+        if not self.optimizer.folder:
+            return None
+        with torch.no_grad(), stage("project"):
+            parts = torch.arange(len(self.model)).split(CHUNK)
+            radii = [project(self.model.activated(self.degree, part), camera, options).radii for part in parts]
+        return torch.cat(radii).nonzero()[:, 0]
+
     def _render(
         self,
         camera: Camera | CameraParameters,
@@ -265,9 +292,10 @@ class Trainer:
         options: RasterOptions,
         room: Room | None = None,
         splats: Splats2D | None = None,
+        rows: torch.Tensor | None = None,
     ) -> RenderOutput:
         with stage("project"):
-            gaussians = self.model.activated(self.degree)
+            gaussians = self.model.activated(self.degree, rows)
         adjoint, options = self.config.model.adjoint, replace(options, sh_degree=self.degree)
         return render(gaussians, camera, background, options, adjoint, room=room, splats=splats)
 
@@ -281,7 +309,7 @@ class Trainer:
         with torch.no_grad():
             options = replace(self.options, depth=depth, sh_degree=self.degree)
             splats = self.blocks.ask("show", camera, options) if self.blocks else None
-            return self._render(camera, self.behind, options, splats=splats)
+            return self._render(camera, self.behind, options, splats=splats, rows=self._shown(camera, options))
 
     def lead(self, do: Callable[[], T]) -> T | None:
         """What process 0 does while the others wait; what it looks at, it sees of the Gaussians of all."""

@@ -45,7 +45,7 @@ class Mcmc:
     def price(self, gaussians: Gaussians) -> torch.Tensor:
         """On opacity and on size (equation 14)."""
         opacities, scales = gaussians.opacities, gaussians.scales
-        count = max(self.processes.total(len(opacities)), 1)
+        count = max(self.processes.total(len(self.model)), 1)
         price = PRICE_OPACITY * in_pairs(opacities.nan_to_num()) / count
         return price + PRICE_SCALE * in_pairs(scales.nan_to_num().reshape(-1)) / (3 * count)
 

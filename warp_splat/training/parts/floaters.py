@@ -17,7 +17,7 @@ class Floaters:
     tried = True
 
     def __init__(self, options: FloatersOptions, setting: Setting):
-        self.weight, self.processes = options.opacity_reg, setting.processes
+        self.weight, self.processes, self.model = options.opacity_reg, setting.processes, setting.model
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
@@ -29,4 +29,4 @@ class Floaters:
         opacities = gaussians.opacities.nan_to_num()
         # Now multiples of 2^-23: in float64 their sum is exact, and the same in any order.
         total = (opacities + 1.0 - 1.0).double().sum()
-        return self.weight * (total / max(self.processes.total(len(opacities)), 1))
+        return self.weight * (total / max(self.processes.total(len(self.model)), 1))
