@@ -40,6 +40,7 @@ def flags_of(source: Path, share: float, iterations: int, width: int) -> list:
     scale = share * iterations / fast["iterations"]
     schedule = [word for name, steps in fast.items() for word in (f"--{name}", round(steps * scale))]
     flags = ["-s", source, "-r", width, "--eval", "--preset", "fast", "--growth", "reference", "--device", "cpu"]
+    flags += ["--densify_grad_threshold", 0.001]  # of small pictures
     return [*flags, *schedule, "--threads", 1]
 
 

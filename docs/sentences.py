@@ -130,7 +130,21 @@ def sentences() -> dict[str, list[tuple]]:
     image, gradient, _ = f.knob(f.EMBEDDED, "alpha_min 0.003922")
     finer, finest = (f.knob(f.EMBEDDED, f"alpha_min {value}") for value in ("0.001", "0.0001"))
     long = f.quoted("compare/compare.txt", r"embedded, step 300 \| central differences .*\| ([\d.e+]+) extrapolated")[0]
+    on_eight, largest = (
+        row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
+    )
     return {
+        "scaling.md": [
+            (
+                "on 64 of them a step takes {} s, and an image {} s: 30,000 images are {} hours. On eight, an "
+                "image takes {} s.",
+                f"{largest['own'] + largest['drawing'] + largest['exchange']:.0f}",
+                f"{largest['image']:.1f}",
+                f"{30_000 * largest['image'] / 3600:.0f}",
+                f"{on_eight['image']:.0f}",
+            ),
+            ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
+        ],
         "README.md": [
             ("The training takes {} s on two cores", f.data("preset")["rows"][0][6]),
             (

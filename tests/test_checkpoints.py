@@ -215,10 +215,11 @@ def test_a_process_that_torchrun_starts_again_goes_on_from_its_own_checkpoint(tm
     assert not goes_on()
     monkeypatch.setenv("TORCHELASTIC_RESTART_COUNT", "1")
     assert not goes_on()  # somebody set it by hand
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
+    monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "1")
     monkeypatch.chdir(tmp_path)
     assert goes_on() and parse(words).learn.iterations == 50
-    assert not parse(["train", "-s", str(SCENE)]).data.start_checkpoint
+    with pytest.raises(InputError, match="-m: expected a folder, from which torchrun's --max-restarts could go on"):
+        parse(["train", "-s", str(SCENE)])
     os.utime(tmp_path / LAST, (0, 0))  # of an older training, which the next step of the program refuses to overwrite
     assert not goes_on()
 

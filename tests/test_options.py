@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_splat.cli import COMMANDS, make_parser, parse
+from warp_splat.cli import COMMANDS, main, make_parser, parse
 from warp_splat.errors import InputError
 from warp_splat.flags import flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
@@ -217,3 +217,10 @@ def test_a_coarse_step_trains_on_a_coarse_image(scene):
     assert all(
         photograph.image.shape[0] == view.image.shape[0] // 2 for view, photograph in trainer.photographs.kept.items()
     )
+
+
+@pytest.mark.parametrize(("rank", "times"), [("0", 1), ("1", 0)])
+def test_what_all_processes_of_a_machine_refuse_is_said_once(rank, times, monkeypatch, capsys):
+    monkeypatch.setenv("LOCAL_RANK", rank)
+    assert main(["train", "--lambda_dssim", "2"]) == 1
+    assert capsys.readouterr().err.count("--lambda_dssim: expected") == times

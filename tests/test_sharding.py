@@ -2,6 +2,7 @@
 
 import math
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -182,6 +183,23 @@ def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):
 def test_what_needs_whole_models_is_refused(options, scene):
     with pytest.raises(InputError, match="--shard: expected a training without --"):
         Trainer(scene, TrainConfig(device="cpu", **options), Shards(0, 1))
+
+
+def test_a_process_that_hangs_beside_this_one_is_killed(monkeypatch):
+    """And none that has another parent: its number is that of another machine."""
+    one = watch.Watch(0, 2, None, math.inf)
+    hung = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        hung.send_signal(signal.SIGSTOP)
+        for rank, sign in enumerate((b"", f"{hung.pid} 7".encode())):
+            one.signs[rank] = sign
+            one.kill(rank)
+        assert hung.poll() is None
+        monkeypatch.setattr(os, "getppid", os.getpid)
+        one.kill(1)
+        assert hung.wait(10) == -signal.SIGKILL
+    finally:
+        hung.kill()
 
 
 def test_a_process_without_signs_is_named(monkeypatch):

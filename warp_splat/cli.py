@@ -27,7 +27,7 @@ from warp_splat.errors import InputError
 from warp_splat.flags import FOREIGN_FLAGS, default_of, flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
-from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
+from warp_splat.training.options import FIXED_OPTIONS, TrainConfig, check_train
 from warp_splat.training.parts import AUTO, PARTS
 
 #: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
@@ -120,8 +120,7 @@ def parse(arguments: list[str]) -> Any:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
-    by_torchrun = "TORCHELASTIC_RUN_ID" in os.environ
-    if config_type is TrainConfig and by_torchrun and os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0":
+    if config_type is TrainConfig and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
         values = _restarted(values)
     given = values
     if values.get("config"):
@@ -136,26 +135,30 @@ def parse(arguments: list[str]) -> Any:
     if config_type is TrainConfig:
         _check_parts(values.get("parts", ""), given)
         _check_minutes(given)
-    if values.get("start_checkpoint"):
-        return TrainConfig(**values)
-    if config_type is TrainConfig:
+    if config_type is TrainConfig and not values.get("start_checkpoint"):
         preset = values.get("preset", "fast" if values.get("minutes") else "")
         defaults = [PRESETS[preset]]
         if "source_path" not in values:
             defaults = [EMBEDDED_DEFAULTS[""], PRESETS[preset], EMBEDDED_DEFAULTS[preset]]
         values = {**{name: value for table in defaults for name, value in table.items()}, **values, "preset": preset}
-    return config_type(**values)
+    config = config_type(**values)
+    if isinstance(config, TrainConfig):
+        check_train(config)
+    return config
 
 
 def _restarted(given: dict) -> dict:
-    """Words of a process that torchrun starts again, by the same ones: it goes on from its own last checkpoint."""
+    """Words of a process that torchrun starts, maybe again: then it goes on from its own last checkpoint."""
     import psutil  # noqa: PLC0415 - seldom needed
 
     from warp_splat.formats.checkpoint import LAST  # noqa: PLC0415
 
+    if not (given.get("model_path") or given.get("start_checkpoint")):
+        raise InputError("-m: expected a folder, from which torchrun's --max-restarts could go on; name one.")
     folder, begun = given.get("model_path", ""), psutil.Process(os.getppid()).create_time()  # of torchrun
     path = os.path.join(folder, LAST)
-    own = folder and os.path.isfile(path) and os.path.getmtime(path) > begun  # not of an older training
+    again = os.environ["TORCHELASTIC_RESTART_COUNT"] != "0"
+    own = again and folder and os.path.isfile(path) and os.path.getmtime(path) > begun  # not of an older training
     return {"start_checkpoint": folder} if own else given
 
 
@@ -216,6 +219,7 @@ def _function_of(config: Any) -> Callable[[Any], int]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
+    alike = os.environ.get("LOCAL_RANK", "0") != "0"  # what another process of this machine says as well
     try:
         config = parse(sys.argv[1:] if arguments is None else arguments)
         if isinstance(config, TrainConfig) and config.machine.portable:
@@ -228,12 +232,14 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         with leaving_at_once():
             run = _function_of(config)
+        alike = False
         return run(config)
     except (InputError, OSError) as error:
         if os.environ.get("WARP_SPLAT_TRACEBACK"):
             raise
         text = f"{error.filename or 'file'}: {error.strerror or error}." if isinstance(error, OSError) else error
-        print(f"warp-splat: error: {text}", file=sys.stderr)
+        if not alike:
+            print(f"warp-splat: error: {text}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("warp-splat: interrupted; what was saved before stays.", file=sys.stderr)

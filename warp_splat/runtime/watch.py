@@ -5,9 +5,10 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
+import psutil
 import torch.distributed as dist
 
 GONE = 3.0  # seconds without a sign, of a process of which nothing is heard
@@ -39,7 +40,7 @@ class Watch:
         while not self.stopped.wait(1.0):
             beat += 1
             try:
-                self.store.set(self.names[self.rank], str(beat))
+                self.store.set(self.names[self.rank], f"{os.getpid()} {beat}")
                 signs, now = self.store.multi_get(self.names), time.monotonic()
             except RuntimeError:
                 return
@@ -57,14 +58,23 @@ class Watch:
                     f"Process {self.rank}: no sign of process {ranks} for {HUNG:.0f} s; the last checkpoint is whole."
                 )
                 os.write(2, f"warp-splat: error: {words}\n".encode())
+                for rank in hung:
+                    self.kill(rank)
                 os._exit(1)
+
+    def kill(self, rank: int) -> None:
+        """End a process that hangs beside this one: torchrun waits 30 s for an answer to its SIGTERM."""
+        with suppress(psutil.Error, LookupError):
+            process = psutil.Process(int(self.signs[rank].split()[0]))
+            if process.ppid() == os.getppid():  # else it has its number on another machine
+                process.kill()
 
 
 @contextmanager
 def watching(rank: int, count: int, ends: bool) -> Iterator[Watch]:
     """A watch while the block runs; where one hangs, it ``ends`` this process, which has nothing whole to save."""
     store = dist.distributed_c10d._get_default_store()
-    store.set(f"sign/{rank}", "0")
+    store.set(f"sign/{rank}", f"{os.getpid()} 0")
     watch = Watch(rank, count, store, HUNG if ends else math.inf)
     threads = [threading.Thread(target=run, daemon=True) for run in (watch.look, watch.judge)]
     for thread in threads:
