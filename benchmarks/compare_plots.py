@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rounding
 from common import parse
 from panels import Panel, draw_panels
 
@@ -63,13 +64,13 @@ def plot_stability(path: Path, measured: Mapping[str, Any]) -> None:
         # side by side, or equal errors would hide each other
         shifted = [n * 1.25 ** (place - 0.5 * (len(modes) - 1)) for n in lengths]
         chain.marks(mode, shifted, [errors[f"chain_{n}", mode]["gradient_error"] for n in lengths], STYLES[mode])
-    recovered = {n: errors[key]["value_error"] for n in lengths if (key := (f"recovery_{n}", "")) in errors}
-    chain.line("T recovered", *zip(*recovered.items(), strict=True), color="#999999", lw=1.2)
-    needle, found = Panel("error of det, worst of all angles", "scale ratio of the needle"), measured["determinant"]
+    recovered = [rounding.recovery_error(n) for n in lengths]
+    chain.line("T recovered", lengths, recovered, color="#999999", lw=1.2)
+    needle = Panel("error of det, worst of all angles", "scale ratio of the needle")
     for name, label, style in (("usual", "a c - b²", "stepwise"), ("ours", "sum of squares", "manual")):
-        needle.marks(label, found["ratios"], found[name], STYLES[style], ls="-")
-    needle.line("", found["ratios"], [1.0] * len(found["ratios"]), color=report.INK, ls="--")
-    needle.notes.append(((found["ratios"][0], 1.0), "no digit right", (0, 4), "left"))
+        needle.marks(label, rounding.RATIOS, rounding.determinant_errors()[name], STYLES[style], ls="-")
+    needle.line("", rounding.RATIOS, [1.0] * len(rounding.RATIOS), color=report.INK, ls="--")
+    needle.notes.append(((rounding.RATIOS[0], 1.0), "no digit right", (0, 4), "left"))
     draw_panels(path, [chain, needle], 2, 2.8)
 
 

@@ -20,11 +20,10 @@ import maps
 import numpy as np
 import torch
 from common import parse, transcribe
+from exact_cameras import exact_camera, exact_render
 from light import Volume
 
 from warp_splat.camera import Camera
-from warp_splat.compare import oracle
-from warp_splat.compare.exact_cameras import exact_camera
 from warp_splat.compare.scenes import distinct_depths, make_camera, to_world
 from warp_splat.compare.truth import random_upstream
 from warp_splat.config import ADJOINTS, PROJECTIONS, RasterOptions
@@ -177,7 +176,7 @@ def gradient_errors(
     given = put_together(learned.base, parts)
     assert isinstance(given, CameraParameters)
     camera = exact_camera(given.base, given.twist, given.intrinsics, given.last_twist, given.coefficients)
-    truth = oracle.exact_render(*exact, camera, projection=options.projection)
+    truth = exact_render(*exact, camera, projection=options.projection)
     weights = random_upstream(truth.image.shape, truth.fragile)
     chosen = [parts[part] for part in asked]
     wanted = torch.autograd.grad((truth.image * weights).sum(), [*exact, *chosen])

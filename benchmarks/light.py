@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from exact_cameras import exact_splats
 from scipy.spatial.transform import Rotation
 from scipy.special import erf, exprel
 
@@ -254,7 +255,7 @@ def splat_images(volume: Volume, camera: Camera, footprints: Mapping[str, tuple[
     """
     peak, rays, scene = peak_depths(volume, camera), camera_rays(camera), volume.splats(np.ones(len(volume.means)))
     blind = np.isnan(rays[:, :1])
-    found = {way: oracle.exact_splats(*scene, camera, projection=way[0], blur=way[1]) for way in footprints.values()}
+    found = {way: exact_splats(*scene, camera, projection=way[0], blur=way[1]) for way in footprints.values()}
     first = next(iter(found.values()))
     order = np.argsort(first.z.numpy(), kind="stable")
     exact = ray_profile(volume, camera.center, np.where(blind, camera.forward, rays)).depths() * first.live.numpy()

@@ -158,6 +158,11 @@ def stability(case: str, name: str) -> float:
     return max(float(row[name]) for row in rows("stability") if row["case"] == case and row[name])
 
 
+def recovered(layers: int) -> float:
+    """How far T is off after so many layers and back."""
+    return next(float(r["error"]) for r in rows("rounding") if r["what"][0] == "T" and int(r["of"]) == layers)
+
+
 def rung(scene: str, name: str, column: str) -> float:
     """Of the splats against the truth."""
     found = (row for row in rows("volume") if row["table"] == "ladder" and (row["scene"], row["rung"]) == (scene, name))

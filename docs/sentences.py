@@ -160,7 +160,7 @@ def sentences() -> dict[str, list[tuple]]:
         ],
         "renderer.md": [
             ("the forward pass is {} times as fast", round(f.blend_gain())),
-            ("exactly enough ({} after 100,000", f.small(f.stability("recovery_100000", "value_error"))),
+            ("exactly enough ({} after 100,000", f.small(f.recovered(100_000))),
             ("has the catalog of {} stiff", count),
         ],
         "extending.md": [
@@ -184,7 +184,7 @@ def sentences() -> dict[str, list[tuple]]:
             ("within a factor of {} of each other", f.one(f.spread_of_modes())),
             (
                 "it is off by {}, and the gradients by {}, where",
-                f.small(f.stability("recovery_100000", "value_error")),
+                f.small(f.recovered(100_000)),
                 f.small(f.stability("chain_100000", "gradient_error")),
             ),
             ("they take {} hours", f.one(float(long) / 3.6e6)),

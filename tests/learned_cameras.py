@@ -1,10 +1,11 @@
 """Cameras that learn all that they may, and the gradients of it: the renderer's, by part, and an exact render."""
 
+import exact_cameras
 import torch
+from exact_cameras import exact_camera
 
 from warp_splat import CameraParameters, RasterOptions, rasterize
-from warp_splat.compare import oracle, truth
-from warp_splat.compare.exact_cameras import exact_camera
+from warp_splat.compare import truth
 
 LENS_ERROR = 1e-4  # relative L2, of coefficients, and of cameras with distortion away from the base
 PLAIN, DEPTH, SHARP = RasterOptions(), RasterOptions(depth=True), RasterOptions(antialiasing=True)
@@ -39,7 +40,7 @@ def split(gradients):
 def exact_render(scene, options, numbers):
     scene, more = scene.to("cpu", torch.float64), {key: numbers.get(key) for key in ("last_twist", "coefficients")}
     camera = exact_camera(scene.camera, numbers["twist"], numbers["intrinsics"], **more)
-    return oracle.exact_render(*scene.parameters(), camera, scene.background, **truth.for_oracle(options))
+    return exact_cameras.exact_render(*scene.parameters(), camera, scene.background, **truth.for_oracle(options))
 
 
 def gradients_of(scene, upstream, options=PLAIN, start=HERE, adjoint="manual", leaves=None):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from exact_cameras import exact_camera
 from learned_cameras import DEPTH, HERE, NEAR, OTHER, PARTS, PLAIN, gradients_of, learned
 from scenes import SCENES, SHUTTER, scene_of
 from scipy.spatial.transform import Rotation
 
 from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
-from warp_splat.compare.exact_cameras import exact_camera
 from warp_splat.raster.differences import INPUTS
 from warp_splat.raster.project import Project
 from warp_splat.runtime import launch

@@ -2,15 +2,16 @@
 
 from dataclasses import replace
 
+import exact_cameras
 import numpy as np
 import pytest
 import torch
+from exact_cameras import exact_camera
 from learned_cameras import LENS_ERROR, exact_render, gradients_of, learned
 from scenes import LENSES, SCENES
 
 from warp_splat import CameraParameters, Lens, RasterOptions
-from warp_splat.compare import exact_cameras, oracle, truth
-from warp_splat.compare.exact_cameras import exact_camera
+from warp_splat.compare import truth
 from warp_splat.config import ADJOINTS
 from warp_splat.lenses.formulas import MODELS
 from warp_splat.raster.data import Gaussians
@@ -97,7 +98,7 @@ def test_splats(scene, projection):
 
     def exact_loss(k):
         camera = exact_camera(scene.camera, numbers["twist"], numbers["intrinsics"], coefficients=k)
-        found = oracle.exact_splats(*exact.parameters(), camera, **given)
+        found = exact_cameras.exact_splats(*exact.parameters(), camera, **given)
         conics = torch.linalg.inv(found.cov2d).flatten(1)[:, [0, 1, 3]]
         return float(loss(*(torch.where(drawn[:, None], part, 0) for part in (found.means2d, conics))).detach())
 

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from exact_cameras import exact_render
 from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import some_splats
 
 from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
-from warp_splat.compare.oracle import exact_render, sh_basis
+from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
 from warp_splat.runtime import pool

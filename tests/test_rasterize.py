@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import pytest
 import scenes
 import torch
+from exact_cameras import exact_render, exact_splats
 from scenes import PARAMETERS, SCENES
 
 import warp_splat
@@ -54,9 +55,7 @@ def truth(name, options):
     """Computed once per scene and options, in float64."""
     scene = scenes.scene_of(name)
     leaves = leaves_of(scene.to("cpu", torch.float64))
-    out = oracle.exact_render(
-        *[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **for_oracle(options)
-    )
+    out = exact_render(*[leaves[key] for key in PARAMETERS], scene.camera, leaves["background"], **for_oracle(options))
     generator = torch.Generator().manual_seed(1)
     upstream = {}
     for key in ("image", "alpha", "depth")[: 3 if options.depth else 2]:
@@ -230,7 +229,7 @@ def test_means2d_carries_gradients_of_its_own(device):
     out = rasterize(scene, leaves)
     weight = torch.randn(120, 2, generator=torch.Generator().manual_seed(2)) * (out.radii.cpu() > 0)[:, None]
     (out.means2d * weight.to(device)).sum().backward()
-    splats = oracle.exact_splats(*[exact[key] for key in PARAMETERS], scene.camera)
+    splats = exact_splats(*[exact[key] for key in PARAMETERS], scene.camera)
     (splats.means2d * weight).sum().backward()
     assert relative_error(leaves["means"].grad, exact["means"].grad) < 1e-5
 
@@ -251,7 +250,7 @@ def test_one_output_alone(key, device):
     scene, weight = expected.scene, expected.upstream[key]
     leaves, exact = leaves_of(scene.to(device)), leaves_of(scene.to("cpu", torch.float64))
     gradients = backward(rasterize(scene, leaves, RasterOptions(depth=True)), {key: weight.to(device)}, leaves)
-    out = oracle.exact_render(*[exact[name] for name in PARAMETERS], scene.camera, exact["background"])
+    out = exact_render(*[exact[name] for name in PARAMETERS], scene.camera, exact["background"])
     for name, value in backward(out, {key: weight}, exact).items():
         if value is not None and value.abs().max() > 0:
             assert relative_error(gradients[name], value) < GRADIENT, name

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import exact_cameras
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from test_rasterize import relative_error, run, truth
 
 from warp_splat import Camera, InputError, RasterOptions, Shutter, rasterize
-from warp_splat.compare import exact_cameras, oracle
 from warp_splat.compare.truth import for_oracle
 from warp_splat.formats import model_folder
 from warp_splat.kernels.project import affine
@@ -101,7 +101,9 @@ def test_beyond_the_picture_the_motion_ends_and_that_alone_is_what_an_oracle_wit
 
     def off():
         """The largest difference of a sure pixel, and of a gradient relative to its norm."""
-        wanted = oracle.exact_render(*exact_leaves, camera, torch.zeros(3).double(), **for_oracle(RasterOptions()))
+        wanted = exact_cameras.exact_render(
+            *exact_leaves, camera, torch.zeros(3).double(), **for_oracle(RasterOptions())
+        )
         sure = ~wanted.fragile
         loss = ((out.image * weights)[sure].sum(), (wanted.image * weights)[sure].sum())
         found = torch.autograd.grad(loss[0], leaves, retain_graph=True)

@@ -1,7 +1,8 @@
 """Truth for the renderer: float64 torch, every Gaussian at every pixel, gradients by torch.autograd.
 
 Written from the papers (Kerbl et al. 2023; Zwicker et al. 2001 for the projection), without a look at the kernels. It
-has no tiles, no early exit (only its effect) and no inverse. It shares nothing with the package but ``Camera``.
+has no tiles, no early exit (only its effect) and no inverse. It shares nothing with the package but ``Camera``. It
+knows pinholes that stand still; benchmarks/exact_cameras.py teaches it lenses and cameras that move.
 
 A renderer in float32 may decide otherwise where a quantity lies within rounding of a threshold. ``Render.fragile``
 marks the pixels where that could be seen, so that a test can leave them out, and count them.
@@ -10,8 +11,6 @@ marks the pixels where that could be seen, so that a test can leave them out, an
 from dataclasses import dataclass
 
 import torch
-
-from warp_splat.compare import exact_cameras
 
 BLACK = (0.0, 0.0, 0.0)
 NEAR = 0.2  # Gaussians nearer than this are culled
@@ -139,35 +138,42 @@ def _double(value):
     return value.double() if isinstance(value, torch.Tensor) else torch.tensor(value, dtype=torch.float64)
 
 
+class Pinhole:
+    """How a pinhole that stands still sees Gaussians."""
+
+    def place(self, points, turned, camera, near):
+        """Of points [N, 3]: as the camera sees them, how the world is turned then, their depth, which are in view."""
+        return points, turned, points[:, 2], True
+
+    def shape(self, points, turned, quats, scales, live, camera, projection, near):
+        """Of Gaussians at points [N, 3] in the camera: means [N, 2], covariances [N, 2, 2] px^2, which are drawn."""
+        sigma, (x, y, z) = turned @ covariances(quats, scales) @ turned.mT, points.unbind(1)
+        if projection == "ellipsoid":
+            live = live & (z**2 > OUTLINE_REACH**2 * sigma[:, 2, 2])
+            return *outlines(points, sigma, live, camera), live
+        means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+        to_pixels = jacobians(points, camera)
+        return means2d, to_pixels @ sigma @ to_pixels.transpose(1, 2), live
+
+    def repeat(self, splats, camera):
+        """What shows more than once, as often as it shows."""
+        return splats
+
+
+PINHOLE = Pinhole()
+
+
 def exact_splats(
     means, quats, scales, opacities, sh, camera, sh_degree=None, antialiasing=False, projection="affine",
-    near=NEAR, blur=BLUR,
+    near=NEAR, blur=BLUR, eye=PINHOLE,
 ):  # fmt: skip
     """Gaussians as the camera sees them. Its numbers may be tensors that want gradients."""
     world_to_camera, translation = _double(camera.rotation), _double(camera.translation)
-    points, seen = means @ world_to_camera.T + translation, world_to_camera
-    if getattr(camera, "shutter", None):
-        points, along = exact_cameras.exposed(points, camera, near)
-        seen = along @ world_to_camera
-    depth, live = exact_cameras.depths_of(points, camera.lens) if camera.lens else (points[:, 2], True)
+    points = means @ world_to_camera.T + translation
+    points, turned, depth, live = eye.place(points, world_to_camera, camera, near)
     live = live & (depth > near) & (quats.norm(dim=1) > 0)
     points = torch.where(live[:, None], points, points.new_tensor([0.3, 0, 1]))  # no division by zero, no gradient
-    x, y, z = points.unbind(1)
-
-    sigma = seen @ covariances(quats, scales) @ seen.mT
-    if projection == "ellipsoid":
-        live = live & (z**2 > OUTLINE_REACH**2 * sigma[:, 2, 2])
-        means2d, sharp = outlines(points, sigma, live, camera)
-    elif projection == "unscented":
-        axes = seen @ rotation_matrices(quats) * scales[:, None]
-        means2d, sharp = exact_cameras.unscented(points, axes, camera, near)
-    elif camera.lens:
-        means2d, to_pixels = exact_cameras.seen(points, camera)
-        sharp = exact_cameras.narrowed(to_pixels @ sigma @ to_pixels.transpose(1, 2), camera)
-    else:
-        means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
-        to_pixels = jacobians(points, camera)
-        sharp = to_pixels @ sigma @ to_pixels.transpose(1, 2)
+    means2d, sharp, live = eye.shape(points, turned, quats, scales, live, camera, projection, near)
     cov2d = sharp + blur * torch.eye(2, dtype=torch.float64)
     opacity = opacities
     if antialiasing:
@@ -224,7 +230,7 @@ def _swappable(alpha, blended, depth, alpha_max):
 
 def exact_render(
     means, quats, scales, opacities, sh, camera, background=BLACK, alpha_min=ALPHA_MIN, alpha_max=ALPHA_MAX, t_min=STOP,
-    pixels=None, **view,
+    pixels=None, eye=PINHOLE, **view,
 ):  # fmt: skip
     """The image of N Gaussians (float64, activated values), differentiable in all inputs and the background.
 
@@ -234,10 +240,8 @@ def exact_render(
     shape = (camera.height, camera.width) if pixels is None else (len(pixels),)
     if pixels is None:
         pixels = torch.cartesian_prod(torch.arange(camera.height), torch.arange(camera.width))
-    once = splats = exact_splats(means, quats, scales, opacities, sh, camera, **view)
-    if camera.lens and camera.lens.model == exact_cameras.AROUND:
-        again = {name: torch.cat([getattr(once, name)] * 3) for name in once.__dataclass_fields__}
-        splats = Splats(**{**again, "means2d": exact_cameras.shown_thrice(once.means2d, camera)})
+    once = exact_splats(means, quats, scales, opacities, sh, camera, eye=eye, **view)
+    splats = eye.repeat(once, camera)
     copies = 1 if splats is once else 3
     key = splats.z.detach().float()  # the renderer's order: float32 depth, ties by index
     order = torch.sort(key, stable=True).indices

@@ -1,18 +1,15 @@
-"""Extremes outside the pixel loop: the determinant of needles, SSIM, Adam, and more tile instances than fit."""
+"""Extremes outside the pixel loop: SSIM, Adam, and more tile instances than fit."""
 
-import functools
 import re
 from dataclasses import replace
-from fractions import Fraction
 from functools import partial
 
-import numpy as np
 import torch
 
 from warp_splat.compare.scenes import cloud, look, tensors
 from warp_splat.compare.stability import verdict as check
-from warp_splat.compare.stability.verdict import EPS, GRADIENT_LIMIT, Case, Outcome, bounded, relative_error
-from warp_splat.config import ALPHA_MAX, BLUR, TILE, RasterOptions
+from warp_splat.compare.stability.verdict import GRADIENT_LIMIT, Case, Outcome, bounded, relative_error
+from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import rasterize
@@ -22,83 +19,9 @@ from warp_splat.training.optimizer import EPS as ADAM_EPS
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import LearnOptions
 
-RATIOS = tuple(10.0**power for power in np.arange(0, 8.5, 0.5))
-SHORT = 0.1  # px, short axis
-ANGLES = 37  # of the needle in the image, and as many to it
 STEPS = 5  # of Adam
 LOSS_LIMIT = 1e-5  # variances are differences of squares, 4 eps / 4 off where images are 1/2; over C2, times 0.2
-RATIONAL = np.frompyfunc(lambda number: Fraction(float(number)), 1, 1)  # of an array
 SIDE = 65_536  # px, of an image whose tiles are too many
-
-
-def needle_rows(ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows a1, a2 [A, 3] (float32, px) of J W R S for a needle at every angle in and to the image."""
-    angle, tilt = np.meshgrid(np.linspace(0, np.pi, ANGLES), np.radians(np.linspace(0, 89, ANGLES)))
-    c, s, up, out = np.cos(angle), np.sin(angle), np.cos(tilt), np.sin(tilt)
-    scales = SHORT * np.array([ratio, 1.0, 1.0])
-    a1 = np.stack([up * c, -s, -out * c], -1).reshape(-1, 3) * scales
-    a2 = np.stack([up * s, c, -out * s], -1).reshape(-1, 3) * scales
-    return a1.astype(np.float32), a2.astype(np.float32)
-
-
-def usual_determinant(a1: np.ndarray, a2: np.ndarray) -> np.ndarray:
-    """(a1.a1 + e) (a2.a2 + e) - (a1.a2)^2 in the precision of its arguments [A, 3], px^4."""
-    blur = RATIONAL(np.float32(BLUR)) if a1.dtype == object else a1.dtype.type(BLUR)
-    xx, yy, xy = (np.sum(left * right, -1, dtype=a1.dtype) for left, right in ((a1, a1), (a2, a2), (a1, a2)))
-    return (xx + blur) * (yy + blur) - xy * xy
-
-
-def our_determinant(a1: np.ndarray, a2: np.ndarray) -> np.ndarray:
-    """|a1 x a2|^2 + e (|a1|^2 + |a2|^2) + e^2, as ``kernels.project`` computes it, px^4."""
-    blur = a1.dtype.type(BLUR)
-    area = np.cross(a1, a2)
-    sharp, xx, yy = (np.sum(row * row, -1, dtype=a1.dtype) for row in (area, a1, a2))
-    return sharp + blur * (xx + yy) + blur * blur
-
-
-def exact_determinant(a1: np.ndarray, a2: np.ndarray) -> np.ndarray:
-    """The same by the usual formula in rational numbers: no rounding at all."""
-    return usual_determinant(RATIONAL(a1), RATIONAL(a2))
-
-
-@functools.cache
-def determinant_errors() -> dict[str, list[float]]:
-    """Largest relative error over all angles for each of ``RATIOS``, by formula, in float32."""
-    errors: dict[str, list[float]] = {"usual": [], "ours": []}
-    for ratio in RATIOS:
-        rows = needle_rows(ratio)
-        exact = exact_determinant(*rows)
-        for name, formula in (("usual", usual_determinant), ("ours", our_determinant)):
-            found = formula(*rows).astype(np.float64)
-            errors[name].append(max(float(abs(Fraction(v) / truth - 1)) for v, truth in zip(found, exact, strict=True)))
-    return errors
-
-
-@functools.cache
-def recovery_error(layers: int) -> float:
-    """|T - 1| after a chain of ``layers`` and its inverse, by the pieces of the kernels in float32 on 64 pixels.
-
-    Opacities are random and small enough that T falls to about 0.01.
-    """
-    rng, one = np.random.default_rng(layers), np.float32(1.0)
-    alphas = rng.uniform(0.0, 9.0 / layers, (layers, 64)).clip(0.0, ALPHA_MAX).astype(np.float32)
-    t = np.ones(64, dtype=np.float32)
-    for alpha in alphas:
-        t = t - alpha * t
-    for alpha in alphas[::-1]:
-        t = t + t * (alpha / (one - alpha))
-    return float(np.abs(t - one).max())
-
-
-def recovery(layers: int, _mode: str) -> Outcome:
-    """T recovered by division through the whole chain; rounding may grow like n eps, two roundings a step each way."""
-    return bounded("T = 1 in front of all", "T", recovery_error(layers), 4 * layers * EPS)
-
-
-def determinant(_mode: str) -> Outcome:
-    """Ours has a few roundings of error at every angle and ratio, where the usual formula has no digit left."""
-    ours, usual = (max(determinant_errors()[name]) for name in ("ours", "usual"))
-    return bounded(f"usual formula off by {usual:.0e}", "determinant", ours, 16 * EPS)
 
 
 def exact_loss(image: torch.Tensor, target: torch.Tensor, share: float = 0.2) -> torch.Tensor:
@@ -198,13 +121,6 @@ GRADIENTS = {
     1e30: "the second moment overflows: the parameter stays where it is",
 }
 TABLE = {
-    "numbers": {
-        **{
-            f"recovery_{layers}": ("T back at 1 within 4 n eps", partial(recovery, layers))
-            for layers in (100, 1_000, 10_000, 100_000)
-        },
-        "determinant": ("needles to 1e8 at every angle: error below 16 eps in float32", determinant),
-    },
     "loss": {f"loss_{name}": ("value and gradient as in float64", partial(loss, *of)) for name, of in LOSSES.items()},
     "optimizer": {
         f"{kind}_{gradient:g}": (claim, partial(adam, gradient, kind))

@@ -1,4 +1,6 @@
-"""Truth for lenses and for cameras that move: float64 torch, derivatives by torch.autograd. Part of :mod:`.oracle`.
+"""Truth for lenses and for cameras that move: float64 torch, derivatives by torch.autograd.
+
+With it, :mod:`warp_splat.compare.oracle` renders through any camera: :func:`exact_render`, :func:`exact_splats` here.
 
 Lenses are those of the papers. A camera that moves learns its pose and numbers, or has a rolling shutter. The whole
 truth of that is a picture of which each row is rendered by a camera that stands still (``Camera.at``). This is what
@@ -6,11 +8,13 @@ splatting makes of it: a Gaussian at its own time, its surroundings linear.
 """
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import torch
 
 from warp_splat.camera import Camera
+from warp_splat.compare import oracle
 
 FIELD = 1.3  # of the angle of view: beyond, a lens that is not wide is continued as straight as it is there
 AROUND = "EQUIRECTANGULAR"
@@ -125,10 +129,40 @@ def unscented(points, axes, camera, near=NEAR):
     return mean.clone(), torch.einsum("p,npi,npj->nij", of_covariance, off, off)
 
 
-def shown_thrice(means2d, camera):
-    """Means [3 N, 2] px of what shows once more, a turn to the left and to the right."""
-    shift = torch.tensor([[camera.width, 0]], dtype=torch.float64)
-    return torch.cat([means2d, means2d + shift, means2d - shift])
+class AnyCamera(oracle.Pinhole):
+    """How cameras with lenses and rolling shutters see Gaussians, and in which projections."""
+
+    def place(self, points, turned, camera, near):
+        if getattr(camera, "shutter", None):
+            points, along = exposed(points, camera, near)
+            turned = along @ turned
+        if camera.lens is None:
+            return super().place(points, turned, camera, near)
+        return points, turned, *depths_of(points, camera.lens)
+
+    def shape(self, points, turned, quats, scales, live, camera, projection, near):
+        if projection == "unscented":
+            axes = turned @ oracle.rotation_matrices(quats) * scales[:, None]
+            return *unscented(points, axes, camera, near), live
+        if camera.lens is None or projection == "ellipsoid":
+            return super().shape(points, turned, quats, scales, live, camera, projection, near)
+        sigma = turned @ oracle.covariances(quats, scales) @ turned.mT
+        means2d, to_pixels = seen(points, camera)
+        return means2d, narrowed(to_pixels @ sigma @ to_pixels.transpose(1, 2), camera), live
+
+    def repeat(self, splats, camera):
+        """A panorama once more, a turn to the left and to the right: [3 N]."""
+        if camera.lens is None or camera.lens.model != AROUND:
+            return splats
+        again = {name: torch.cat([getattr(splats, name)] * 3) for name in splats.__dataclass_fields__}
+        shift = torch.tensor([[camera.width, 0]], dtype=torch.float64)
+        shown = torch.cat([splats.means2d, splats.means2d + shift, splats.means2d - shift])
+        return oracle.Splats(**{**again, "means2d": shown})
+
+
+EYE = AnyCamera()
+exact_splats = partial(oracle.exact_splats, eye=EYE)
+exact_render = partial(oracle.exact_render, eye=EYE)
 
 
 LATEST = 0.65  # time from the middle row to where the motion ends, beyond the picture
