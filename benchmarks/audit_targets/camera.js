@@ -24,10 +24,11 @@ export function placed(camera, entry) {
   return camera;
 }
 
-// Draws until the canvas has not changed for six frames, and shows something; for blank ones, 40 frames at most.
+// Draws until the canvas has not changed for six frames, and shows something: 40 frames, and for blank ones 10 s, at most.
 export async function settled(canvas, draw) {
   const paper = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
-  for (let i = 0, same = 0, last = ""; i < 40 && same < 6; i++) {
+  const end = performance.now() + 10000;
+  for (let i = 0, same = 0, last = ""; same < 6 && (i < 40 || (!last && performance.now() < end)); i++) {
     await new Promise((resolve) => setTimeout(() => requestAnimationFrame(resolve), 40));
     await draw?.();
     paper.clearRect(0, 0, canvas.width, canvas.height);

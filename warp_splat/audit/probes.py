@@ -22,6 +22,7 @@ GREEN, FOCAL = np.array([0.0, 1.0, 0.0]), 60.0
 CENTER = np.array([32.5, 24.5])  # px, the middle of a pixel and of the picture
 SEEN = {True: 0.6 / 255, False: 1e-9}  # of a cover, by whether pictures have 8 bits
 COMPANY = 16  # Gaussians behind the camera: some viewers draw nothing of a scene that has only one or two
+NEARLY_ROUND = np.array([0.999, 1.001, 1.0])  # of scales: some viewers do not draw what is round to the last bit
 OPAQUE = 0.9995  # what lets through more than most stops
 ASKED = (0.25, 0.5, 0.75)
 #: Values that renderers are known to have; a measured interval that holds one is named by it.
@@ -71,6 +72,7 @@ class Prober:
         rest = arrays["sh_rest"].shape[1]
         company["sh_rest"] = np.zeros((COMPANY, rest, 3))
         both = {name: np.concatenate([array, company[name]]) for name, array in arrays.items()}
+        both["scales"] = both["scales"] * NEARLY_ROUND
         answer = self.draw(on_all_pixels("probe", (tensors(both), camera), background, self.degree))
         self.seen = SEEN[answer.eight_bit]
         return decoded_srgb(answer.image) if self.encoded else answer.image
@@ -92,6 +94,7 @@ class Prober:
         """What float64 says of a probe, at the places where the renderer draws it."""
         camera = camera or probe_camera()
         moved = replace(camera, cx=camera.cx + self.shift[0], cy=camera.cy + self.shift[1])
+        arrays = arrays | {"scales": arrays["scales"] * NEARLY_ROUND}
         given = {name: torch.tensor(np.ascontiguousarray(array)) for name, array in arrays.items()}
         sh = torch.cat([given.pop("sh_dc"), given.pop("sh_rest")], 1)
         behind = tuple(self.behind if background is None else background)

@@ -238,7 +238,7 @@ def find_sort(prober: Prober) -> str:
             (1, 0): "The order is reversed: the farther Gaussian is in front.",
         }.get(both, "Two Gaussians behind each other do not look as in either order.")
     wide = make_camera(65, 49, 30.0, seed=None)
-    arrays = balls(wide, [[56.5, 24.5], [24.5, 24.5]], [3.0, 3.3], [14.0, 16.0], 0.7, colors)
+    arrays = balls(wide, [[56.5, 30.5], [24.5, 19.5]], [3.0, 3.3], [14.0, 16.0], 0.7, colors)
     arrays["scales"] = arrays["scales"] * [1.0, 1.0, 0.1]  # balls as large would reach behind the camera
     key = front(0, 1, wide), front(1, 0, wide)
     return {
