@@ -123,8 +123,9 @@ def main() -> None:
     records = [row for name, source in scenes.items() for row in compare(name, source.resolve(), *rest)]
     note = (
         f"PSNR [dB] of held-out views, {arguments.resolution} px wide, after {arguments.iterations} steps by --preset "
-        "fast and --growth reference, a block fewer in proportion to its photographs. Across: views of which a tenth "
-        f"or more lies in other cells than most of it; seams: pixels within {SEAM} of another cell's; starts from: "
+        "fast and --growth reference with --densify_grad_threshold 0.001, a block fewer in proportion to its "
+        "photographs. Across: views of which a tenth or more lies in other cells than most of it; seams: pixels within "
+        f"{SEAM} of another cell's; starts from: "
         "points of the largest block; MB: peak of the largest training; steps: of all trainings."
     )
     write_table("blocks", arguments.out, COLUMNS, records, note, {"records": records})

@@ -130,6 +130,7 @@ def sentences() -> dict[str, list[tuple]]:
     image, gradient, _ = f.knob(f.EMBEDDED, "alpha_min 0.003922")
     finer, finest = (f.knob(f.EMBEDDED, f"alpha_min {value}") for value in ("0.001", "0.0001"))
     long = f.quoted("compare/compare.txt", r"embedded, step 300 \| central differences .*\| ([\d.e+]+) extrapolated")[0]
+    one, several = f.data("blocks")["records"]
     on_eight, largest = (
         row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
     )
@@ -142,6 +143,10 @@ def sentences() -> dict[str, list[tuple]]:
                 f"{largest['image']:.1f}",
                 f"{30_000 * largest['image'] / 3600:.0f}",
                 f"{on_eight['image']:.0f}",
+            ),
+            (
+                "The blocks are {} dB behind away from the borders, and {} dB at them:",
+                *(f.one(one[place] - several[place]) for place in ("rest", "seams")),
             ),
             ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
         ],
