@@ -1,8 +1,9 @@
 """How true the surface of `warp-splat mesh` is: the embedded scene's known geometry, and points of other scenes.
 
 Of a mesh of the embedded scene: accuracy, its area that is near the true surface; completeness, what the cameras see
-of the true surface that is near the mesh; both within shares of the extent, and F, their harmonic mean. Normals: mean
-angle of what is near. Of any scene: how far the points of structure from motion are from the mesh.
+of the true surface that is near the mesh; both within shares of the extent, and F, their harmonic mean. The table, with
+what is on it: completeness without the room around. Normals: mean angle of what is near. Of any scene: how far the
+points of structure from motion are from the mesh.
 
     python benchmarks/mesh.py -m MODEL [-m MODEL ...] [--out docs/benchmarks]
 """
@@ -24,8 +25,9 @@ from warp_splat.scene.types import Scene, View
 
 SHARES = (0.005, 0.01, 0.02)
 SAMPLES, STRIDE, FAR = 200_000, 4, 1e6
+TABLE = np.array([[-1.5, -1.5, -0.1], [1.5, 1.5, 2.0]])  # around the embedded scene's table and what is on it
 HEADERS = ("scene", *(f"{name} {share:.1%}" for share in SHARES for name in ("accuracy", "completeness", "F")))
-HEADERS += ("normals, degrees", "points, median", "points, 90 %", "triangles", "seconds")
+HEADERS += ("table, completeness 1.0%", "normals, degrees", "points, median", "points, 90 %", "triangles", "seconds")
 
 
 @wp.kernel
@@ -62,7 +64,7 @@ def seen_by(view: View, measure: Measure) -> np.ndarray:
 
 
 def against_truth(found: trimesh.Trimesh, scene: Scene) -> list[float]:
-    """Accuracy, completeness and F for each share of the extent [%], and the mean angle of normals [degrees]."""
+    """Accuracy, completeness and F for each share of the extent [%]; completeness of the table; angle of normals."""
     patch = still_life()
     measure = Measure(patch)
     visible = np.concatenate([seen_by(view, measure) for view in scene.train])
@@ -73,6 +75,8 @@ def against_truth(found: trimesh.Trimesh, scene: Scene) -> list[float]:
     for share in SHARES:
         accuracy, completeness = ((far < share * scene.extent).mean() for far in (wrong, missing))
         row += [accuracy, completeness, 2 * accuracy * completeness / (accuracy + completeness)]
+    table = ((visible > TABLE[0]) & (visible < TABLE[1])).all(1)
+    row.append((missing[table] < SHARES[1] * scene.extent).mean())
     cosines = np.abs((found.face_normals[of] * normals).sum(1)).clip(0, 1)[wrong < SHARES[-1] * scene.extent]
     return [*(100 * value for value in row), np.degrees(np.arccos(cosines)).mean()]
 
@@ -85,7 +89,7 @@ def row_of(model: Path) -> tuple:
     mesh(config)
     seconds = time.perf_counter() - begin
     found = trimesh.load(path, process=False)
-    truth = against_truth(found, scene) if name == "still_life" else [None] * (3 * len(SHARES) + 1)
+    truth = against_truth(found, scene) if name == "still_life" else [None] * (3 * len(SHARES) + 2)
     far = to_mesh(scene.points, found.vertices, found.faces)[0] / scene.extent * 100
     numbers = [*truth, np.median(far), np.quantile(far, 0.9)]
     shown = ("" if value is None else f"{value:.3g}" for value in numbers)

@@ -5,12 +5,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from warp_splat import RasterOptions, rasterize
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.meshing.command import without_islands
-from warp_splat.meshing.fusion import Drawn, Surface, agreed, footprint, fused, surface_of, voxels_of
+from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, footprint, fused, surface_of, voxels_of
 from warp_splat.runtime import pool
 
 trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
@@ -49,6 +50,19 @@ def test_a_ball():
     assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03)  # outwards: it is positive
     assert np.abs(np.linalg.norm(found.vertices, axis=1) - 1).max() < 0.5 * VOXEL
     np.testing.assert_allclose(found.colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(found.colors), 0), atol=1e-5)
+
+
+def test_a_disc_is_where_rays_meet_its_plane():
+    camera = Camera(64, 48, 80, 85, 30, 25, np.eye(3), np.array([0, 0, DISTANCE]))
+    turn = Rotation.from_euler("xyz", [30, 40, 0], degrees=True)
+    numbers = [[0, 0, 0]], turn.as_quat(scalar_first=True)[None], [[0.5, 0.5, 0.001]], [0.999], np.ones((1, 1, 3))
+    disc = [torch.tensor(np.array(values), dtype=torch.float32) for values in numbers]
+    depth = depth_of(rasterize(*disc, camera, options=RasterOptions(strongest=8)), camera).numpy()
+    y, x = np.nonzero(depth)
+    along = np.stack([(x + 0.5 - 30) / 80, (y + 0.5 - 25) / 85, np.ones(len(x))], 1)
+    normal = turn.as_matrix()[:, 2]
+    assert len(x) > 100
+    np.testing.assert_allclose(depth[y, x], DISTANCE * normal[2] / (along @ normal), rtol=1e-3)
 
 
 def test_any_number_of_threads():

@@ -13,12 +13,23 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from warp_splat.color import to_srgb
-from warp_splat.config import MeshConfig
+from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import BYTES, Drawn, Surface, agreed, as_pinhole, footprint, fused, surface_of, voxels_of
+from warp_splat.meshing.fusion import (
+    BYTES,
+    Drawn,
+    Surface,
+    agreed,
+    as_pinhole,
+    depth_of,
+    footprint,
+    fused,
+    surface_of,
+    voxels_of,
+)
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
 from warp_splat.runtime.launch import available_memory
@@ -77,7 +88,7 @@ def needed(package: str) -> Any:
 def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     """The training views as the model shows them, so small that they fit: depths where half of the light is gone."""
     setting, found = opened.setting, []
-    options = replace(setting.options, median_depth=True)
+    options = replace(setting.options, strongest=STRONGEST_MOST)
     background = setting.background if setting.background.ndim == 1 else setting.background.new_zeros(3)
     cameras = [view.camera for view in opened.scene.train]
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
@@ -91,7 +102,7 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
             smaller = as_pinhole(camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height))))
             shown = render(gaussians, smaller, background, options)
             image = to_srgb(shown.image, torch.where) if opened.scene.linear else shown.image
-            found.append(Drawn(smaller, shown.median_depth.cpu().contiguous(), image.cpu().contiguous()))
+            found.append(Drawn(smaller, depth_of(shown, smaller).cpu(), image.cpu().contiguous()))
     return found
 
 

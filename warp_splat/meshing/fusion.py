@@ -15,6 +15,8 @@ from warp.geometry import IsoSurfaceMarchingCubes, sparse_marching_cubes_from_ce
 
 from warp_splat.camera import Camera
 from warp_splat.kernels.distance_field import agree, fuse
+from warp_splat.raster.api import RenderOutput
+from warp_splat.raster.beside import rotations
 from warp_splat.runtime import launch
 
 EDGE = 8  # voxels of a block
@@ -53,6 +55,33 @@ def lens_of(camera: Camera) -> wp.vec4:
     return wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
 
 
+def rays(camera: Camera, device: torch.device) -> torch.Tensor:
+    """Of a pinhole's pixels, in the world, from its center to depth 1, [H, W, 3]."""
+    columns, rows = torch.arange(camera.width, device=device), torch.arange(camera.height, device=device)
+    y, x = torch.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
+    right, down, forward = torch.from_numpy(camera.rotation.astype(np.float32)).to(device)
+    return x[..., None] * right + y[..., None] * down + forward
+
+
+def depth_of(shown: RenderOutput, camera: Camera) -> torch.Tensor:
+    """Depth of the Gaussian at which half of a pixel's light is gone, of its strongest, [H, W]; 0: it is not gone.
+
+    It is taken where the Gaussian is densest along the ray, not at its center, which all pixels that it covers share.
+    """
+    gaussians, numbers, weights = shown.gaussians, shown.strongest, shown.strongest_weights
+    assert numbers is not None and weights is not None
+    order = shown.depths[numbers.clamp_min(0)].sort(stable=True, dim=-1).indices
+    sums = weights.gather(-1, order).cumsum(-1)
+    half = (sums < 0.5 * sums[..., -1:]).sum(-1, keepdim=True).clamp_max(weights.shape[-1] - 1)
+    middle = numbers.gather(-1, order.gather(-1, half))[..., 0].clamp_min(0)
+    ray = rays(camera, weights.device)
+    center = torch.from_numpy(camera.center.astype(np.float32)).to(ray)
+    flatness = gaussians.scales.amin(1, keepdim=True) / gaussians.scales
+    axes = (rotations(gaussians.quats).mT * flatness[..., None])[middle]  # to where the Gaussian is a ball
+    along, mean = ((axes * x[..., None, :]).sum(-1) for x in (ray, gaussians.means[middle] - center))
+    return torch.where(shown.alpha > 0.5, (along * mean).sum(-1) / (along * along).sum(-1), 0.0)
+
+
 def agreed(views: Sequence[Drawn]) -> list[Drawn]:
     """The views without the depths that too few of the others see, of those nearest to them."""
     centers, found = np.stack([view.camera.center for view in views]), []
@@ -81,15 +110,11 @@ def voxels_of(views: Sequence[Drawn], voxel: float) -> torch.Tensor:
     """Places on the grid [V, 3] int32 of the voxels of all blocks that depths fall into, or a truncation beside."""
     blocks = torch.empty(0, dtype=torch.int64)
     for view in views:
-        camera, depth = view.camera, view.depth.double()
-        ys, xs = torch.nonzero((depth > 0) & (depth < COARSEST * voxel * camera.fx), as_tuple=True)
-        z = depth[ys, xs]
-        ray = torch.stack(
-            [(xs + 0.5 - camera.cx) / camera.fx, (ys + 0.5 - camera.cy) / camera.fy, torch.ones_like(z)], 1
-        )
-        rotation, center = torch.from_numpy(camera.rotation.copy()), torch.from_numpy(camera.center)
+        camera, depth = view.camera, view.depth
+        counts = (depth > 0) & (depth < COARSEST * voxel * camera.fx)
+        z, ray, center = depth[counts].double(), rays(camera, depth.device)[counts], torch.from_numpy(camera.center)
         for offset in (-TRUNCATION, 0.0, TRUNCATION):
-            points = (ray * (z + offset * voxel)[:, None]) @ rotation + center
+            points = ray * (z + offset * voxel)[:, None] + center
             places = torch.floor(points / (voxel * EDGE)).long()
             blocks = torch.unique(torch.cat([blocks, torch.unique(code(places))]))
     inside = torch.cartesian_prod(*[torch.arange(EDGE)] * 3)
