@@ -174,6 +174,20 @@ def test_torchrun_restarts_from_the_last_checkpoint(hosts, tmp_path, monkeypatch
     until(lambda: iteration(tmp_path / "hosts") > before, 150, hosts)
 
 
+def test_a_host_that_comes_back_goes_on(hosts, tmp_path, monkeypatch):
+    """torchrun of the first one starts its processes again, and waits; the second one is started with --resume."""
+    monkeypatch.setenv("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1")
+    for host in hosts:
+        host.start(tmp_path / "hosts", ENDLESS, "--max-restarts", "1")
+    until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
+    signaled("host", signal.SIGKILL)(hosts)
+    hosts[1].agent.wait(10)
+    hosts[1].start(tmp_path / "hosts", f"--resume {tmp_path / 'hosts'}", "--max-restarts", "1")
+    until(lambda: "Continuing after" in hosts[0].log.read_text(), 150, hosts)
+    before = iteration(tmp_path / "hosts")
+    until(lambda: iteration(tmp_path / "hosts") > before, 150, hosts)
+
+
 def iteration(folder):
     """Of the last checkpoint; -1 if there is none, or it is being replaced."""
     try:
