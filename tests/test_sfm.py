@@ -186,6 +186,7 @@ def holding(*names):
 def test_bad_photographs_get_one_sentence(tmp_path, make, words):
     make(tmp_path / "photos")
     cannot(lambda: sfm(SfmConfig(str(tmp_path / "photos"), str(tmp_path / "scene"), quiet=True)), "photos", *words)
+    assert (tmp_path / "scene").exists() == (make is flat_photos)  # of which there are features
 
 
 def test_a_folder_in_use_stays_as_it_is(photos, scene, tmp_path):

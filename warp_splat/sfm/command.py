@@ -68,9 +68,9 @@ def sfm(config: SfmConfig) -> int:
     if (scene / "sparse").is_dir():
         say(f"{scene} is complete already; remove it to start anew.")
     else:
-        root = _frames(source, work, config, say) if is_video(source) else photo_root(source)
-        names = find_files(root, PHOTOS, None if is_video(source) else scene)
         with _explained(work):
+            root = _frames(source, work, config, say) if is_video(source) else photo_root(source)
+            names = find_files(root, PHOTOS, None if is_video(source) else scene)
             summary = _reconstruct(root, names, scene, work, config, say)
         summary["seconds_of_last_run"] = round(time.perf_counter() - started, 1)
         write_json(work / "summary.json", summary)
@@ -95,10 +95,13 @@ def scene_for(photos: str, processes: int, **options: Any) -> str:
 
 @contextmanager
 def _explained(work: Path) -> Iterator[None]:
-    """Turn what pycolmap raises, of a full disk or a damaged database, into a sentence."""
+    """Turn what pycolmap raises, of a full disk or a damaged database, into a sentence; what was not begun goes."""
     try:
         yield
     except InputError:
+        if not (work / "database.db").exists():
+            shutil.rmtree(work)
+            work.parent.rmdir()
         raise
     except (RuntimeError, ValueError) as error:
         raise InputError(
