@@ -22,7 +22,8 @@ EPS = wp.constant(2.0**-24)  # of float32, half a unit in the last place of 1
 BLOCK = wp.constant(4.0)  # px
 FAINT = 1.0e-13  # alpha at which the last box ends
 SEEN = 0.25  # share of the cut down to which the blend looks: where the tails matter most, they are summed exactly
-SHARE = wp.constant(1.0 / 40.0)  # of that, alpha at which the first box around ends; the second ends at FAINT
+SHARE = wp.constant(1.0 / 6.0)  # of the alpha at which a box ends, that at which the next one does
+BOXES = wp.constant(3)  # around; the last ends at FAINT
 
 
 @wp.struct
@@ -31,7 +32,6 @@ class Rules:
 
     focal: wp.vec2  # px
     principal: wp.vec2  # px
-    alpha_min: float
     seen: float  # alpha down to which the blend looks
     faint: float
     floor: float  # alpha below which the ideal has nothing
@@ -48,9 +48,9 @@ class BoundView:
     outside: wp.array3d[int]  # [K, rows, columns] of blocks: alpha that no list holds, in units
     unit: float
     usual: float
-    floor: float  # alpha below which the ideal has nothing
+    floor: wp.vec2  # alpha below which the ideal has nothing, and from which on it surely has something
     begins: wp.array[float]  # [K] depths at which the maps begin; the first is below all
-    errors: wp.array[wp.vec3]  # [V] of splats: of alpha, relative; alpha that rounding may hide below the cut; of color
+    errors: wp.array[wp.vec3]  # [V] of splats: of alpha, relative; of alpha that is faint, or at the floor; of color
     brightest: float  # of all colors and the background
     darkest: float  # of the background
     behind: float  # brightest of the background
@@ -67,7 +67,7 @@ class Since:
     steps: float  # entries of the list
     error: float  # of alpha, relative
     shade: float  # error of a color
-    hidden: float  # sum of alpha that rounding may hide
+    hidden: float  # sum of what rounding may change of faint alpha
 
 
 @wp.func
@@ -106,19 +106,18 @@ def brightness(color: wp.vec3, usual: float):
     return wp.max(wp.max(color) / usual, 1.0)
 
 
-@functools.cache
-def make_skipped(floor: bool) -> wp.Function:
-    """What adds alpha that the cut leaves out, by its :func:`brightness`; with ``floor``, the ideal has one."""
+@wp.func
+def sure(raw: Any, alphas: wp.vec2, bound: BoundView):
+    """Alpha in the ideal. What is fainter is left out, as subnormal numbers take many times as long."""
+    return where_less(raw, fill(bound.floor[1], raw), fill(0.0, raw), wp.min(raw, fill(alphas[1], raw)))
 
-    @wp.func
-    def skipped(raw: Any, alpha_min: float, color: wp.vec3, bound: BoundView, before: Any):
-        none = fill(0.0, raw)
-        left_out = where_less(raw, fill(alpha_min, raw), raw, none)
-        if wp.static(floor):
-            left_out = where_less(raw, fill(bound.floor, raw), none, left_out)
-        return fma(left_out, fill(brightness(color, bound.usual), raw), before)
 
-    return skipped
+@wp.func
+def unsure(raw: Any, bound: BoundView):
+    """Alpha that the ideal may have or not."""
+    none = fill(0.0, raw)
+    found = where_less(raw, fill(bound.floor[1], raw), raw, none)
+    return where_less(raw, fill(bound.floor[0], raw), none, found)
 
 
 @wp.func
@@ -149,9 +148,16 @@ def all_rounding(rounding: Any, bound: BoundView):
 
 
 @wp.func
-def all_cuts(taken: Any, added: Any, rest: Any, bound: BoundView):
-    """What cuts change: what is taken and what is added have different signs; the rest lies where the pixel stopped."""
-    return (wp.max(taken, added) + rest + fill(bound.brightest * bound.everywhere, rest)) * 1.001
+def all_cuts(change: Any, taken: Any, added: Any, before: Any):
+    """What cuts change in a channel, and ``before`` in others: ``change`` in the list, and what no list holds."""
+    return wp.max(before, wp.max(change + added, taken - change))
+
+
+@wp.func
+def with_rest(cuts: Any, stopped: Any, bound: BoundView):
+    """With what lies where a pixel ``stopped``, which is its transmittance there, and outside of the last boxes."""
+    hidden = times(stopped, wp.max(bound.brightest - bound.darkest, bound.behind))
+    return (cuts + hidden + fill(bound.brightest * bound.everywhere, hidden)) * 1.001
 
 
 @wp.func
@@ -261,7 +267,7 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 size = wp.max(scales[i])
                 condition, shift = conditions(rules, mean, conic, sigma, size, z)
                 error = alpha_error(rules, condition, shift, wp.max(0.5 * near, 1.0))
-                hidden = rules.alpha_min * error * (1.0 + error)  # as exp(e) - 1 is less
+                hidden = wp.max(rules.floor, rules.seen) * error * (1.0 + error)  # as exp(e) - 1 is less
                 if error > 1.0:  # nothing is known of its place
                     hidden = opacity
                 errors_out[i] = wp.vec3(wp.where(error > 1.0, 0.0, error * (1.0 + error)), hidden, errors_out[i][2])
@@ -274,10 +280,11 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0)  # the blend looks a tenth below a floor
                 if unsure:
                     wp.atomic_add(lost_out, 0, 1)
-                most = opacity * loose * brightness(splats2d.colors[i], rules.usual) * 1.001 / rules.unit
+                color = splats2d.colors[i] + wp.vec3(errors_out[i][2])
+                most = opacity * loose * brightness(color, rules.usual) * 1.001 / rules.unit
                 margin = 1.0e-2 + 1.0e-6 * (wp.max(wp.abs(mean)) + wp.max(splats2d.extents[i]))
                 slack = wp.vec2(margin, margin)
-                level = wp.min(rules.seen, opacity)
+                alpha = wp.min(rules.seen, opacity)
                 if opacity >= rules.seen:
                     radius = wp.ceil(float(splats2d.radii[i]) * wp.sqrt(near / far))
                     radii_out[i] = wp.max(int(wp.min(radius, 1.0e9)), 1)
@@ -288,8 +295,8 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                     half = wp.vec2(0.0)
                 inner = box_of(maps_out, mean, half - slack)
                 carried = int(0)  # what the box before counts
-                for step in range(2):
-                    alpha = wp.where(step == 0, wp.max(level * SHARE, rules.faint), rules.faint)
+                for step in range(BOXES):
+                    alpha = wp.where(step < BOXES - 1, wp.max(alpha * SHARE, rules.faint), rules.faint)
                     wider = wp.max(sigma * wp.sqrt(reach_of(opacity, alpha)), half) + slack
                     if rules.floor == 0.0 and not unsure:
                         aside = beyond(inner[0], inner[1], maps_out.shape[3] - 1, mean[0], sigma[0], most)

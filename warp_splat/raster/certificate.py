@@ -17,6 +17,7 @@ from warp_splat.runtime.pool import even_slices
 
 #: Where maps of depth begin, as shares of the Gaussians: most is hidden by what is near.
 STARTS = (0.06, 0.15, 0.3, 0.55)
+BAND = 1e-4  # around 1/255, where rounding decides what the reference leaves out
 SAMPLE = 2048  # Gaussians that tell depths and colors
 #: Relative error of alpha by the degree of its exponential (kernels/falloff.py).
 EXP_ERRORS = {3: 7.6e-5, 4: 3.1e-6, 5: 1.8e-7, 6: 1.8e-7, None: 1.8e-7}
@@ -82,7 +83,7 @@ def certify(
             usual = max(float(colors[sample].amax(1).median()), 1e-3 * brightest, 1e-30)
         rules = Rules()
         rules.focal, rules.principal = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        rules.alpha_min, rules.seen = options.alpha_min, looking(options).alpha_min
+        rules.seen = looking(options).alpha_min
         rules.faint, rules.square = faint, int(options.extent == "square")
         rules.floor = ALPHA_MIN if options.of == "trained" else 0.0
         rules.exp_error = 1e-6 if options.falloff else EXP_ERRORS[options.exp_degree]
@@ -114,7 +115,7 @@ def certify(
         "darkest": float(background.min()),
         "behind": behind,
         "everywhere": float(lost) + (0.0 if rules.floor else 2.0 * count * faint),
-        "floor": (1.0 - 1e-4) * rules.floor,
+        "floor": wp.vec2((1.0 - BAND) * rules.floor, (1.0 + BAND) * rules.floor) if rules.floor else wp.vec2(faint),
     }
     bound, rounding = (torch.empty(camera.height, camera.width, device=device) for _ in range(2))
     return splats._replace(extents=extents, radii=radii), Certificate(bound, rounding, errors, fields)

@@ -11,16 +11,15 @@ from warp_splat.config import ALPHA_MIN, TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.bin import balanced_slices
 from warp_splat.raster.blend import Blending
-from warp_splat.raster.certificate import FAINT, Certificate
+from warp_splat.raster.certificate import BAND, FAINT, Certificate
 from warp_splat.raster.data import Bins, Pixels, Splats2D
 
 #: From which tolerance on the exponential's polynomial may be of that degree; its error is a tenth at most.
 DEGREES = ((3, 2e-3), (4, 1e-4))
-FIRST = 1.0 / 400.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
+FIRST = 1.0 / 150.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
 STOP = 0.005  # where pixels stop, likewise: the Gaussian that crosses it may take 100 times as much
 LOWER = 0.6  # of what the bound asks for, the cut of tiles that are drawn again
 MOST_ROUNDS = 4
-BAND = 1e-4  # around 1/255, where rounding decides what the reference leaves out
 PER_PIXEL = ("bound", "rounding")  # of a certificate
 
 

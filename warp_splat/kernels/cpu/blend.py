@@ -34,10 +34,10 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.bound import BoundView, make_skipped
+from warp_splat.kernels.bound import BoundView, brightness, own_light, sure, unsure
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
-from warp_splat.kernels.cpu.settle import SETTLED, make_settle
+from warp_splat.kernels.cpu.settle import SETTLED, make_settle, rows_from
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, total, vec16, where_less
@@ -137,12 +137,12 @@ def walk(bins, near, start, count, way, x0, y0, out, begin, step, finish):
 def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     CHANNELS = variant.channels
-    T, WALKED, RGB, DEPTH, SKIPPED = 0, BLOCKS, 2 * BLOCKS, 5 * BLOCKS, (2 + CHANNELS) * BLOCKS
-    STATE = SKIPPED + SETTLED * variant.bound
+    T, WALKED, RGB, DEPTH, IDEAL = 0, BLOCKS, 2 * BLOCKS, 5 * BLOCKS, (2 + CHANNELS) * BLOCKS
+    STATE = IDEAL + SETTLED * variant.bound
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
     fall_at, way = make_falloff(variant.falloff).value, 1
-    expect, conclude = make_settle(RGB, SKIPPED, AHEAD)
-    skipped = make_skipped(variant.floor)
+    prepare, expect, conclude = make_settle(RGB, IDEAL, AHEAD)
+    IDEAL_T, _, IDEAL_RGB, _, TOTAL, ADDED, *_ = rows_from(IDEAL)
 
     def begin(k, here, out, s, bound, tile, bins, near, length):
         """Instances walked."""
@@ -155,8 +155,16 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         raw = fall * splat.opacity
         alpha = alpha_of(raw, alphas)
         if wp.static(variant.bound):
-            row = SKIPPED + block
-            s[row] = skipped(raw, alphas[0], splat.color, bound, s[row])
+            ideal = times(sure(raw, alphas, bound), s[IDEAL_T + block])
+            for channel in range(3):
+                row = IDEAL_RGB + channel * BLOCKS + block
+                s[row] = fma(ideal, splat.color[channel], s[row])
+            if wp.static(variant.floor):
+                may = unsure(raw, bound)
+                s[TOTAL + block] = s[TOTAL + block] + may
+                may = times(may, brightness(splat.color, bound.usual))
+                s[ADDED + block] = own_light(s[IDEAL_T + block], may, bound.usual, s[ADDED + block])
+            s[IDEAL_T + block] = s[IDEAL_T + block] - ideal
         behind = advance(s[T + block], alpha, t_min)
         if wp.static(variant.hides):
             behind = where_less(here, limits[tile, block], behind, wp.min(s[T + block], -s[T + block]))
@@ -209,10 +217,12 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             s[T + block] = vec16(1.0)
         for row in range(WALKED, s.shape[0]):  # as a constant, a blend that takes half as long again
             s[row] = vec16(0.0)
+        if wp.static(variant.bound):
+            prepare(s)
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
         walk(bins, near, start, length, way, x0, y0, kept_out, begin, step, finish)
         if wp.static(variant.bound):
-            conclude(s, bound, tile, bins, length)
+            conclude(s, bound, tile, bins, length, background)
         for block in range(BLOCKS):
             s[T + block] = wp.max(s[T + block], -s[T + block])
             final_out[tile, block] = s[T + block]

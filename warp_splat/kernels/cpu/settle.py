@@ -1,6 +1,7 @@
-"""The bound beside the CPU's blend: what was skipped is settled where a map of depth begins, and at the end.
+"""The bound beside the CPU's blend, which keeps the ideal beside the picture: transmittance and color.
 
-So it costs the loop over blocks one sum. Sixteen rows each, one for every block of pixels.
+What the blend does not see is settled where a map of depth begins, and at the end. Sixteen rows each, one for every
+block of pixels.
 """
 
 import functools
@@ -19,26 +20,38 @@ from warp_splat.kernels.bound import (
     own_light,
     rounding_of,
     watch,
+    with_rest,
 )
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.simd import LANES, times, vec16, where_less
+from warp_splat.kernels.simd import LANES, fma, times, vec16, where_less
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
 
 wp.set_module_options(FORWARD_ONLY)
 
 BLOCKS = TILE * TILE // LANES
-SETTLED = 9 * BLOCKS + 1  # rows
+SETTLED = 12 * BLOCKS + 1  # rows
+
+
+def rows_from(first: int) -> list[int]:
+    """The first of each: T, that at the last settlement, colors, those, sums of what is not seen, and of the bound."""
+    return [first + row * BLOCKS for row in (0, 1, 2, 5, 8, 9, 10, 11)]
 
 
 @functools.cache
-def make_settle(rgb: int, skipped: int, ahead: int) -> tuple[wp.Function, wp.Function]:
-    """What settles before entries, and what concludes.
+def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
+    """What starts, settles before entries, and concludes.
 
-    ``rgb`` and ``skipped``: the first rows of the colors and of what was skipped. Transmittances are the first of all.
-    ``ahead``: entries of the list that are read together.
+    ``rgb`` and ``ideal``: the first rows of the colors, and of what is kept for the bound. Transmittances are the first
+    of all. ``ahead``: entries of the list that are read together.
     """
-    TOTAL, TAKEN, ADDED, ROUNDING, BEFORE, LIGHT = (skipped + row * BLOCKS for row in range(1, 7))
+    T, BEFORE, LIGHT, SEEN, TOTAL, ADDED, TAKEN, ROUNDING = rows_from(ideal)
+
+    @wp.func
+    def at_start(s: wp.array[vec16]):
+        """The rows, which are zeros, before the first entry."""
+        for row in range(T, LIGHT):
+            s[row] = vec16(1.0)
 
     @wp.func
     def settle(s: wp.array[vec16], bound: BoundView, since: Since, tile: int, tiles_x: int, end: int):
@@ -46,25 +59,20 @@ def make_settle(rgb: int, skipped: int, ahead: int) -> tuple[wp.Function, wp.Fun
         begin = since.map
         block = int(0)
         while block < BLOCKS:  # Warp would unroll a range
-            t = wp.max(s[block], -s[block])
+            t = s[T + block]
             gained = vec16(0.0)
             light = vec16(0.0)
             for channel in range(3):
-                now = s[rgb + channel * BLOCKS + block]
-                gained = wp.max(gained, now - s[LIGHT + channel * BLOCKS + block])
+                now = s[LIGHT + channel * BLOCKS + block]
+                gained = wp.max(gained, now - s[SEEN + channel * BLOCKS + block])
                 light = wp.max(light, now)
-                s[LIGHT + channel * BLOCKS + block] = now
-            q = s[skipped + block]
-            total = s[TOTAL + block] + q
-            before = wp.max(s[BEFORE + block], t)
-            s[TAKEN + block] = light_behind(total, gained, s[TAKEN + block])
-            s[ROUNDING + block] = s[ROUNDING + block] + rounding_of(before, t, light, since, bound.brightest)
+                s[SEEN + channel * BLOCKS + block] = now
+            s[TAKEN + block] = light_behind(s[TOTAL + block], gained, s[TAKEN + block])
+            s[ROUNDING + block] = s[ROUNDING + block] + rounding_of(s[BEFORE + block], t, light, since, bound.brightest)
             outside = vec16(outside_of(bound, begin, end, tile, tiles_x, block))
-            added = own_light(before, q, bound.usual + since.shade, s[ADDED + block])
-            s[ADDED + block] = own_light(t, outside, bound.usual, added)
-            s[TOTAL + block] = total + outside
+            s[ADDED + block] = own_light(t, outside, bound.usual, s[ADDED + block])
+            s[TOTAL + block] = s[TOTAL + block] + outside
             s[BEFORE + block] = t
-            s[skipped + block] = vec16(0.0)
             block += 1
         started = Since()
         started.map = end
@@ -91,7 +99,9 @@ def make_settle(rgb: int, skipped: int, ahead: int) -> tuple[wp.Function, wp.Fun
         since[0] = watch(bound, since[0], bins, k, count)
 
     @wp.func
-    def conclude(s: wp.array[vec16], bound: BoundView, tile: int, bins: BinsView, length: int):
+    def conclude(
+        s: wp.array[vec16], bound: BoundView, tile: int, bins: BinsView, length: int, background: wp.array[float]
+    ):
         """The bound of every pixel, which saw ``length`` entries of the list."""
         since = memory(s)
         settle(s, bound, since[0], tile, bins.tiles_x, bound.begins.shape[0])
@@ -101,13 +111,18 @@ def make_settle(rgb: int, skipped: int, ahead: int) -> tuple[wp.Function, wp.Fun
         top = (tile // tiles_x) * TILE
         block = int(0)
         while block < BLOCKS:
-            t = wp.max(s[block], -s[block])
-            stopped = where_less(s[block], vec16(0.0), vec16(1.0), vec16(wp.where(cut, 1.0, 0.0)))
-            hidden = times(stopped, wp.max(bound.brightest - bound.darkest, bound.behind))
-            last = wp.max(times(stopped, bound.brightest), vec16(bound.behind))
-            taken = light_behind(s[TOTAL + block], times(t, last), s[TAKEN + block])
+            t = s[T + block]
+            through = t - wp.max(s[block], -s[block])
+            stopped = where_less(s[block], vec16(0.0), t, times(t, wp.where(cut, 1.0, 0.0)))
+            last = wp.max(times(stopped, bound.brightest), times(t, bound.behind))
+            taken = light_behind(s[TOTAL + block], last, s[TAKEN + block])
+            cuts = vec16(0.0)
+            for channel in range(3):
+                row = channel * BLOCKS + block
+                change = fma(through, background[channel], s[LIGHT + row] - s[rgb + row])
+                cuts = all_cuts(change, taken, s[ADDED + block], cuts)
             rounding = all_rounding(s[ROUNDING + block], bound)
-            found = all_cuts(taken, s[ADDED + block], times(t, hidden), bound) + rounding
+            found = with_rest(cuts, stopped, bound) + rounding
             for lane in range(LANES):
                 y = top + 4 * (block >> 2) + lane // 4
                 x = left + 4 * (block & 3) + lane % 4
@@ -116,4 +131,4 @@ def make_settle(rgb: int, skipped: int, ahead: int) -> tuple[wp.Function, wp.Fun
                     bound.rounding_out[y, x] = rounding[lane]
             block += 1
 
-    return expect, conclude
+    return at_start, expect, conclude

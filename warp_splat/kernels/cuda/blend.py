@@ -12,7 +12,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, Since
 from warp_splat.kernels.cuda import warps
-from warp_splat.kernels.cuda.settle import conclude, expect, mat_settled, skip
+from warp_splat.kernels.cuda.settle import at_start, blend_ideal, conclude, expect
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
@@ -109,7 +109,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         top = float(line) + 0.5
         start = bins.ranges[tile][0]
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
-        settled = mat_settled()
+        settled = at_start()
         since = Since()
         ts = vec_each(1.0)
         counts = vec_each(float(length))
@@ -128,9 +128,8 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             first = batch * BATCH
             if wp.static(variant.bound):
                 settled, since = expect(
-                    settled, ts, reds, greens, blues, bound, since, bins, tile, lane, half, start + first,
-                    wp.min(BATCH, length - first),
-                )  # fmt: skip
+                    settled, bound, since, bins, tile, lane, half, start + first, wp.min(BATCH, length - first)
+                )
             mine = vec12(0.0)
             if first + thread < length:
                 splat = bins.splats[bins.instances[start + first + thread]]
@@ -159,7 +158,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
                             alpha = alpha_of(fall * g[OPACITY], alphas)
                             if wp.static(variant.bound):
                                 color = wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2])
-                                settled = skip(settled, p, fall * g[OPACITY], alphas[0], color, bound)
+                                settled = blend_ideal(settled, p, fall * g[OPACITY], alphas, color, bound)
                             behind = advance(ts[p], alpha, t_min)
                             if wp.static(variant.hides):
                                 behind = wp.where(here < limits[tile, place_of(lane, half + p)], behind, -wp.abs(ts[p]))
@@ -185,6 +184,6 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             shown = wp.vec4(reds[p], greens[p], blues[p], fars[p])
             write_pixel(pixels_out, background, line + place // TILE, column + place % TILE, shown, wp.abs(ts[p]))
             if wp.static(variant.bound):
-                conclude(settled, p, shown, ts[p], bound, since, bins, tile, lane, half, length)
+                conclude(settled, p, shown, ts[p], background, bound, since, bins, tile, lane, half, length)
 
     return blend

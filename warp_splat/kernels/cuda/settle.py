@@ -8,54 +8,45 @@ from warp_splat.kernels.bound import (
     Since,
     all_cuts,
     all_rounding,
+    brightness,
     light_behind,
-    make_skipped,
     next_map,
     outside_of,
     own_light,
     rounding_of,
+    sure,
+    unsure,
     watch,
+    with_rest,
 )
 from warp_splat.kernels.cuda.warps import across_of, down_of
 from warp_splat.kernels.simd import where_less
 from warp_splat.kernels.structs import BinsView
 
 EACH = 4  # pixels of a lane
-skipped = make_skipped(floor=True)
-SKIPPED, TOTAL, TAKEN, ADDED, ROUNDING, BEFORE, LIGHT = (wp.constant(row) for row in range(7))
-mat_settled = wp.types.matrix(shape=(9, EACH), dtype=float)
+T, BEFORE, TOTAL, TAKEN, ADDED, ROUNDING, LIGHT = (wp.constant(row) for row in range(7))
+SEEN = wp.constant(9)
+mat_settled = wp.types.matrix(shape=(12, EACH), dtype=float)
 vec_each = wp.types.vector(length=EACH, dtype=float)
 
 
 @wp.func
-def settle(
-    m: mat_settled,
-    p: int,
-    pixel: wp.vec4,
-    bound: BoundView,
-    since: Since,
-    end: int,
-    tile: int,
-    tiles_x: int,
-    block: int,
-):
+def settle(m: mat_settled, p: int, bound: BoundView, since: Since, end: int, tile: int, tiles_x: int, block: int):
     """The sums of a pixel up to here, where the map ``end`` follows those that begin."""
-    t = wp.abs(pixel[3])
-    now = wp.vec3(pixel[0], pixel[1], pixel[2])
-    gained = wp.max(wp.max(now - wp.vec3(m[LIGHT, p], m[LIGHT + 1, p], m[LIGHT + 2, p])), 0.0)
-    q = m[SKIPPED, p]
-    total = m[TOTAL, p] + q
-    before = wp.max(m[BEFORE, p], t)
-    m[TAKEN, p] = light_behind(total, gained, m[TAKEN, p])
-    m[ROUNDING, p] = m[ROUNDING, p] + rounding_of(before, t, wp.max(now), since, bound.brightest)
-    outside = outside_of(bound, since.map, end, tile, tiles_x, block)
-    added = own_light(before, q, bound.usual + since.shade, m[ADDED, p])
-    m[ADDED, p] = own_light(t, outside, bound.usual, added)
-    m[TOTAL, p] = total + outside
-    m[BEFORE, p] = t
-    m[SKIPPED, p] = 0.0
+    t = m[T, p]
+    gained = float(0.0)
+    light = float(0.0)
     for channel in range(3):
-        m[LIGHT + channel, p] = now[channel]
+        now = m[LIGHT + channel, p]
+        gained = wp.max(gained, now - m[SEEN + channel, p])
+        light = wp.max(light, now)
+        m[SEEN + channel, p] = now
+    m[TAKEN, p] = light_behind(m[TOTAL, p], gained, m[TAKEN, p])
+    m[ROUNDING, p] = m[ROUNDING, p] + rounding_of(m[BEFORE, p], t, light, since, bound.brightest)
+    outside = outside_of(bound, since.map, end, tile, tiles_x, block)
+    m[ADDED, p] = own_light(t, outside, bound.usual, m[ADDED, p])
+    m[TOTAL, p] = m[TOTAL, p] + outside
+    m[BEFORE, p] = t
     return m
 
 
@@ -66,44 +57,59 @@ def block_at(lane: int, pixel: int):
 
 
 @wp.func
+def at_start():
+    """The sums before the first entry."""
+    m = mat_settled()
+    for p in range(EACH):
+        m[T, p] = 1.0
+        m[BEFORE, p] = 1.0
+    return m
+
+
+@wp.func
 def expect(
-    m: mat_settled, ts: vec_each, reds: vec_each, greens: vec_each, blues: vec_each, bound: BoundView, since: Since,
-    bins: BinsView, tile: int, lane: int, half: int, k: int, count: int,
+    m: mat_settled, bound: BoundView, since: Since, bins: BinsView, tile: int, lane: int, half: int, k: int, count: int
 ):  # fmt: skip
     """Before ``count`` entries from ``k`` on: the sums, and what there is since they were settled."""
     end = next_map(bound, since.map, bins.splats[bins.instances[k + count - 1]].depth)
     if end > since.map:
         for p in range(EACH):
-            pixel = wp.vec4(reds[p], greens[p], blues[p], ts[p])
-            m = settle(m, p, pixel, bound, since, end, tile, bins.tiles_x, block_at(lane, half + p))
+            m = settle(m, p, bound, since, end, tile, bins.tiles_x, block_at(lane, half + p))
         since = Since()
         since.map = end
     return m, watch(bound, since, bins, k, count)
 
 
 @wp.func
-def skip(m: mat_settled, p: int, raw: float, alpha_min: float, color: wp.vec3, bound: BoundView):
-    """With what a pixel leaves out."""
-    m[SKIPPED, p] = skipped(raw, alpha_min, color, bound, m[SKIPPED, p])
+def blend_ideal(m: mat_settled, p: int, raw: float, alphas: wp.vec2, color: wp.vec3, bound: BoundView):
+    """With one more Gaussian of the ideal."""
+    weight = sure(raw, alphas, bound) * m[T, p]
+    for channel in range(3):
+        m[LIGHT + channel, p] += weight * color[channel]
+    may = unsure(raw, bound)
+    m[TOTAL, p] += may
+    m[ADDED, p] = own_light(m[T, p], may * brightness(color, bound.usual), bound.usual, m[ADDED, p])
+    m[T, p] -= weight
     return m
 
 
 @wp.func
 def conclude(
-    m: mat_settled, p: int, sums: wp.vec4, final: float, bound: BoundView, since: Since, bins: BinsView, tile: int,
-    lane: int, half: int, length: int,
+    m: mat_settled, p: int, sums: wp.vec4, final: float, background: wp.array[float], bound: BoundView, since: Since,
+    bins: BinsView, tile: int, lane: int, half: int, length: int,
 ):  # fmt: skip
     """Write the bound of a pixel, which saw ``length`` entries of the list."""
-    pixel = wp.vec4(sums[0], sums[1], sums[2], final)
-    block = block_at(lane, half + p)
-    m = settle(m, p, pixel, bound, since, bound.begins.shape[0], tile, bins.tiles_x, block)
-    t = wp.abs(final)
-    stopped = where_less(final, 0.0, 1.0, wp.where(bins.ranges[tile][1] - bins.ranges[tile][0] > length, 1.0, 0.0))
-    hidden = stopped * wp.max(bound.brightest - bound.darkest, bound.behind)
-    taken = light_behind(m[TOTAL, p], t * wp.max(stopped * bound.brightest, bound.behind), m[TAKEN, p])
+    m = settle(m, p, bound, since, bound.begins.shape[0], tile, bins.tiles_x, block_at(lane, half + p))
+    t = m[T, p]
+    stopped = where_less(final, 0.0, t, wp.where(bins.ranges[tile][1] - bins.ranges[tile][0] > length, t, 0.0))
+    taken = light_behind(m[TOTAL, p], wp.max(stopped * bound.brightest, t * bound.behind), m[TAKEN, p])
+    cuts = float(0.0)
+    for channel in range(3):
+        change = (t - wp.abs(final)) * background[channel] + m[LIGHT + channel, p] - sums[channel]
+        cuts = all_cuts(change, taken, m[ADDED, p], cuts)
     rounding = all_rounding(m[ROUNDING, p], bound)
     y = (tile // bins.tiles_x) * TILE + down_of(lane, half + p)
     x = (tile % bins.tiles_x) * TILE + across_of(lane, half + p)
     if y < bound.bound_out.shape[0] and x < bound.bound_out.shape[1]:
-        bound.bound_out[y, x] = all_cuts(taken, m[ADDED, p], t * hidden, bound) + rounding
+        bound.bound_out[y, x] = with_rest(cuts, stopped, bound) + rounding
         bound.rounding_out[y, x] = rounding
