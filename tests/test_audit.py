@@ -159,7 +159,7 @@ def test_a_module_of_the_folder_where_one_stands_is_audited(tmp_path):
     (tmp_path / "mine.py").write_text("def draw(*given):\n    return given[-1].expand(48, 64, 3)\n")
     command = [Path(sys.executable).parent / "warp-splat", "audit", "mine:draw", "--case", "one"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.stdout.startswith("one: 1 Gaussians on ") and "off by 0.719" in done.stdout, done.stderr
+    assert done.stdout.startswith("one: 1 Gaussian on ") and "off by 0.719" in done.stdout, done.stderr
 
 
 @pytest.mark.slow

@@ -117,6 +117,7 @@ WRONG = {
     "expected the cells of": ((0, 1), spoil("3.4", "3.1")),
     "expected the antialiasing of": ((0, 1), spoil("antialiasing=False", "antialiasing=True", "cfg_args")),
     "expected a block as training writes it": ((0, 1), spoil('"number"', '"numbers"')),
+    "expected cameras as training writes them": ((0, 1), spoil('"img_name"', '"image"', "cameras.json")),
 }
 
 

@@ -213,7 +213,7 @@ class ConvertConfig:
 class MergeConfig:
     """Trainings of the blocks of a scene (train --block) to make one model of."""
 
-    folder: str = argument("the folder that holds those of their trainings; the model is written here")
+    folder: str = argument("the folder in which the folders of their trainings are; the model is written here")
 
 
 @dataclass

@@ -140,7 +140,10 @@ def merge_blocks(config: MergeConfig) -> int:
         colors.append(cloud[1][own])
         with reading(place / CAMERAS, "cameras as training writes them"):
             found = json.loads((place / CAMERAS).read_text(encoding="utf-8"))
-            cameras |= {entry["img_name"]: entry for entry in found}
+            try:
+                cameras |= {entry["img_name"]: entry for entry in found}
+            except (KeyError, TypeError) as error:
+                raise Unexpected("other JSON") from error
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)))
     for old in folder.glob("point_cloud/*/point_cloud.ply"):  # merged before, from blocks that went further
         old.unlink()

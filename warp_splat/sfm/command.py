@@ -10,7 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,8 +100,9 @@ def _explained(work: Path) -> Iterator[None]:
         yield
     except InputError:
         if not (work / "database.db").exists():
-            shutil.rmtree(work)
-            work.parent.rmdir()
+            shutil.rmtree(work, ignore_errors=True)
+            with suppress(OSError):  # there is something else in it
+                work.parent.rmdir()
         raise
     except (RuntimeError, ValueError) as error:
         raise InputError(
