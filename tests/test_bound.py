@@ -6,11 +6,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from exact_cameras import exact_render
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import warp_splat
-from warp_splat.compare import oracle
 from warp_splat.compare.scenes import cloud, look, tensors
 from warp_splat.compare.stability import cases, verdict
 from warp_splat.compare.truth import for_oracle
@@ -33,7 +33,7 @@ def ideal(gaussians, camera, background, options):
     means, quats, scales, opacities, sh_dc, sh_rest = (tensor.detach().double() for tensor in gaussians)
     keywords = for_oracle(options) | IDEAL
     sh = torch.cat([sh_dc, sh_rest], 1)
-    out = oracle.exact_render(means, quats, scales, opacities, sh, camera, background.double(), **keywords)
+    out = exact_render(means, quats, scales, opacities, sh, camera, background.double(), **keywords)
     return out.image, ~out.fragile
 
 
@@ -161,7 +161,7 @@ def test_cuts_stay_below_a_tolerance(of, tolerance):
     out = render(gaussians, camera, torch.zeros(3), options)
     means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double() for tensor in gaussians)
     keywords = for_oracle(RasterOptions()) | {"t_min": 0.0, "alpha_min": 0.0 if of == "ideal" else ALPHA_MIN}
-    exact = oracle.exact_render(means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), camera, **keywords)
+    exact = exact_render(means, quats, scales, opacities, torch.cat([sh_dc, sh_rest], 1), camera, **keywords)
     error = (out.image - exact.image).abs().amax(2)
     assert (error <= out.bound)[~exact.fragile].all()
     above = out.bound - out.rounding > tolerance
