@@ -2,7 +2,8 @@
 
 Walks: a pixel of random alphas through which a thousandth of the light comes, forward and back in float32, against the
 same in float64; the bounds are those of docs/adjoints.md. Trained scenes: float64 without and with a cut, and how often
-float32 decides otherwise at 1/255. Integrators: the observed order, from docs/compare/volume.csv.
+float32 decides otherwise at 1/255; gradients summed in random orders, as atomic
+additions are. Integrators: the observed order, from docs/compare/volume.csv.
 
     python benchmarks/numerics.py [-s SCENE -m MODEL ...] [--out docs/benchmarks]
 """
@@ -26,6 +27,7 @@ from warp_splat.scene import load_scene
 EPS = 2.0**-24
 LAYERS, PIXELS = (10, 100, 1_000, 10_000, 100_000), 256
 LEFT = 1e-3  # of the light, behind all layers
+SIDE, ORDERS = 48, 20  # pixels of a square whose gradients are summed, in that many orders
 NEAR = 0.05  # of 1/255, relative: pairs that tell how many of them are where rounding decides
 HEADERS = ("what", "where", "measured", "along the exact one", "by the square root", "bound", "condition")
 
@@ -92,19 +94,23 @@ def walk(count: int) -> list[dict]:
     return rows
 
 
-def some_pixels(camera: Camera, count: int) -> tuple[torch.Tensor, torch.Generator]:
+def some_pixels(camera: Camera, count: int, seed: int) -> tuple[torch.Tensor, torch.Generator]:
     """Row and column of each, [P, 2], at random, and what goes on at random."""
-    generator = torch.Generator().manual_seed(1)
-    sides = (camera.height, camera.width)
+    generator, sides = torch.Generator().manual_seed(seed), (camera.height, camera.width)
     return torch.stack([torch.randint(0, side, (count,), generator=generator) for side in sides], 1), generator
+
+
+def sorted_splats(gaussians: Gaussians, camera: Camera) -> tuple[oracle.Splats, torch.Tensor]:
+    """Projected in float64, and those that are seen, nearest first."""
+    double = [tensor.double() for tensor in gaussians]
+    exact = oracle.exact_splats(*double[:4], torch.cat(double[4:], 1), camera)
+    order = torch.sort(exact.z.float(), stable=True).indices
+    return exact, order[exact.live[order]]
 
 
 def biased(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
     """How far gradients with a cut are from those without, float64, of random signs at some pixels."""
-    generator = torch.Generator().manual_seed(1)
-    pixels = torch.stack(
-        [torch.randint(0, side, (count,), generator=generator) for side in (camera.height, camera.width)], 1
-    )
+    pixels, generator = some_pixels(camera, count, 1)
     signs = 2.0 * torch.randint(0, 2, (count, 3), generator=generator).double() - 1.0
     found, rows = {}, []
     for cuts in ((0.0, 0.0), (ALPHA_MIN, 0.0), (0.0, 1e-4)):
@@ -126,17 +132,12 @@ def biased(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[
 @torch.no_grad()
 def flipped(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
     """How often float32 decides otherwise than float64 whether alpha is below 1/255, and what that changes."""
-    generator = torch.Generator().manual_seed(2)
-    pixels = torch.stack(
-        [torch.randint(0, side, (count,), generator=generator) for side in (camera.height, camera.width)], 1
-    )
-    double = [tensor.double() for tensor in gaussians]
-    exact = oracle.exact_splats(*double[:4], torch.cat(double[4:], 1), camera)
-    order = torch.sort(exact.splats.z.float(), stable=True).indices
-    order = order[exact.live[order]]
+    pixels, _ = some_pixels(camera, count, 2)
+    exact, order = sorted_splats(gaussians, camera)
     drawn = project(gaussians, camera, RasterOptions(alpha_min=1e-6))
     xx, xy, yy = drawn.conics[order].unbind(1)
-    flips = expected = near = off = worst = 0.0
+    colors = exact.color[order]
+    flips = expected = near = off = change = most = 0.0
     for part in pixels.split(64):
         raw, _ = oracle._alphas(exact, order, camera, part)
         dx, dy = (drawn.means2d[order] - (part.flip(1) + 0.5)[:, None]).unbind(2)
@@ -149,14 +150,65 @@ def flipped(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list
         other = ((raw < ALPHA_MIN) != (alphas < ALPHA_MIN)) & close
         flips, near, off = flips + float(other.sum()), near + float(close.sum()), off + float(offs.sum())
         expected += float(offs.sum()) / (2.0 * NEAR)  # as likely anywhere within NEAR
-        worst += float((front[close] * offs).sum())
+        pixel, layer = close.nonzero(as_tuple=True)
+        light = torch.cumsum((front * solid)[..., None] * colors, 1)
+        behind = light[pixel, -1] - light[pixel, layer]
+        own = front[close, None] * colors[layer]
+        change += float((offs * (behind - own).abs().amax(1)).sum())
+        most += float((offs * front[close]).sum() * colors.max())
     per = 1e6 / count
     return [
         {"what": "decisions at 1/255 that float32 turns, a megapixel: found", "where": name, "measured": per * flips},
         {"what": "the same, expected", "where": name, "measured": per * expected},
         {"what": "error of alpha there, relative, mean", "where": name, "measured": off / near},
-        {"what": "T where they are turned, mean", "where": name, "measured": worst / off, "bound": 1.0},
+        {
+            "what": "what one changes in its pixel, mean",
+            "where": name,
+            "measured": ALPHA_MIN * change / off,
+            "bound": ALPHA_MIN * most / off,
+        },
     ]
+
+
+@torch.no_grad()
+def shuffled(name: str, gaussians: Gaussians, camera: Camera) -> list[dict]:
+    """Gradients of opacities of random signs at SIDE x SIDE pixels, summed in float32 in random orders and in ours."""
+    exact, order = sorted_splats(gaussians, camera)
+    colors = exact.color[order]
+    top, left = ((size // 2 - SIDE // 2) // 16 * 16 for size in (camera.height, camera.width))
+    generator, terms = torch.Generator().manual_seed(3), []
+    for pixel in range(0, SIDE * SIDE, 64):  # tile by tile, block by block, as the blend goes
+        lanes = pixel + torch.arange(64)
+        tile, block, lane = lanes // 256, lanes // 16 % 16, lanes % 16
+        y = top + tile // (SIDE // 16) * 16 + block // 4 * 4 + lane // 4
+        x = left + tile % (SIDE // 16) * 16 + block % 4 * 4 + lane % 4
+        raw, _ = oracle._alphas(exact, order, camera, torch.stack([y, x], 1))
+        solid = torch.where(raw < ALPHA_MIN, 0.0, raw.clamp_max(0.99))
+        front = torch.cumprod(1.0 - solid, 1) / (1.0 - solid)
+        light = (2.0 * torch.randint(0, 2, (64, 3), generator=generator).double() - 1.0) @ colors.T
+        weighted = front * solid * light
+        behind = weighted.sum(1, keepdim=True) - torch.cumsum(weighted, 1)
+        by_alpha = front * light - behind / (1.0 - solid)
+        terms.append((by_alpha * raw / exact.opacity[order] * (solid > 0.0)).float())
+    each = torch.cat(terms).numpy()
+    each = each[:, (each != 0.0).any(0)]
+    truth, sizes = each.sum(0, dtype=np.float64), np.abs(each).sum(0, dtype=np.float64)
+    length, generator = np.linalg.norm(truth), np.random.default_rng(4)
+    found = [np.add.accumulate(each[generator.permutation(len(each))], 0)[-1] for _ in range(ORDERS)]
+    ours = each.reshape(-1, 16, 16, each.shape[1])  # tiles, blocks, lanes
+    for _ in range(3):
+        ours = np.add.accumulate(ours, 1)[:, -1] if ours.ndim > 2 else np.add.accumulate(ours, 0)[-1]
+    errors = [np.linalg.norm(one - truth) / length for one in found]
+    apart = [np.linalg.norm(one - other) / length for one, other in zip(found[::2], found[1::2], strict=True)]
+    counts, condition = (each != 0.0).sum(0), np.linalg.norm(sizes) / length
+    bounds = [np.linalg.norm(EPS * by * sizes) / length for by in (np.sqrt(counts), counts)]
+    rows = [
+        {"measured": float(np.median(errors)), "root": bounds[0], "bound": bounds[1], "condition": condition},
+        {"measured": float(np.median(apart))},
+        {"measured": float(np.linalg.norm(ours - truth) / length)},
+    ]
+    names = ("gradient summed in random orders", "two such sums apart", "summed in the fixed order")
+    return [{"what": what, "where": name} | row for what, row in zip(names, rows, strict=True)]
 
 
 def orders() -> list[dict]:
@@ -189,7 +241,7 @@ def main() -> None:
         with torch.no_grad():
             gaussians = GaussianModel.load(model).arranged().activated()
         name = Path(folder).name
-        rows += flipped(name, gaussians, camera, arguments.pixels)
+        rows += flipped(name, gaussians, camera, arguments.pixels) + shuffled(name, gaussians, camera)
         rows += biased(name, gaussians, camera, arguments.pixels // 24)
     rows += orders()
     formats = {"measured": ".2g", "along": ".3f", "root": ".2g", "bound": ".2g", "condition": ".2g"}
