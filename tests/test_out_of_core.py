@@ -12,7 +12,7 @@ SPARSE = {"optimizer_type": "sparse_adam"}
 @pytest.mark.parametrize(
     "options",
     [
-        {},
+        {"sh_interval": 15},
         {"growth": "budget", "max_gaussians": 7000, "random_background": True, "prune_screen_size": 20},
         {"growth": "mcmc", "max_gaussians": 4900, "parts": "floaters"},
     ],

@@ -154,9 +154,11 @@ class GaussianModel:
     def activated(self, degree: int | None = None, rows: torch.Tensor | None = None) -> Gaussians:
         """As the renderer takes them; with ``rows`` (indices) only those, and gradients are sparse.
 
-        At ``degree`` 0, sh_rest is empty, so that none of the 45 numbers gets a gradient.
+        At ``degree`` 0, sh_rest is empty, so that none of the 45 numbers gets a gradient, or is read.
         """
-        raw = self.parameters
+        raw = dict(self.parameters)
+        if degree == 0:
+            raw["sh_rest"] = raw["sh_rest"].detach()[:, :0]
         if rows is not None:
             raw = {name: Taken.apply(leaf, rows) for name, leaf in raw.items()}
         return Gaussians(
@@ -164,7 +166,7 @@ class GaussianModel:
             raw["quats"],
             *Activate.apply(raw["scales"], raw["opacities"]),
             raw["sh_dc"],
-            raw["sh_rest"].detach()[:, :0] if degree == 0 else raw["sh_rest"],
+            raw["sh_rest"],
         )
 
     def splats(self, rows: torch.Tensor | slice = slice(None)) -> SplatArrays:

@@ -281,8 +281,8 @@ class Trainer:
         if not self.optimizer.folder:
             return None
         with torch.no_grad(), stage("project"):
-            parts = torch.arange(len(self.model)).split(CHUNK)
-            radii = [project(self.model.activated(self.degree, part), camera, options).radii for part in parts]
+            parts, options = torch.arange(len(self.model)).split(CHUNK), replace(options, sh_degree=0)
+            radii = [project(self.model.activated(0, part), camera, options).radii for part in parts]
         return torch.cat(radii).nonzero()[:, 0]
 
     def _render(
