@@ -14,7 +14,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import LAST
 from warp_splat.formats.ply import save_points
 from warp_splat.scene import load_scene
-from warp_splat.scene.blocks import FILE, block_of
+from warp_splat.scene.blocks import BLOCK, block_of
 
 APART = 100.0
 
@@ -80,8 +80,8 @@ def put(trained, folder, *numbers):
     """Trainings of blocks with the model of another."""
     for number in numbers:
         shutil.copytree(trained, folder / str(number))
-        facts = json.loads((trained / FILE).read_text())
-        (folder / str(number) / FILE).write_text(json.dumps({**facts, "number": int(number)}))
+        facts = json.loads((trained / BLOCK).read_text())
+        (folder / str(number) / BLOCK).write_text(json.dumps({**facts, "number": int(number)}))
 
 
 def test_a_merge_of_one_model_by_blocks_is_that_model(trained, tmp_path, capsys):
@@ -97,7 +97,7 @@ def test_a_merge_of_one_model_by_blocks_is_that_model(trained, tmp_path, capsys)
     assert "Holding out every 8th image by name" in capsys.readouterr().out
 
 
-def spoil(old, new, name=FILE):
+def spoil(old, new, name=BLOCK):
     def change(folder):
         path = folder / "1" / name
         text = path.read_text()
@@ -133,5 +133,8 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
 def test_what_a_block_cannot_have(trained, tmp_path, fails):
     assert "expected no part that learns" in fails(
         "train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts", "exposure"
+    )
+    assert "expected parts by name" in fails(
+        "train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts", "auto"
     )
     assert "--block 2/2: expected 1/2" in fails("train", "--resume", trained, "--block", "2/2")

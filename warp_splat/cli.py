@@ -157,7 +157,7 @@ def _restarted(given: dict) -> dict:
         raise InputError("-m: expected a folder, from which torchrun's --max-restarts could go on; name one.")
     folder, begun = given.get("model_path", ""), psutil.Process(os.getppid()).create_time()  # of torchrun
     path = os.path.join(folder, LAST)
-    again = os.environ["TORCHELASTIC_RESTART_COUNT"] != "0"
+    again = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
     own = again and folder and os.path.isfile(path) and os.path.getmtime(path) > begun  # not of an older training
     return {"start_checkpoint": folder} if own else given
 

@@ -23,7 +23,7 @@ from warp_splat.formats.ply import load_points, save_points
 from warp_splat.formats.splats import concatenated
 from warp_splat.scene.types import visible
 
-FILE = "block.json"  # in the folder of a training that has ended
+BLOCK = "block.json"  # in the folder of a training that has ended
 SHARE = 0.1  # of what a photograph shows, for a block to train on it
 SOME = 1000  # points of a block that tell what a photograph shows
 ENDLESS = float(np.finfo(np.float32).max)  # where a cell has no neighbor; JSON has no infinity
@@ -88,7 +88,7 @@ def block_of(text: str, points: np.ndarray, cameras: Sequence[Camera]) -> Block:
 
 def write_block(folder: Path, block: Block) -> None:
     """Note in the folder of a training that it has ended, and which block it was."""
-    write_json(folder / FILE, {"number": block.number, "cells": block.cells.tolist()})
+    write_json(folder / BLOCK, {"number": block.number, "cells": block.cells.tolist()})
 
 
 def _read_block(path: Path) -> Block:
@@ -113,11 +113,11 @@ def merge_blocks(config: MergeConfig) -> int:
     from warp_splat.formats.curve import arranged  # noqa: PLC0415 - likewise
 
     folder = Path(config.folder)
-    places = sorted(path.parent for path in folder.glob(f"*/{FILE}"))
+    places = sorted(path.parent for path in folder.glob(f"*/{BLOCK}"))
     if (folder / LAST).exists() or not places:
         found = "a training" if places else "none"
         raise InputError(f"{folder}: expected only folders of ended trainings by --block, found {found}.")
-    blocks, models = [_read_block(place / FILE) for place in places], [open_model(place) for place in places]
+    blocks, models = [_read_block(place / BLOCK) for place in places], [open_model(place) for place in places]
     kinds = []
     for block, (_, _, options) in zip(blocks, models, strict=True):
         cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist()}
@@ -145,9 +145,9 @@ def merge_blocks(config: MergeConfig) -> int:
             except (KeyError, TypeError) as error:
                 raise Unexpected("other JSON") from error
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)))
-    for old in folder.glob("point_cloud/*/point_cloud.ply"):  # merged before, from blocks that went further
-        old.unlink()
     save_gaussians(path, merged)
+    for old in {*folder.glob("point_cloud/*/point_cloud.ply")} - {path}:  # merged before, from blocks of other lengths
+        old.unlink()
     save_points(folder / "input.ply", np.concatenate(points), np.concatenate(colors))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))

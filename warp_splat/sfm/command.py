@@ -99,7 +99,7 @@ def _explained(work: Path) -> Iterator[None]:
     try:
         yield
     except InputError:
-        if not (work / "database.db").exists():
+        if not (work / "database.db").exists() and not (work / "frames").exists():
             shutil.rmtree(work, ignore_errors=True)
             with suppress(OSError):  # there is something else in it
                 work.parent.rmdir()

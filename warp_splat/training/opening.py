@@ -18,6 +18,7 @@ from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch, pool
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
+from warp_splat.scene.blocks import BLOCK
 from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
@@ -138,5 +139,6 @@ def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: boo
     model_folder.write_cameras(folder, scene.test, scene.train, scene.coordinates)
     write_coordinates(folder, scene.coordinates)
     remove_leftovers(folder)
+    (folder / BLOCK).unlink(missing_ok=True)  # until this, too, has ended
     if not (continues and (folder / "input.ply").exists()):
         save_points(folder / "input.ply", scene.points, scene.colors)

@@ -243,6 +243,8 @@ def check_train(config: TrainConfig) -> None:
         raise InputError(
             f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
         )
+    if config.data.block and parts == AUTO:
+        raise InputError(f"--block: expected parts by name, got --parts {AUTO}: each block would take others.")
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:
         raise InputError("--position_lr_init, --position_lr_final: expected more than 0, for rates to decay between.")
     if config.grow.growth not in GROWTHS:
