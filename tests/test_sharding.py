@@ -116,7 +116,8 @@ def train(folder, count, options):
     command = [sys.executable]
     if count > 1:
         command += ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
-    command += [str(ROOT / "train.py"), "-m", str(folder), *options.split(), "--shard" if count > 1 else "--no-shard"]
+    command += [str(ROOT / "train.py"), "-m", str(folder), *options.split()]
+    command += ["--shard", "--viewer"] if count > 1 else ["--no-shard"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     run = subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=280)
     assert run.returncode == 0, run.stderr

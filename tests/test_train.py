@@ -18,7 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
-from warp_splat.formats.ply import load_ply
+from warp_splat.formats.ply import load_ply, save_ply_parts
 from warp_splat.formats.png import load_png
 from warp_splat.raster.drivers import CPU
 from warp_splat.training.loss import image_loss
@@ -230,9 +230,9 @@ def test_a_full_disk_does_not_lose_the_model(trained, tmp_path, monkeypatch, cap
     """The save fails; the model goes to the folder for temporary files instead."""
 
     def full(path, *arrays, **options):
-        (no_space if "point_cloud" in str(path) else save_gaussians)(path, *arrays, **options)
+        (no_space if "point_cloud" in str(path) else save_ply_parts)(path, *arrays, **options)
 
-    monkeypatch.setattr("warp_splat.gaussians.save_gaussians", full)
+    monkeypatch.setattr("warp_splat.gaussians.save_ply_parts", full)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert train(tmp_path / "model", "--iterations", "5", "--antialiasing") == 1
     (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")

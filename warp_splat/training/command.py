@@ -44,8 +44,8 @@ def train(config: TrainConfig) -> int:
     """
     check_train(config)
     with join(config.machine.device, config.learn.views, Shards if config.machine.shard else Processes) as processes:
-        if config.report.viewer and processes.count > 1:
-            raise InputError("--viewer: expected one process, since others would wait for it; leave it out.")
+        if config.report.viewer and processes.count > 1 and not processes.sharded:
+            raise InputError("--viewer: expected one process, or --shard, of which process 0 draws; leave it out.")
         return _train(config, processes)
 
 
@@ -132,15 +132,15 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
 
 def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say) -> int:
     """Evaluate and tell; returns the process's exit code."""
-    end = trainer.config.learn.end
-    if viewer:
-        viewer.show_end()
+    end, watched = trainer.config.learn.end, trainer.config.report.viewer
+    if watched:
+        trainer.lead(lambda: viewer and viewer.show_end())
     run.gaussians = trainer.processes.total(len(trainer.model))
     # as in the file: at one depth, the first is in front
     trainer.optimizer.arrange(trainer.model.arranging(trainer.processes, [len(trainer.model)]))
     trainer.lead(lambda: finish(trainer, run, say))
-    if viewer and run.iteration >= end:
-        viewer.linger()
+    if watched and run.iteration >= end:
+        trainer.lead(lambda: viewer and viewer.linger())
     if run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration):
         elsewhere = f"The model is not in {run.folder}, but in {run.saved}; see the warning, and move it."
         tqdm.write(elsewhere, file=sys.stderr)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import torch
 from tqdm import tqdm
@@ -112,8 +112,8 @@ class TrainingViewer:
 
 
 @contextmanager
-def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
-    """Serve a viewer of the training while the block runs.
+def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer | None]:
+    """Serve a viewer of the training while the block runs, in process 0; None in others.
 
     Raises:
         InputError: if no port is free.
@@ -124,5 +124,6 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer]:
         return as_photographed(image, trainer.exposures, view.name)
 
     means = lambda: trainer.model.parameters["means"]  # noqa: E731
-    with Viewer(trainer.look, means, scene, port, scene.linear, exposed) as viewer:
-        yield TrainingViewer(trainer, run, viewer)
+    viewer = trainer.lead(lambda: Viewer(trainer.look, means, scene, port, scene.linear, exposed))
+    with viewer or nullcontext():
+        yield TrainingViewer(trainer, run, viewer) if viewer else None

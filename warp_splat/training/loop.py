@@ -62,8 +62,8 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: Trai
                 bar.total = trainer.config.learn.end
                 if processes.rank == 0:
                     write_config(run.folder, trainer.config)
-            if viewer:
-                viewer.between_steps(interrupted)
+            if report.viewer:
+                trainer.lead(lambda: viewer and viewer.between_steps(interrupted))
     run.dropped = trainer.all_dropped()
     if report.profile and unprofiled:
         steps = (run.iteration - unprofiled[0]) // processes.images
