@@ -11,7 +11,7 @@ from fake_viser import PHOTO, FakeClient, at_rest, drawn, some_gaussians, some_s
 from scene_files import write_colmap
 
 from warp_splat.color import to_srgb
-from warp_splat.config import ViewConfig
+from warp_splat.config import RasterOptions, ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
@@ -206,8 +206,8 @@ def test_what_cannot_be_viewed(config, message):
         view_model(config)
 
 
-@pytest.mark.parametrize("source", ["", "scene"])
-def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, source):
+@pytest.mark.parametrize(("source", "tolerance"), [("", 0.0), ("scene", 0.0), ("", 0.5)])
+def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, source, tolerance):
     """A file does not say what light it was trained in; its scene does."""
     root = write_colmap(tmp_path / "scene", ["a.exr", "b.exr"], np.full((32, 48, 3), 0.2, np.float32))
     save_gaussians(tmp_path / "a.ply", SplatFile(some_gaussians(50)))
@@ -224,8 +224,9 @@ def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, so
     monkeypatch.setattr("warp_splat.viewer.command.Viewer", serve)
     monkeypatch.setattr("warp_splat.viewer.command.interruptible", lambda: nullcontext([2]))
     at_rest(monkeypatch)
-    assert view_model(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "")) == 0
-    draw = make_renderer(GaussianModel.from_splats(some_gaussians(50)).arranged())
+    assert view_model(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "", tolerance=tolerance)) == 0
+    options = RasterOptions(tolerance=tolerance or None, of="trained")
+    draw = make_renderer(GaussianModel.from_splats(some_gaussians(50)).arranged(), None, options)
     plain = draw(served[0], False).image.clamp(0, 1)
     assert plain.std() > 0.1
     shown = to_srgb(plain, torch.where) if source else plain

@@ -34,6 +34,7 @@ STRONGEST_MOST = 8  # Gaussians of a pixel that are told
 
 PORT, LAST_PORT = 8080, 65535  # of the viewer
 PORT_HELP = "of the viewer; if it is busy, the next free one"
+TOLERANCE_HELP = "leave out what changes no pixel by more, of 1; 0: the usual cuts"
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)  # that we may use
 
@@ -140,7 +141,7 @@ class RenderConfig(OnDevice):
         choices=("", *VIDEOS),
     )
     quiet: bool = flag(False, "print only the summary")
-    tolerance: float = flag(0.0, "leave out what changes no pixel by more, of 1; 0: the usual cuts", most=1)
+    tolerance: float = flag(0.0, TOLERANCE_HELP, most=1)
     of: str = flag("trained", "what a tolerance and a bound compare with: see docs/tolerance.md", choices=BOUNDS_OF)
     bound: bool = flag(
         False,
@@ -164,6 +165,7 @@ class RenderConfig(OnDevice):
 class ViewConfig(FinishedModel):
     """A model to look at in a browser."""
 
+    tolerance: float = flag(0.0, TOLERANCE_HELP, most=1)
     port: int = flag(PORT, PORT_HELP, least=1, most=LAST_PORT)
 
 

@@ -34,12 +34,13 @@ def view_model(config: ViewConfig) -> int:
     model = GaussianModel.from_splats(finished.file.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {finished.iteration}")
     scene = _find_scene(finished, config.source_path)
+    options = replace(finished.options, of="trained", tolerance=config.tolerance or None)
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with (
         memory_explained(device, model, [LARGEST], advice),
         Viewer(
-            finished.renderer(model),
+            finished.renderer(model, options),
             lambda: model.parameters["means"],
             scene,
             config.port,
