@@ -130,7 +130,7 @@ def sentences() -> dict[str, list[tuple]]:
     image, gradient, _ = f.knob(f.EMBEDDED, "alpha_min 0.003922")
     finer, finest = (f.knob(f.EMBEDDED, f"alpha_min {value}") for value in ("0.001", "0.0001"))
     long = f.quoted("compare/compare.txt", r"embedded, step 300 \| central differences .*\| ([\d.e+]+) extrapolated")[0]
-    one, several = f.data("blocks")["records"]
+    street, street_blocks, ring, ring_blocks = f.data("blocks")["records"]
     on_eight, largest = (
         row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
     )
@@ -145,8 +145,12 @@ def sentences() -> dict[str, list[tuple]]:
                 f"{on_eight['image']:.0f}",
             ),
             (
-                "The blocks are {} dB behind away from the borders, and {} dB at them:",
-                *(f.one(one[place] - several[place]) for place in ("rest", "seams")),
+                "The street's blocks are {} dB behind away from the borders, and {} dB at them:",
+                *(f.one(street[place] - street_blocks[place]) for place in ("rest", "seams")),
+            ),
+            (
+                "On fox they are {} and {} dB behind",
+                *(f.one(ring[place] - ring_blocks[place]) for place in ("rest", "seams")),
             ),
             ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
         ],
