@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.gaussians import activate
+from warp_splat.gaussians import CHUNK, activate
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.drivers import driver_of
@@ -153,7 +153,7 @@ def survivors(raw: dict[str, torch.Tensor]) -> torch.Tensor:
     """Which Gaussians are finite, and not too faint to be seen [N]."""
     keep = raw["opacities"] >= math.log(PRUNE_OPACITY / (1.0 - PRUNE_OPACITY))
     for tensor in raw.values():  # one that is not finite is left out of every image, so nothing else would prune it
-        keep &= torch.isfinite(tensor).flatten(1).all(1) if tensor.dim() > 1 else torch.isfinite(tensor)
+        keep &= torch.cat([torch.isfinite(part)[..., None].flatten(1).all(1) for part in tensor.split(CHUNK)])
     return keep
 
 
