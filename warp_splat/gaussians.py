@@ -143,7 +143,7 @@ class GaussianModel:
     def gradients(self, degree: int) -> list[torch.Tensor]:
         """The gradients, without those of the SH coefficients above ``degree``, which are zero. Views, not copies.
 
-        Nor sparse ones, which are of one image.
+        Sparse ones are left out: a step that has them is of one image, with nothing to average.
         """
         found = {name: leaf.grad for name, leaf in self.parameters.items() if leaf.grad is not None}
         found = {name: grad for name, grad in found.items() if not grad.is_sparse}

@@ -135,14 +135,15 @@ class SensorSplatCamera:
         """
         views = len(camera_transforms)
         shape = (views, camera.height, camera.width)
-        reals = {"rgb_image": rgb_image, "forward_depth_image": forward_depth_image, "mesh_depth": mesh_depth}
-        packed = {"color_image": color_image, "shape_index_image": shape_index_image}
-        packed |= {"mesh_color": mesh_color, "mesh_index": mesh_index}
-        for name, array in {**reals, **packed}.items():
-            kind = wp.vec3 if name == "rgb_image" else wp.uint32 if name in packed else wp.float32
-            if array is not None and (array.shape, array.dtype) != (shape, kind):
-                found = f"{array.shape} of {array.dtype.__name__}"
-                raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
+        kinds = {wp.vec3: {"rgb_image": rgb_image}}
+        kinds[wp.float32] = {"forward_depth_image": forward_depth_image, "mesh_depth": mesh_depth}
+        kinds[wp.uint32] = {"color_image": color_image, "shape_index_image": shape_index_image}
+        kinds[wp.uint32] |= {"mesh_color": mesh_color, "mesh_index": mesh_index}
+        for kind, images in kinds.items():
+            for name, array in images.items():
+                if array is not None and (array.shape, array.dtype) != (shape, kind):
+                    found = f"{array.shape} of {array.dtype.__name__}"
+                    raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
         for name, array in (("mesh_color", mesh_color), ("mesh_index", mesh_index)):
             if array is not None and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
