@@ -7,7 +7,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 from exact_cameras import exact_render
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import warp_splat
@@ -83,6 +83,10 @@ OPTIONS = st.fixed_dictionaries(
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@example(  # the brightest color is one whose harmonics are left out, in a list that is cut
+    options={"alpha_min": 0.0, "sh_degree": 0, "max_steps": 7}, seed=0, count=29, largest=1.0, opacity=(0.9, 1.0),
+    aspect=1e-4, bright=0.0, behind=0.0,
+)  # fmt: skip
 @given(
     options=OPTIONS,
     seed=st.integers(0, 999),

@@ -74,7 +74,10 @@ def certify(
     with torch.no_grad():
         count, device, faint = len(splats.radii), background.device, min(options.alpha_min, FAINT)
         colors, behind = splats.colors.detach(), float(background.max())
-        brightest = max(float(colors.max()) if count else 0.0, behind)
+        drawn = max(float(colors.max()) if count else 0.0, behind)  # the brightest color
+        errors = _color_errors(gaussians, options, drawn)
+        scales, errors = (with_copies(tensor, crossing) for tensor in (gaussians.scales.detach(), errors))
+        brightest = max(float((colors + errors[:, 2:]).max()) if count else 0.0, behind)  # with harmonics left out
         sample = torch.nonzero(splats.radii[:: max(count // SAMPLE, 1)] > 0)[:, 0] * max(count // SAMPLE, 1)
         usual, begins = 1e-3, [-torch.inf]
         if len(sample):
@@ -95,8 +98,6 @@ def certify(
         rows, columns = 4 * -(-camera.height // TILE), 4 * -(-camera.width // TILE)
         new = {"dtype": torch.int32, "device": device}
         maps = torch.zeros(len(bounds) - 1 if threads else 1, len(begins), rows + 1, columns + 1, **new)
-        errors = _color_errors(gaussians, options, brightest)
-        scales, errors = (with_copies(tensor, crossing) for tensor in (gaussians.scales.detach(), errors))
         starts, bands = torch.tensor(begins, device=device), torch.tensor(bounds, **new)
         extents, radii = torch.empty_like(splats.extents), torch.empty_like(splats.radii)
         if count:
