@@ -5,6 +5,7 @@ tests/browser.py).
 """
 
 import argparse
+import json
 import re
 import subprocess
 import sys
@@ -22,7 +23,7 @@ sys.path.insert(0, str(DOCS.parent / "tests"))
 from browser import browser_page  # noqa: E402
 
 from warp_splat.cli import main  # noqa: E402
-from warp_splat.evaluation.report import new_figure, save_figure  # noqa: E402
+from warp_splat.evaluation.report import new_figure, plot_training, save_figure  # noqa: E402
 from warp_splat.formats.model_folder import find_iteration  # noqa: E402
 from warp_splat.formats.png import load_png  # noqa: E402
 
@@ -36,6 +37,12 @@ def sheet(model: str) -> Path:
     iteration = find_iteration(model)
     assert main(["render", "-m", model, "--skip_train", "--iteration", str(iteration)]) == 0
     return _save(load_png(Path(model) / "contact_sheet.png"), "contact_sheet.jpg")
+
+
+def curves(model: str) -> Path:
+    """The curves of its training, drawn again."""
+    plot_training(IMAGES / "training.png", json.loads((Path(model) / "history.json").read_text()))
+    return IMAGES / "training.png"
 
 
 def videos(model: str) -> Path:
@@ -110,6 +117,7 @@ def _save(picture: np.ndarray, name: str) -> Path:
 
 PICTURES = {
     "sheet": sheet,
+    "curves": curves,
     "videos": videos,
     "page": page,
     "viewer": viewer,

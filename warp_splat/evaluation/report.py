@@ -113,7 +113,7 @@ def plot_training(path: str | Path, history: Sequence[Mapping[str, float]], spli
         smooth = _smooth(values) if key == "loss" else values
         axes.plot(along, smooth, color=color, linewidth=1.8, marker="o" if key == "psnr" else "", markersize=4)
         if key == "psnr":
-            label_point(axes, (along[-1], values[-1]), f"{values[-1]:.2f}", (0, 6), "right")
+            label_point(axes, (along[-1], values[-1]), f"{values[-1]:.2f}", (0, -14), "right")
         else:
             axes.set_ylim(bottom=0)
         axes.yaxis.set_major_formatter(_thousands)
