@@ -1,7 +1,7 @@
 """What a format loses, and what a viewer's own loader makes of it: the numbers that it read, and its picture.
 
 The 60 Gaussians of the audit's ``cloud``, harmonics of degree 0, written by this package in each format and shown by
-Spark in a headless Chromium, whose loader tells what it read.
+Spark in a headless Chromium, glTF by Babylon.js. Their loaders tell what they read.
 
     python benchmarks/audit_formats.py [--out docs/benchmarks]
 """
@@ -24,12 +24,14 @@ from warp_splat.formats.files import write_text
 from warp_splat.formats.stored import SH_C0
 from warp_splat.text import table_of
 
-FORMATS = ("ply", "spz", "splat", "sog")
+#: Who reads a format, who shows the PLY file for comparison, and what the loader may leave to the viewer: axes turned.
+SPARK = ("spark.html", "spark.html", (1, -1, -1))
+FORMATS = {**dict.fromkeys(("ply", "spz", "splat", "sog"), SPARK), "glb": ("gltf.html", "babylon.html", (-1, -1, 1))}
 COLUMNS = {
     "format": "{format}",
     "the format's own error": "{format_error:.1e}",
     "the loader's error": "{loader_error:.1e}",
-    "with y and z turned": "{turned:.1e}",
+    "with axes turned": "{turned:.1e}",
     "picture off by, mean": "{mean:.1e}",
     "from that of the PLY file": "{from_ply:.1e}",
 }
@@ -52,15 +54,17 @@ def measured(suffix: str, folder: Path, workload, file) -> dict:
 
     write(folder)
     ours = numbers(load_gaussians(folder / f"scene.{suffix}").splats)
-    picture, read = screenshot(FOLDER / "spark.html", workload.camera, write, f"scene.{suffix}")
+    page, usual, turned = FORMATS[suffix]
+    picture, read = screenshot(FOLDER / page, workload.camera, write, f"scene.{suffix}")
+    of_ply, _ = screenshot(FOLDER / usual, workload.camera, lambda to: save_gaussians(to / "same.ply", file), "same.ply")
     theirs = np.array(read)[:, [0, 1, 2, 7, 8, 9, 10, 11, 12, 13]]
     return {
         "format": suffix,
         "format_error": error(ours, numbers(file.splats)),
         "loader_error": error(theirs, ours),
-        "turned": error(theirs * np.array([1, -1, -1, *[1] * 7]), ours),
+        "turned": error(theirs * np.array([*turned, *[1] * 7]), ours),
         "mean": float(np.abs(picture / 255 - in_eight_bits(exact_image(workload))).mean()),
-        "picture": picture / 255,
+        "from_ply": float(np.abs(picture / 255 - of_ply / 255).mean()),
     }
 
 
@@ -73,9 +77,7 @@ def main() -> None:
     file = stored(*geometry, torch.cat([dc, rest], 1))
     with tempfile.TemporaryDirectory() as name:
         rows = [measured(suffix, Path(name), workload, file) for suffix in FORMATS]
-    for row in rows:
-        row["from_ply"] = float(np.abs(row["picture"] - rows[0]["picture"]).mean())
-    note = f"Measured by `benchmarks/audit_formats.py` on {machine()}, with Spark 2.2.0."
+    note = f"Measured by `benchmarks/audit_formats.py` on {machine()}, with Spark 2.2.0; glb with Babylon.js 9.28.0."
     write_text(arguments.out / "audit_formats.md", f"{table_of(rows, COLUMNS)}\n\n{note}\n")
     print(table_of(rows, COLUMNS))
 
