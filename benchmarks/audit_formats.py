@@ -56,7 +56,8 @@ def measured(suffix: str, folder: Path, workload, file) -> dict:
     ours = numbers(load_gaussians(folder / f"scene.{suffix}").splats)
     page, usual, turned = FORMATS[suffix]
     picture, read = screenshot(FOLDER / page, workload.camera, write, f"scene.{suffix}")
-    of_ply, _ = screenshot(FOLDER / usual, workload.camera, lambda to: save_gaussians(to / "same.ply", file), "same.ply")
+    given = lambda served: save_gaussians(served / "same.ply", file)  # noqa: E731
+    of_ply, _ = screenshot(FOLDER / usual, workload.camera, given, "same.ply")
     theirs = np.array(read)[:, [0, 1, 2, 7, 8, 9, 10, 11, 12, 13]]
     return {
         "format": suffix,
