@@ -39,6 +39,16 @@ def quoted(name: str, pattern: str) -> list[str]:
     return list(re.search(pattern, text(name)).groups())
 
 
+def compared_on() -> str:
+    """The machine of ``warp-splat compare``."""
+    return quoted("compare/compare.txt", r"Measured on (.*), 2 threads")[0]
+
+
+def scatter() -> list[str]:
+    """Standard deviations of PSNR [dB] over adjoints, and over seeds."""
+    return quoted("compare/training.txt", r"is ([\d.]+) dB over modes and ([\d.]+) dB over seeds")
+
+
 def small(value: float) -> str:
     """2e-3."""
     return re.sub(r"e([+-])0*(\d+)", lambda found: f"e{found[1].replace('+', '')}{found[2]}", f"{value:.0e}")

@@ -1,8 +1,8 @@
 """The figures in pages: tables, and those in running text.
 
-A page stays plain Markdown. :func:`sentences` repeats the text around a figure, and says what stands there.
-docs/make_pages.py writes it into the page, and raises an error if the text is not there. A figure that no file holds is
-said to be measured by hand, once.
+A page stays plain Markdown. Its function in ``SENTENCES`` repeats the text around each figure, with ``{}`` for it, and
+says what stands there. docs/make_pages.py writes it into the page, and raises an error if the text is not there. A
+figure that no file holds is said to be measured by hand, once.
 """
 
 import re
@@ -117,257 +117,297 @@ TABLES = {
 }
 
 
-def sentences() -> dict[str, list[tuple]]:
-    """By page: pieces of its text, with ``{}`` for a figure, and the figures."""
-    measured = f.quoted("compare/compare.txt", r"Measured on (.*), 2 threads")[0]
-    over_modes, over_seeds = f.quoted("compare/training.txt", r"is ([\d.]+) dB over modes and ([\d.]+) dB over seeds")
+def _scaling() -> list[tuple]:
+    street, street_blocks, ring, ring_blocks = f.data("blocks")["records"]
+    on_eight, largest = (
+        row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
+    )
+    return [
+        (
+            "on 64 of them a step takes {} s, and an image {} s: 30,000 images are {} hours. On eight, an "
+            "image takes {} s.",
+            f"{largest['own'] + largest['drawing'] + largest['exchange']:.0f}",
+            f"{largest['image']:.1f}",
+            f"{30_000 * largest['image'] / 3600:.0f}",
+            f"{on_eight['image']:.0f}",
+        ),
+        (
+            "The street's blocks are {} dB behind away from the borders, and {} dB at them:",
+            *(f.one(street[place] - street_blocks[place]) for place in ("rest", "seams")),
+        ),
+        (
+            "On fox they are {} and {} dB behind",
+            *(f.one(ring[place] - ring_blocks[place]) for place in ("rest", "seams")),
+        ),
+        ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
+    ]
+
+
+def _readme() -> list[tuple]:
+    return [
+        ("The training takes {} s on two cores", f.data("preset")["rows"][0][6]),
+        (
+            "In the worst of {} stiff and extreme cases, gradients err by {}.",
+            f.cases(),
+            f.small(max(float(row["gradient_error"] or 0) for row in f.rows("stability"))),
+        ),
+        ("recorded naively is wrong by {} %", round(100 * min(f.errors("plain")))),
+        ("Without them it takes {} to {} times the time", *f.span(f.times_manual("generated"), "{:.0f}".format)),
+        ("modes differ by {} dB, seeds by {} dB", *f.scatter()),
+        ("shrink from {} lines to {}.", f.rules("manual"), f.rules("stepwise")),
+        ("Measured on {}, by `uv run python -m warp_splat.compare`", f.compared_on()),
+    ]
+
+
+def _renderer() -> list[tuple]:
+    return [
+        ("the forward pass is {} times as fast", round(f.blend_gain())),
+        ("exactly enough ({} after 100,000", f.small(f.recovered(100_000))),
+        ("has the catalog of {} stiff", f.cases()),
+    ]
+
+
+def _extending() -> list[tuple]:
+    return [
+        ("`: {} stiff and extreme cases, {} verdicts over", f.cases(), len(f.rows("stability"))),
+    ]
+
+
+def _adjoints() -> list[tuple]:
     exponentials = [f.knob(scene, "exp_degree 3") for scene in f.scenes("knobs")]
     stops = [f.knob(scene, "t_min 0.01") for scene in f.scenes("knobs")]
     default_stops = [f.knob(scene, "t_min 0.0001")[0] for scene in f.scenes("knobs")]
     caps = [f.worst("adjoints", f.MANY, f"cap {cap}") for cap in (2048, 128)]
     lists = max(int(row["longest_list"]) for row in f.rows("training") if not row["variant"].startswith("cap"))
-    count = f.cases()
     image, gradient, _ = f.knob(f.EMBEDDED, "alpha_min 0.003922")
     finer, finest = (f.knob(f.EMBEDDED, f"alpha_min {value}") for value in ("0.001", "0.0001"))
     long = f.quoted("compare/compare.txt", r"embedded, step 300 \| central differences .*\| ([\d.e+]+) extrapolated")[0]
-    street, street_blocks, ring, ring_blocks = f.data("blocks")["records"]
-    on_eight, largest = (
-        row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
-    )
-    return {
-        "scaling.md": [
-            (
-                "on 64 of them a step takes {} s, and an image {} s: 30,000 images are {} hours. On eight, an "
-                "image takes {} s.",
-                f"{largest['own'] + largest['drawing'] + largest['exchange']:.0f}",
-                f"{largest['image']:.1f}",
-                f"{30_000 * largest['image'] / 3600:.0f}",
-                f"{on_eight['image']:.0f}",
-            ),
-            (
-                "The street's blocks are {} dB behind away from the borders, and {} dB at them:",
-                *(f.one(street[place] - street_blocks[place]) for place in ("rest", "seams")),
-            ),
-            (
-                "On fox they are {} and {} dB behind",
-                *(f.one(ring[place] - ring_blocks[place]) for place in ("rest", "seams")),
-            ),
-            ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
-        ],
-        "README.md": [
-            ("The training takes {} s on two cores", f.data("preset")["rows"][0][6]),
-            (
-                "In the worst of {} stiff and extreme cases, gradients err by {}.",
-                count,
-                f.small(max(float(row["gradient_error"] or 0) for row in f.rows("stability"))),
-            ),
-            ("recorded naively is wrong by {} %", round(100 * min(f.errors("plain")))),
-            ("Without them it takes {} to {} times the time", *f.span(f.times_manual("generated"), "{:.0f}".format)),
-            ("modes differ by {} dB, seeds by {} dB", over_modes, over_seeds),
-            ("shrink from {} lines to {}.", f.rules("manual"), f.rules("stepwise")),
-            ("Measured on {}, by `uv run python -m warp_splat.compare`", measured),
-        ],
-        "renderer.md": [
-            ("the forward pass is {} times as fast", round(f.blend_gain())),
-            ("exactly enough ({} after 100,000", f.small(f.recovered(100_000))),
-            ("has the catalog of {} stiff", count),
-        ],
-        "extending.md": [
-            ("`: {} stiff and extreme cases, {} verdicts over", count, len(f.rows("stability"))),
-        ],
-        "adjoints.md": [
-            ("Machine of all figures: {}.\n", measured),
-            (
-                "545 px, {} million tile",
-                f.two(int(f.quoted("benchmarks/adjoints.md", r"(\d+) tile instances")[0]) / 1e6),
-            ),
-            ("Its gradient is wrong by {} %", round(100 * min(f.errors("plain")))),
-            ("`stepwise` lay between {} and {} times", *f.span(f.times_manual("stepwise"), f.two)),
-            ("`reversible` between {} and {}. `stored`", *f.span(f.times_manual("reversible"), f.one)),
-            (
-                "in the forward pass: {} ms instead of {} here",
-                *(round(1e3 * f.seconds(mode, "forward", 2)) for mode in ("stored", "manual")),
-            ),
-            ("**All modes lie between {} and {}.**", *f.span(f.errors(*f.WITH_GENERATED), f.small)),
-            ("That is at least {} times below", int(2e-4 / max(f.errors(*f.WITH_GENERATED)))),
-            ("within a factor of {} of each other", f.one(f.spread_of_modes())),
-            (
-                "it is off by {}, and the gradients by {}, where",
-                f.small(f.recovered(100_000)),
-                f.small(f.stability("chain_100000", "gradient_error")),
-            ),
-            ("they take {} hours", f.one(float(long) / 3.6e6)),
-            ("Their error over the scenes is {} to {}.", *f.span(f.errors("central differences"), f.small)),
-            ("1e-4, which errs by {} to {} in the image", *f.span(default_stops, f.small)),
-            (
-                "1e-6 takes {} to {} times as long",
-                *f.span([f.slower("t_min 1e-06", "t_min 0.0001", scene) for scene in f.scenes("knobs")], f.two),
-            ),
-            (
-                "1e-2 takes {} to {} times as long, and errs by {} to {}.",
-                *f.span([f.slower("t_min 0.01", "t_min 0.0001", scene) for scene in f.scenes("knobs")], f.two),
-                *f.span([image for image, *_ in stops], f.small),
-            ),
-            (
-                "1/255 errs by {} in the image and {} % in the gradient",
-                f"{image:.1e}".replace("e-0", "e-"),
-                round(100 * gradient),
-            ),
-            (
-                "1e-3 errs by {} and {} %, and takes {} times as long",
-                f"{finer[0]:.1e}".replace("e-0", "e-"),
-                f.one(100 * finer[1]),
-                f.two(f.slower("alpha_min 0.001", "alpha_min 0.003922")),
-            ),
-            (
-                "1e-4 errs by {} and {} %, and takes {} times as long",
-                f"{finest[0]:.1e}".replace("e-0", "e-"),
-                f.one(100 * finest[1]),
-                f.two(f.slower("alpha_min 0.0001", "alpha_min 0.003922")),
-            ),
-            ("deviations takes {} times as long", f.two(f.slower("extent square", "extent ellipse"))),
-            (
-                "exponential, which takes {} to {} times as long",
-                *f.span([f.slower("exp_degree none", "exp_degree 5", scene) for scene in f.scenes("knobs")], f.one),
-            ),
-            (
-                "3 takes {} to {} times as long, and errs by {} in the image and {} in gradients",
-                *f.span([f.slower("exp_degree 3", "exp_degree 5", scene) for scene in f.scenes("knobs")], f.two),
-                f.small(max(image for image, *_ in exponentials)),
-                f.small(max(off for _, off, _ in exponentials)),
-            ),
-            ("its gradients err by {} (2048 of 10,000 candidates) to {} (128", f.small(caps[0]), f.one(caps[1])),
-            ("different modes are {} to {} times closer", *f.span(f.nearer(), "{:.0f}".format)),
-            ("PSNR scatters by {} dB over modes and by {} dB over seeds", over_modes, over_seeds),
-            ("The mean of `manual` is {} dB", f.two(f.psnr("manual"))),
-            (
-                "`reversible` takes {} times the time of `manual`, by `stored` {} times",
-                *(f.one(f.steps_slower(mode)) for mode in ("reversible", "stored")),
-            ),
-            ("no tile lists more than {}.", lists),
-            ("A cap of 128 cuts {} % of", round(100 * f.fact("training", "embedded", "cap 128", "lists_cut"))),
-            ("It costs {} dB, or {} dB if applied", f.one(f.lost("cap 128")), f.one(f.lost("cap 128, rendering only"))),
-            ("it takes {} times as long as projection and colors", f.one(f.projection_backwards())),
-            ("it gains {} to {} dB over the affine", *f.span(f.gained(), "{:.0f}".format)),
-            ("ends {} dB lower (one seed)", f.two(f.lost("ellipsoid"))),
-            ("runs {} named cases, {} verdicts", count, len(f.rows("stability"))),
-            (
-                "direction the image errs by {}.",
-                f.small(max(f.stability(f"size_{size}", "value_error") for size in ("1x20000", "20000x1"))),
-            ),
-            (
-                "(measured on a slab: {} and {})",
-                *f.quoted("compare/volume.txt", r"slab +\| Euler .*\| ([\d.]+) +\|\n.*\| ([\d.]+)"),
-            ),
-            (
-                "its 64 samples err by {}, those of the exponential by {}.",
-                *(f.small(f.integrated(name)) for name in ("RK4", "exponential")),
-            ),
-            ("linearized exponential: up to {},", f.small(max(f.shortcut("linear depth") + f.shortcut("linear peak")))),
-            ("overlap: {} where", f.small(max(f.shortcut("no overlap")))),
-            ("affine projection: {} to {};", *f.span(f.shortcut("affine"), f.small)),
-            ("low-pass: up to {}.", f.small(max(f.shortcut("affine + blur")))),
-            (
-                "`stepwise` has {} in all, `manual` {}.",
-                *(f.rules(mode) + f.plumbing(mode) for mode in ("stepwise", "manual")),
-            ),
-            ("it saves almost half: {} against {}.", f.rules("stepwise"), f.rules("manual")),
-            ("`stored` takes {} to {} times the adjoint", *f.span(f.stored_to_reversible(), f.one)),
-            ("What it costs is {} times the memory", round(f.mebibytes("stored") / f.mebibytes("manual"))),
-        ],
-        "steps.md": [
-            (
-                "Two threads do {} times the multiply-adds of one, and moved {} times the bytes in that run",
-                f.two(f.of_two_threads("rate")),
-                f.two(f.of_two_threads("bandwidth")),
-            ),
-            (
-                "pixels: {} times as many in `full`, {} times where",
-                f.one(f.looked_at("full")),
-                f.one(f.looked_at("synthetic")),
-            ),
-        ],
-        "performance.md": [
-            ("two processes see {} times the images per second", f.two(f.images_gained())),
-        ],
-        "shutters.md": [
-            (
-                "find the means to within {} px, one step to within {} px.",
-                *(f.small(max(f.shutter(way, "off"))) for way in ("two steps", "one step")),
-            ),
-            ("the adjoint has {} registers, without spills", f.registers("project, rolling shutter")[0]),
-            ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
-            ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
-        ],
-        "simulation.md": [
-            (
-                "ours draws {} times as many pictures",
-                round(f.simulated("ours, 1 thread", 2) / f.simulated("Newton's", 2)),
-            ),
-            ("mean error of a color is {},", f.small(f.simulated("Newton's", 4))),
-            ("Ours errs by at most {}.", f.small(f.simulated("ours, 1 thread", 3))),
-        ],
-        "cameras.md": [
-            (
-                "All {} get there, after {} steps at most, and end within {} degrees, {} mm and {} %.",
-                *(len(f.data("cameras")["reached"]), max(f.data("cameras")["reached"])),
-                *(f.small(unit * max(f.data("cameras")["last"][of])) for of, unit in f.CAMERA_ERRORS.items()),
-            ),
-            (
-                "footprints of `affine` reach {} dB, those of `unscented` {} dB; through a wide lens {} and {} dB.",
-                *(f.one(f.footprint(lens, way, "0.03")) for lens in ("OPENCV_FISHEYE", "OPENCV,") for way in f.WAYS),
-            ),
-            (
-                "7 degrees: {} and {} dB through the fisheye, {} and {} dB through the wide lens",
-                *(f.one(f.footprint(lens, way, "0.12")) for lens in ("OPENCV_FISHEYE", "OPENCV,") for way in f.WAYS),
-            ),
-            (
-                "both are wrong, by up to {} of a color of 1",
-                f.two(max(f.footprint("EQUI", way, size, "max") for way in f.WAYS for size in ("0.03", "0.12"))),
-            ),
-            (
-                "take {} times as long through the fisheye as a pinhole's, `unscented` {} times",
-                *(f.two(f.footprint("OPENCV_F", w, "0.03", "seconds", "pinhole")) for w in f.WAYS),
-            ),
-            (
-                "are off by {}, the largest seen, relative to float64, over all",
-                f.off_by("gaussians"),
-            ),
-            *((f"{where} | {{}} |", f.off_by(*parts)) for where, parts in f.LEARNED.items()),
-            (
-                "px takes {} % longer with a camera that learns its pose, fx, fy, cx and cy. Through an OPENCV lens it "
-                "takes {} % longer if that learns all of them and its four coefficients, {} % by the unscented "
-                "transform (one thread, processor time, {}).",
-                *(f.one(100 * price["added"] / price["step"]) for price in f.data("cameras")["prices"].values()),
-                f.data("cameras")["machine"],
-            ),
-            ("projection and adjoint take up to {} times as long if all is learned.", f.two(f.rolling_price())),
-        ],
-        "cuda.md": [
-            ("the blend has {} registers and", f.registers("blend")[0]),
-            ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),
-            (
-                "Its adjoints have {} to {} registers,",
-                *f.span(f.registers("manual", "stepwise", "reversible", "stored"), str),
-            ),
-            ("the adjoint of the ball takes {} to {} ms,", *f.loads("ball", "one for a tile")),
-            ("ms, not {}: its 2,170 tiles", *f.loads("ball", "one for a tile", "slots busy: ms")),
-            (
-                "pixels a lane take {} to {} ms for the ball's adjoint, but {} to {} for the crowd's, {} to {} now",
-                *f.loads("ball", "two of four pixels a lane"),
-                *f.loads("crowd", "two of four pixels a lane"),
-                *f.loads("crowd", "one for a tile"),
-            ),
-            ("Lists split at 256 take {} to {} (ball)", *f.loads("ball", "one for 256 of a list")),
-            ("the longest tiles first, {} (crowd)", f.loads("crowd", "one for a tile, the longest first")[1]),
-            ("registers, {} % (`stored` {}).", f.resident("manual"), f.resident("stored")),
-            (
-                "projection and colors have {} and {} registers, {} %:",
-                *f.registers("project", "adjoint of shade"),
-                f.resident("project"),
-            ),
-        ],
-    }
+    return [
+        ("Machine of all figures: {}.\n", f.compared_on()),
+        (
+            "545 px, {} million tile",
+            f.two(int(f.quoted("benchmarks/adjoints.md", r"(\d+) tile instances")[0]) / 1e6),
+        ),
+        ("Its gradient is wrong by {} %", round(100 * min(f.errors("plain")))),
+        ("`stepwise` lay between {} and {} times", *f.span(f.times_manual("stepwise"), f.two)),
+        ("`reversible` between {} and {}. `stored`", *f.span(f.times_manual("reversible"), f.one)),
+        (
+            "in the forward pass: {} ms instead of {} here",
+            *(round(1e3 * f.seconds(mode, "forward", 2)) for mode in ("stored", "manual")),
+        ),
+        ("**All modes lie between {} and {}.**", *f.span(f.errors(*f.WITH_GENERATED), f.small)),
+        ("That is at least {} times below", int(2e-4 / max(f.errors(*f.WITH_GENERATED)))),
+        ("within a factor of {} of each other", f.one(f.spread_of_modes())),
+        (
+            "it is off by {}, and the gradients by {}, where",
+            f.small(f.recovered(100_000)),
+            f.small(f.stability("chain_100000", "gradient_error")),
+        ),
+        ("they take {} hours", f.one(float(long) / 3.6e6)),
+        ("Their error over the scenes is {} to {}.", *f.span(f.errors("central differences"), f.small)),
+        ("1e-4, which errs by {} to {} in the image", *f.span(default_stops, f.small)),
+        (
+            "1e-6 takes {} to {} times as long",
+            *f.span([f.slower("t_min 1e-06", "t_min 0.0001", scene) for scene in f.scenes("knobs")], f.two),
+        ),
+        (
+            "1e-2 takes {} to {} times as long, and errs by {} to {}.",
+            *f.span([f.slower("t_min 0.01", "t_min 0.0001", scene) for scene in f.scenes("knobs")], f.two),
+            *f.span([image for image, *_ in stops], f.small),
+        ),
+        (
+            "1/255 errs by {} in the image and {} % in the gradient",
+            f"{image:.1e}".replace("e-0", "e-"),
+            round(100 * gradient),
+        ),
+        (
+            "1e-3 errs by {} and {} %, and takes {} times as long",
+            f"{finer[0]:.1e}".replace("e-0", "e-"),
+            f.one(100 * finer[1]),
+            f.two(f.slower("alpha_min 0.001", "alpha_min 0.003922")),
+        ),
+        (
+            "1e-4 errs by {} and {} %, and takes {} times as long",
+            f"{finest[0]:.1e}".replace("e-0", "e-"),
+            f.one(100 * finest[1]),
+            f.two(f.slower("alpha_min 0.0001", "alpha_min 0.003922")),
+        ),
+        ("deviations takes {} times as long", f.two(f.slower("extent square", "extent ellipse"))),
+        (
+            "exponential, which takes {} to {} times as long",
+            *f.span([f.slower("exp_degree none", "exp_degree 5", scene) for scene in f.scenes("knobs")], f.one),
+        ),
+        (
+            "3 takes {} to {} times as long, and errs by {} in the image and {} in gradients",
+            *f.span([f.slower("exp_degree 3", "exp_degree 5", scene) for scene in f.scenes("knobs")], f.two),
+            f.small(max(image for image, *_ in exponentials)),
+            f.small(max(off for _, off, _ in exponentials)),
+        ),
+        ("its gradients err by {} (2048 of 10,000 candidates) to {} (128", f.small(caps[0]), f.one(caps[1])),
+        ("different modes are {} to {} times closer", *f.span(f.nearer(), "{:.0f}".format)),
+        ("PSNR scatters by {} dB over modes and by {} dB over seeds", *f.scatter()),
+        ("The mean of `manual` is {} dB", f.two(f.psnr("manual"))),
+        (
+            "`reversible` takes {} times the time of `manual`, by `stored` {} times",
+            *(f.one(f.steps_slower(mode)) for mode in ("reversible", "stored")),
+        ),
+        ("no tile lists more than {}.", lists),
+        ("A cap of 128 cuts {} % of", round(100 * f.fact("training", "embedded", "cap 128", "lists_cut"))),
+        ("It costs {} dB, or {} dB if applied", f.one(f.lost("cap 128")), f.one(f.lost("cap 128, rendering only"))),
+        ("it takes {} times as long as projection and colors", f.one(f.projection_backwards())),
+        ("it gains {} to {} dB over the affine", *f.span(f.gained(), "{:.0f}".format)),
+        ("ends {} dB lower (one seed)", f.two(f.lost("ellipsoid"))),
+        ("runs {} named cases, {} verdicts", f.cases(), len(f.rows("stability"))),
+        (
+            "direction the image errs by {}.",
+            f.small(max(f.stability(f"size_{size}", "value_error") for size in ("1x20000", "20000x1"))),
+        ),
+        (
+            "(measured on a slab: {} and {})",
+            *f.quoted("compare/volume.txt", r"slab +\| Euler .*\| ([\d.]+) +\|\n.*\| ([\d.]+)"),
+        ),
+        (
+            "its 64 samples err by {}, those of the exponential by {}.",
+            *(f.small(f.integrated(name)) for name in ("RK4", "exponential")),
+        ),
+        ("linearized exponential: up to {},", f.small(max(f.shortcut("linear depth") + f.shortcut("linear peak")))),
+        ("overlap: {} where", f.small(max(f.shortcut("no overlap")))),
+        ("affine projection: {} to {};", *f.span(f.shortcut("affine"), f.small)),
+        ("low-pass: up to {}.", f.small(max(f.shortcut("affine + blur")))),
+        (
+            "`stepwise` has {} in all, `manual` {}.",
+            *(f.rules(mode) + f.plumbing(mode) for mode in ("stepwise", "manual")),
+        ),
+        ("it saves almost half: {} against {}.", f.rules("stepwise"), f.rules("manual")),
+        ("`stored` takes {} to {} times the adjoint", *f.span(f.stored_to_reversible(), f.one)),
+        ("What it costs is {} times the memory", round(f.mebibytes("stored") / f.mebibytes("manual"))),
+    ]
+
+
+def _steps() -> list[tuple]:
+    return [
+        (
+            "Two threads do {} times the multiply-adds of one, and moved {} times the bytes in that run",
+            f.two(f.of_two_threads("rate")),
+            f.two(f.of_two_threads("bandwidth")),
+        ),
+        (
+            "pixels: {} times as many in `full`, {} times where",
+            f.one(f.looked_at("full")),
+            f.one(f.looked_at("synthetic")),
+        ),
+    ]
+
+
+def _performance() -> list[tuple]:
+    return [
+        ("two processes see {} times the images per second", f.two(f.images_gained())),
+    ]
+
+
+def _shutters() -> list[tuple]:
+    return [
+        (
+            "find the means to within {} px, one step to within {} px.",
+            *(f.small(max(f.shutter(way, "off"))) for way in ("two steps", "one step")),
+        ),
+        ("the adjoint has {} registers, without spills", f.registers("project, rolling shutter")[0]),
+        ("Pictures then reach {} to {} dB, where", *f.span(f.shutter("two steps", "psnr"), f.one)),
+        ("stands still reaches {} to {} dB.", *f.span(f.shutter("standing still", "psnr"), f.one)),
+    ]
+
+
+def _simulation() -> list[tuple]:
+    return [
+        (
+            "ours draws {} times as many pictures",
+            round(f.simulated("ours, 1 thread", 2) / f.simulated("Newton's", 2)),
+        ),
+        ("mean error of a color is {},", f.small(f.simulated("Newton's", 4))),
+        ("Ours errs by at most {}.", f.small(f.simulated("ours, 1 thread", 3))),
+    ]
+
+
+def _cameras() -> list[tuple]:
+    return [
+        (
+            "All {} get there, after {} steps at most, and end within {} degrees, {} mm and {} %.",
+            *(len(f.data("cameras")["reached"]), max(f.data("cameras")["reached"])),
+            *(f.small(unit * max(f.data("cameras")["last"][of])) for of, unit in f.CAMERA_ERRORS.items()),
+        ),
+        (
+            "footprints of `affine` reach {} dB, those of `unscented` {} dB; through a wide lens {} and {} dB.",
+            *(f.one(f.footprint(lens, way, "0.03")) for lens in ("OPENCV_FISHEYE", "OPENCV,") for way in f.WAYS),
+        ),
+        (
+            "7 degrees: {} and {} dB through the fisheye, {} and {} dB through the wide lens",
+            *(f.one(f.footprint(lens, way, "0.12")) for lens in ("OPENCV_FISHEYE", "OPENCV,") for way in f.WAYS),
+        ),
+        (
+            "both are wrong, by up to {} of a color of 1",
+            f.two(max(f.footprint("EQUI", way, size, "max") for way in f.WAYS for size in ("0.03", "0.12"))),
+        ),
+        (
+            "take {} times as long through the fisheye as a pinhole's, `unscented` {} times",
+            *(f.two(f.footprint("OPENCV_F", w, "0.03", "seconds", "pinhole")) for w in f.WAYS),
+        ),
+        (
+            "are off by {}, the largest seen, relative to float64, over all",
+            f.off_by("gaussians"),
+        ),
+        *((f"{where} | {{}} |", f.off_by(*parts)) for where, parts in f.LEARNED.items()),
+        (
+            "px takes {} % longer with a camera that learns its pose, fx, fy, cx and cy. Through an OPENCV lens it "
+            "takes {} % longer if that learns all of them and its four coefficients, {} % by the unscented "
+            "transform (one thread, processor time, {}).",
+            *(f.one(100 * price["added"] / price["step"]) for price in f.data("cameras")["prices"].values()),
+            f.data("cameras")["machine"],
+        ),
+        ("projection and adjoint take up to {} times as long if all is learned.", f.two(f.rolling_price())),
+    ]
+
+
+def _cuda() -> list[tuple]:
+    return [
+        ("the blend has {} registers and", f.registers("blend")[0]),
+        ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),
+        (
+            "Its adjoints have {} to {} registers,",
+            *f.span(f.registers("manual", "stepwise", "reversible", "stored"), str),
+        ),
+        ("the adjoint of the ball takes {} to {} ms,", *f.loads("ball", "one for a tile")),
+        ("ms, not {}: its 2,170 tiles", *f.loads("ball", "one for a tile", "slots busy: ms")),
+        (
+            "pixels a lane take {} to {} ms for the ball's adjoint, but {} to {} for the crowd's, {} to {} now",
+            *f.loads("ball", "two of four pixels a lane"),
+            *f.loads("crowd", "two of four pixels a lane"),
+            *f.loads("crowd", "one for a tile"),
+        ),
+        ("Lists split at 256 take {} to {} (ball)", *f.loads("ball", "one for 256 of a list")),
+        ("the longest tiles first, {} (crowd)", f.loads("crowd", "one for a tile, the longest first")[1]),
+        ("registers, {} % (`stored` {}).", f.resident("manual"), f.resident("stored")),
+        (
+            "projection and colors have {} and {} registers, {} %:",
+            *f.registers("project", "adjoint of shade"),
+            f.resident("project"),
+        ),
+    ]
+
+
+#: By page: pieces of its text, with ``{}`` for a figure, and the figures.
+SENTENCES = {
+    "scaling.md": _scaling,
+    "README.md": _readme,
+    "renderer.md": _renderer,
+    "extending.md": _extending,
+    "adjoints.md": _adjoints,
+    "steps.md": _steps,
+    "performance.md": _performance,
+    "shutters.md": _shutters,
+    "simulation.md": _simulation,
+    "cameras.md": _cameras,
+    "cuda.md": _cuda,
+}
 
 
 def filled(name: str, page: str) -> str:
@@ -376,7 +416,7 @@ def filled(name: str, page: str) -> str:
     Raises:
         LookupError: if a sentence is not in it, or more than once.
     """
-    for sentence, *values in sentences().get(name, []):
+    for sentence, *values in SENTENCES[name]() if name in SENTENCES else ():
         pieces = [re.sub(r"(?:\\?\s)+", r"\\s+", re.escape(piece)) for piece in sentence.split("{}")]
         found = list(re.finditer(r"([^|]{1,60}?)".join(pieces), page))
         if len(found) != 1:
