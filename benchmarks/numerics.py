@@ -2,13 +2,15 @@
 
 Walks: a pixel of random alphas through which a thousandth of the light comes, forward and back in float32, against the
 same in float64; the bounds are those of docs/adjoints.md. Trained scenes: float64 without and with a cut, and how often
-float32 decides otherwise at 1/255; gradients summed in random orders, as atomic
-additions are. Integrators: the observed order, from docs/compare/volume.csv.
+float32 decides otherwise at 1/255; gradients summed in random orders, as atomic additions are. Integrators: the
+observed order, from docs/compare/volume.csv.
 
     python benchmarks/numerics.py [-s SCENE -m MODEL ...] [--out docs/benchmarks]
 """
 
+import argparse
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from common import ROOT, option, parse, write_table
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
+from warp_splat.compare.stability.verdict import EPS
 from warp_splat.config import ALPHA_MIN, RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.data import Gaussians
@@ -24,7 +27,11 @@ from warp_splat.raster.project import project
 from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
 
-EPS = 2.0**-24
+#: Of scenes and their models, for :func:`views_of`.
+PAIRS = (
+    option("-s", "--scenes", nargs="*", default=[], action="extend"),
+    option("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene"),
+)
 LAYERS, PIXELS = (10, 100, 1_000, 10_000, 100_000), 256
 LEFT = 1e-3  # of the light, behind all layers
 SIDE, ORDERS = 48, 20  # pixels of a square whose gradients are summed, in that many orders
@@ -94,10 +101,19 @@ def walk(count: int) -> list[dict]:
     return rows
 
 
-def some_pixels(camera: Camera, count: int, seed: int) -> tuple[torch.Tensor, torch.Generator]:
-    """Row and column of each, [P, 2], at random, and what goes on at random."""
-    generator, sides = torch.Generator().manual_seed(seed), (camera.height, camera.width)
-    return torch.stack([torch.randint(0, side, (count,), generator=generator) for side in sides], 1), generator
+def views_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Gaussians, Camera]]:
+    """Each scene's name, its model's Gaussians, and its first camera, shrunk to --width."""
+    for folder, model in zip(arguments.scenes, arguments.models, strict=True):
+        scene = load_scene(folder, resolution=arguments.width, eval=True, report=str)
+        with torch.no_grad():
+            gaussians = GaussianModel.load(model).arranged().activated()
+        yield Path(folder).name, gaussians, scene.train[0].camera
+
+
+def some_pixels(camera: Camera, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Row and column of each, [P, 2], at random."""
+    sides = (camera.height, camera.width)
+    return torch.stack([torch.randint(0, side, (count,), generator=generator) for side in sides], 1)
 
 
 def sorted_splats(gaussians: Gaussians, camera: Camera) -> tuple[oracle.Splats, torch.Tensor]:
@@ -110,7 +126,8 @@ def sorted_splats(gaussians: Gaussians, camera: Camera) -> tuple[oracle.Splats, 
 
 def biased(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
     """How far gradients with a cut are from those without, float64, of random signs at some pixels."""
-    pixels, generator = some_pixels(camera, count, 1)
+    generator = torch.Generator().manual_seed(1)
+    pixels = some_pixels(camera, count, generator)
     signs = 2.0 * torch.randint(0, 2, (count, 3), generator=generator).double() - 1.0
     found, rows = {}, []
     for cuts in ((0.0, 0.0), (ALPHA_MIN, 0.0), (0.0, 1e-4)):
@@ -132,7 +149,7 @@ def biased(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[
 @torch.no_grad()
 def flipped(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
     """How often float32 decides otherwise than float64 whether alpha is below 1/255, and what that changes."""
-    pixels, _ = some_pixels(camera, count, 2)
+    pixels = some_pixels(camera, count, torch.Generator().manual_seed(2))
     exact, order = sorted_splats(gaussians, camera)
     drawn = project(gaussians, camera, RasterOptions(alpha_min=1e-6))
     xx, xy, yy = drawn.conics[order].unbind(1)
@@ -229,18 +246,13 @@ def orders() -> list[dict]:
 def main() -> None:
     arguments = parse(
         __doc__,
-        option("-s", "--scenes", nargs="*", default=[], action="extend"),
-        option("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene"),
+        *PAIRS,
         option("--width", type=int, default=240, help="of the view [px]"),
         option("--pixels", type=int, default=480),
     )
     launch.prepare("cpu", 0)
     rows = [row for count in LAYERS for row in walk(count)]
-    for folder, model in zip(arguments.scenes, arguments.models, strict=True):
-        camera = load_scene(folder, resolution=arguments.width, eval=True, report=lambda _: None).train[0].camera
-        with torch.no_grad():
-            gaussians = GaussianModel.load(model).arranged().activated()
-        name = Path(folder).name
+    for name, gaussians, camera in views_of(arguments):
         rows += flipped(name, gaussians, camera, arguments.pixels) + shuffled(name, gaussians, camera)
         rows += biased(name, gaussians, camera, arguments.pixels // 24)
     rows += orders()

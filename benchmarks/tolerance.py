@@ -9,25 +9,21 @@ of the worst of these pixels and of half of them; the bound is found with a tole
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
 import torch
 from common import interleaved, option, parse, write_table
 from knobs import KNOBS
 from made_up import cameras, make_crowd
+from numerics import PAIRS, some_pixels, views_of
+from panels import Panel, draw_panels
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
 from warp_splat.compare.stability import cases, verdict
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ALPHA_MIN, RasterOptions
-from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 from warp_splat.runtime import launch, pool
-from warp_splat.scene import load_scene
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 HEADERS = ("scene", "options", "error, worst", "error, median", "bound, worst", "bound, median", "bound : error")
@@ -61,9 +57,7 @@ def exact(gaussians: Gaussians, camera: Camera, pixels: torch.Tensor, alpha_min:
 
 def measure(name: str, gaussians: Gaussians, camera: Camera, count: int) -> list[dict]:
     """A row for each variant."""
-    generator, black = torch.Generator().manual_seed(0), torch.zeros(3)
-    sides = (camera.height, camera.width)
-    pixels = torch.stack([torch.randint(0, side, (count,), generator=generator) for side in sides], 1)
+    pixels, black = some_pixels(camera, count, torch.Generator().manual_seed(0)), torch.zeros(3)
     at_once = max(2_000_000 // len(gaussians.means), 1)
     truths = {
         of: exact(gaussians, camera, pixels, alpha_min, at_once)
@@ -138,20 +132,19 @@ def stiff() -> list[dict]:
 
 def plot(path: Path, rows: list[dict]) -> None:
     """Worst error over time, one panel for each scene."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    _, panels = plt.subplots(1, len(scenes), figsize=(5 * len(scenes), 4), squeeze=False)
-    for axes, scene in zip(panels[0], scenes, strict=True):
-        for curve in dict.fromkeys(row["curve"] for row in rows if row["of"] == "ideal"):
-            points = sorted(
-                (row["times"], row["worst"]) for row in rows if (row["scene"], row["curve"]) == (scene, curve)
+    panels = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        panels.append(
+            panel := Panel(
+                f"{scene}: error of the worst pixel", "time of the forward pass, times the default's", ticks=True
             )
-            style = {"linewidth": 2.5, "color": "black"} if curve.startswith("tolerance") else {"alpha": 0.8}
-            axes.loglog(*zip(*points, strict=True), marker="o", markersize=4, label=curve, **style)
-        axes.set(title=scene, xlabel="time of the forward pass, times the default's", ylabel="error of the worst pixel")
-        axes.grid(alpha=0.3)
-    panels[0][0].legend(fontsize=7)
-    plt.tight_layout()
-    plt.savefig(path, dpi=110)
+        )
+        ideal = [row for row in rows if (row["scene"], row["of"]) == (scene, "ideal")]
+        for curve in dict.fromkeys(row["curve"] for row in ideal):
+            points = sorted((row["times"], row["worst"]) for row in ideal if row["curve"] == curve)
+            style = {"lw": 2.5, "color": "black"} if curve.startswith("tolerance") else {"alpha": 0.8}
+            panel.line(curve, *zip(*points, strict=True), marker="o", markersize=4, **style)
+    draw_panels(path, panels, 2, 2.8)
 
 
 def write(rows: list[dict], extreme: list[dict], count: int, out: Path | None) -> None:
@@ -177,19 +170,15 @@ def write(rows: list[dict], extreme: list[dict], count: int, out: Path | None) -
 def main() -> None:
     arguments = parse(
         __doc__,
-        option("-s", "--scenes", nargs="*", default=[], action="extend"),
-        option("-m", "--models", nargs="*", default=[], action="extend", help="one for each scene"),
+        *PAIRS,
         option("--width", type=int, default=480, help="of the view [px]"),
         option("--crowd", type=int, default=0, help="Gaussians of a crowd made up; 0: none"),
         option("--pixels", type=int, default=200),
     )
     launch.prepare("cpu", 0)
     rows, extreme = [], stiff()
-    for folder, model in zip(arguments.scenes, arguments.models, strict=True):
-        view = load_scene(folder, resolution=arguments.width, eval=True, report=lambda _: None).train[0].camera
-        with torch.no_grad():
-            gaussians = GaussianModel.load(model).arranged().activated()
-        rows += measure(Path(folder).name, gaussians, view, arguments.pixels)
+    for name, gaussians, camera in views_of(arguments):
+        rows += measure(name, gaussians, camera, arguments.pixels)
         write(rows, extreme, arguments.pixels, arguments.out)
     if arguments.crowd:
         with torch.no_grad():
