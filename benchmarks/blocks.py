@@ -85,22 +85,17 @@ def compare(name: str, source: Path, models: Path, count: int, iterations: int, 
     largest = max(blocks, key=lambda part: len(part.points))
     views = f"{min(len(part.train) for part in blocks)} to {max(len(part.train) for part in blocks)}"
     records.append({"model": f"{count} blocks", "largest": len(largest.points), "views": views, "results": trained})
-    across, within, seams = [], [], []
-    for place, record in zip((whole, folder), records, strict=True):
-        errors, depths = errors_of(place, scene.test)
-        if not across and not within:
-            for index, depth in enumerate(depths):
-                cells = cells_in(scene.test[index].camera, depth, blocks[0].block)
-                (across if (cells != np.bincount(cells.ravel()).argmax()).mean() > ACROSS else within).append(index)
-                near = maximum_filter(cells, 2 * SEAM + 1) != minimum_filter(cells, 2 * SEAM + 1)
-                seams.append(near)
-        record |= {
-            "scene": f"{name}: {len(across)} of {len(scene.test)} across",
-            "file": len(Finished(place).file.splats.means),
-        }
-        record |= {"across": decibels([errors[i] for i in across]), "within": decibels([errors[i] for i in within])}
-        record["seams"] = decibels([np.concatenate([error[near] for error, near in zip(errors, seams, strict=True)])])
-        record["rest"] = decibels([np.concatenate([error[~near] for error, near in zip(errors, seams, strict=True)])])
+    (of_whole, depths), (of_blocks, _) = (errors_of(place, scene.test) for place in (whole, folder))
+    cells = [cells_in(view.camera, depth, blocks[0].block) for view, depth in zip(scene.test, depths, strict=True)]
+    across = [(found != np.bincount(found.ravel()).argmax()).mean() > ACROSS for found in cells]
+    seams = [maximum_filter(found, 2 * SEAM + 1) != minimum_filter(found, 2 * SEAM + 1) for found in cells]
+    for place, errors, record in zip((whole, folder), (of_whole, of_blocks), records, strict=True):
+        record["scene"] = f"{name}: {sum(across)} of {len(across)} across"
+        record["file"] = len(Finished(place).file.splats.means)
+        for of_views, of_pixels, chosen in (("across", "seams", True), ("within", "rest", False)):
+            views = [error for error, beyond in zip(errors, across, strict=True) if beyond == chosen]
+            pixels = [error[near == chosen] for error, near in zip(errors, seams, strict=True)]
+            record |= {of_views: decibels(views), of_pixels: decibels([np.concatenate(pixels)])}
         record["mb"] = max(one["peak_memory_mb"] for one in record["results"])
         record["steps"] = sum(one["iterations"] for one in record["results"])
     return records
@@ -112,7 +107,7 @@ def main() -> None:
         MODELS,
         SCENE,
         option("--blocks", type=int, default=4),
-        option("--iterations", type=int, default=3600, help="of the undivided training"),
+        option("--iterations", type=int, default=800, help="of the undivided training"),
         option("-r", "--resolution", type=int, default=160, help="width of the pictures [px]"),
     )
     make_street(arguments.models / "street" / "scene")

@@ -8,13 +8,12 @@ cameras are the true ones, the points lie at random in the rooms. Each row is a 
 
 import json
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from common import option, parse, write_table
+from common import in_process, option, parse, write_table
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
@@ -118,9 +117,7 @@ def main() -> None:
         if not (scene / "sparse").is_dir():
             make_scene(scene, count, options.made, tuple(options.size), options.masks)
         for memory in options.memories:
-            command = [sys.executable, __file__, "--work", options.work, "--one", scene, "--memories", str(memory)]
-            lines = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
-            rows.append(json.loads(lines[-1]))
+            rows.append(in_process(__file__, "--work", options.work, "--one", scene, "--memories", memory))
             print(rows[-1], flush=True)
     note = (
         f"Photographs of {options.size[0]} x {options.size[1]} px{' with masks' * options.masks}, {options.made} "

@@ -52,6 +52,12 @@ def run_training(model: Path, flags: Iterable) -> dict:
     return results[max(results, key=lambda name: int(name.removeprefix("ours_")))]
 
 
+def in_process(*command) -> dict:
+    """What a script prints last, as JSON, in a process of its own; ``command``: its path and its words."""
+    found = subprocess.run([sys.executable, *map(str, command)], check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(found.stdout.splitlines()[-1])
+
+
 def with_threads(count: int, run: Callable[[], object]) -> Callable[[], None]:
     """``run`` on so many threads."""
 

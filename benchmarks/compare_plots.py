@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import rounding
-from common import parse
+from common import ROOT, parse
 from panels import Panel, draw_panels
 
 from warp_splat.compare.plots import STYLES
@@ -75,7 +75,7 @@ def plot_stability(path: Path, measured: Mapping[str, Any]) -> None:
 
 
 def main() -> None:
-    out = parse(__doc__).out
+    out = parse(__doc__).out or ROOT / "output" / "compare"
     measured, cases = (json.loads((out / f"{name}.json").read_text()) for name in ("adjoints", "stability"))
     plot_memory(out / "memory.png", measured)
     plot_stages(out / "stages.png", measured)

@@ -4,11 +4,10 @@
 """
 
 import ast
-from pathlib import Path
 
-from common import parse, write_table
+from common import ROOT, parse, write_table
 
-KERNELS = Path(__file__).parents[1] / "warp_splat" / "kernels"
+KERNELS = ROOT / "warp_splat" / "kernels"
 
 _CLAMP = ("splat.adj_alpha_of",)
 _EXP = ("falloff.adj_exp2_known", "step.adj_opaque", *_CLAMP)

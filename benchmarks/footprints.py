@@ -98,7 +98,7 @@ def compare_cameras(out: Path, say: Callable[[str], None] = print) -> list[dict[
     say(table_of(records, FOOTPRINTS))
     gradients = measure_gradients()
     _report_gradients(gradients, say)
-    write_csv(out / "cameras.csv", [{"table": "footprints", **r} for r in records])
+    write_csv(out / "cameras.csv", records)
     write_csv(out / "cameras_gradients.csv", gradients)
     maps.plot_maps(out / "cameras.png", rows, 1.6 * len(rows), LEAST)
     return records

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from common import option, parse, versions
+from common import ROOT, option, parse, versions
 from gpu_counts import LAUNCHES, OPERATIONS, REST, WAITS, Scene, count_scene, count_step
 from gpu_steps import STAGES
 from made_up import cameras, make_crowd, make_gaussians
@@ -29,7 +29,7 @@ from warp_splat.kernels.window import RADIUS
 from warp_splat.runtime import launch
 from warp_splat.text import format_table
 
-CUBINS = Path(__file__).parents[1] / "docs/cuda/cubins.json"
+CUBINS = ROOT / "docs/cuda/cubins.json"
 
 
 class Card(NamedTuple):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from common import milliseconds
+from common import ROOT, milliseconds
 from made_up import cameras, make_gaussians, make_trainer, steps_of
 from preset import run
 
@@ -18,7 +18,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 
-STORED = Path(__file__).parents[1] / "docs/benchmarks/preset.json"
+STORED = ROOT / "docs/benchmarks/preset.json"
 TRAINING_HEADERS = ("photographs", "iterations", "s of steps", "PSNR dB", "SSIM", "Gaussians", "PSNR dB on a CPU")
 GSPLAT_HEADERS = ("size", "Gaussians", "renderer", "forward ms", "forward + backward ms")
 NCU_HEADERS = ("kernel", "ms", "% of bandwidth", "% of arithmetic", "% of warps resident")

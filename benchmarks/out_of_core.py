@@ -11,7 +11,6 @@ import hashlib
 import json
 import resource
 import statistics
-import subprocess
 import sys
 import tempfile
 import threading
@@ -20,12 +19,12 @@ import weakref
 from pathlib import Path
 
 import numpy as np
-from common import option, parse, write_table
+from common import in_process, option, parse, write_table
 from PIL import Image
 
 from warp_splat.camera import Camera
 from warp_splat.formats.colmap_text import write_colmap
-from warp_splat.runtime import launch, mapped, pool
+from warp_splat.runtime import launch, pool
 from warp_splat.scene import load_scene
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -70,7 +69,7 @@ def keep_maps() -> list[weakref.ref]:
         maps.append(weakref.ref(content))
         return content
 
-    mapped.np.memmap = made
+    np.memmap = made
     return maps
 
 
@@ -132,11 +131,7 @@ def main() -> None:
     if options.kind:
         print(json.dumps(measure(scene, options.gaussians, options.limit, options.kind == "file")))
         return
-    rows = []
-    for kind in ("memory", "file"):
-        command = [sys.executable, *sys.argv, "--kind", kind]
-        lines = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
-        rows.append({"kind": kind, **json.loads(lines[-1])})
+    rows = [{"kind": kind, **in_process(*sys.argv, "--kind", kind)} for kind in ("memory", "file")]
     note = (
         f"One thread, degree 3, the last {STEPS} steps after growth; `of its own`: memory beyond that before training, "
         f"growth and the saving of the model included, which a limit of {options.limit:g} GiB (RLIMIT_DATA) held for "

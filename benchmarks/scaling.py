@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import ROOT, option, parse, write_table
+from common import ROOT, in_process, option, parse, write_table
 from made_up import make_trainer
 from panels import Panel, draw_panels
 
@@ -137,9 +137,7 @@ def count_instances(trainer: Trainer) -> int:
 
 def measure_apart(arguments: list) -> dict:
     """:func:`measure` in a process of its own."""
-    command = [sys.executable, __file__, "--point", json.dumps(arguments)]
-    found = subprocess.run(command, check=True, capture_output=True, text=True)
-    return json.loads(found.stdout.splitlines()[-1])
+    return in_process(__file__, "--point", json.dumps(arguments))
 
 
 def train(limit: int) -> dict:

@@ -12,16 +12,15 @@ are the least that ``gpu_model.py`` finds for an H200. Networks are as their mak
 """
 
 import json
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from common import parse, write_table
+from common import ROOT, parse, write_table
 from gpu_counts import Scene
 from gpu_model import CARDS, times
 from sharding import SENT, VIEWS
 
-RESULTS = Path(__file__).parents[1] / "docs" / "benchmarks"
+RESULTS = ROOT / "docs" / "benchmarks"
 CORES = 2  # of the machine that measured
 STATE = 4 * 4 * 59  # bytes of a Gaussian: parameters, gradients, two moments
 DRAWING = ("bin", "blend", "loss", "adjoint of loss", "adjoint of blend")
