@@ -5,28 +5,42 @@ of the true surface that is near the mesh; both within shares of the extent, and
 what is on it: completeness without the room around. Normals: mean angle of what is near. Of any scene: how far the
 points of structure from motion are from the mesh.
 
+Beside it, on the same scene, by Open3D (pip install open3d-cpu), whose rows are left out without it: its distance field
+of the same depths, of all depths (those that no other view sees, too), and Poisson's surface of the points of structure
+from motion (Kazhdan and Hoppe 2013).
+
     python benchmarks/mesh.py -m MODEL [-m MODEL ...] [--out docs/benchmarks]
 """
 
+import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import trimesh
 import warp as wp
 from common import TRAINED, parse, write_table
+from scipy.spatial import KDTree
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
+
 from scene_geometry import still_life
 from scene_trace import Measure
 
 from warp_splat.config import MeshConfig
-from warp_splat.meshing.command import mesh
+from warp_splat.meshing.command import PIXELS, drawn_views, mesh, without_islands
+from warp_splat.meshing.fusion import EDGE, TRUNCATION, Drawn, Surface, agreed, footprint
 from warp_splat.pruning.opened import Opened
 from warp_splat.scene.types import Scene, View
 
 SHARES = (0.005, 0.01, 0.02)
 SAMPLES, STRIDE, FAR = 200_000, 4, 1e6
+MEMORY, BLOCKS, LEAST = 2e9, 50_000, 3.0  # of Open3D: bytes of views; blocks at first; its own threshold of weights
+NEIGHBORS, OCTREE, FAINT = 30, 9, 0.01  # Poisson: points of a normal; depth; share of vertices left out
 TABLE = np.array([[-1.5, -1.5, -0.1], [1.5, 1.5, 2.0]])  # around the embedded scene's table and what is on it
-HEADERS = ("scene", *(f"{name} {share:.1%}" for share in SHARES for name in ("accuracy", "completeness", "F")))
+HEADERS = ("scene", "surface")
+HEADERS += tuple(f"{name} {share:.1%}" for share in SHARES for name in ("accuracy", "completeness", "F"))
 HEADERS += ("table, completeness 1.0%", "normals, degrees", "points, median", "points, 90 %", "triangles", "seconds")
 
 
@@ -81,25 +95,79 @@ def against_truth(found: trimesh.Trimesh, scene: Scene) -> list[float]:
     return [*(100 * value for value in row), np.degrees(np.arccos(cosines)).mean()]
 
 
-def row_of(model: Path) -> tuple:
+def open3d_fused(views: list[Drawn], voxel: float, least: float) -> trimesh.Trimesh:
+    """Depths in Open3D's distance field where at least so many meet: our voxels and truncation, without islands."""
+    import open3d  # noqa: PLC0415 - may be missing
+
+    tensor, single = open3d.core.Tensor, open3d.core.float32
+    blocks = open3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), (single, single), ((1,), (1,)), voxel, EDGE, BLOCKS)
+    for view in views:
+        c, depth = view.camera, open3d.t.geometry.Image(tensor(view.depth.numpy()))
+        pinhole = tensor(np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]]))
+        pose = tensor(np.block([[c.rotation, c.translation[:, None]], [np.zeros(3), 1.0]]))
+        scale = (pinhole, pose, 1.0, FAR, TRUNCATION)
+        blocks.integrate(blocks.compute_unique_block_coordinates(depth, *scale), depth, *scale)
+    found = blocks.extract_triangle_mesh(least)
+    vertices = found.vertex.positions.numpy()
+    kept = without_islands(Surface(vertices, found.triangle.indices.numpy(), np.zeros_like(vertices)))
+    return trimesh.Trimesh(kept.vertices, kept.faces, process=False)
+
+
+def poisson(scene: Scene) -> trimesh.Trimesh:
+    """Poisson's surface of the scene's points; their normals look to the nearest camera."""
+    import open3d  # noqa: PLC0415 - may be missing
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scene.points.astype(np.float64)))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBORS))
+    centers = np.stack([view.camera.center for view in scene.train])
+    towards = centers[KDTree(centers).query(scene.points)[1]] - scene.points
+    normals = np.asarray(cloud.normals)
+    cloud.normals = open3d.utility.Vector3dVector(normals * np.sign((normals * towards).sum(1, keepdims=True)))
+    found, density = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=OCTREE)
+    found.remove_vertices_by_mask(np.asarray(density) < np.quantile(density, FAINT))
+    return trimesh.Trimesh(np.asarray(found.vertices), np.asarray(found.triangles), process=False)
+
+
+def surfaces_of(config: MeshConfig, opened: Opened) -> Iterator[tuple[str, Callable[[], trimesh.Trimesh]]]:
+    """Each with what makes it."""
+
+    def ours() -> trimesh.Trimesh:
+        mesh(config)
+        return trimesh.load(config.output, process=False)
+
+    yield "ours", ours
+    try:
+        import open3d  # noqa: F401, PLC0415 - may be missing
+    except ImportError as error:
+        print(f"Open3D's rows are left out: {error}")
+        return
+    views = drawn_views(opened, MEMORY)
+    counting = agreed(views)
+    voxel = PIXELS * float(np.nanmedian([footprint(view) for view in counting]))
+    yield "Open3D, same depths", lambda: open3d_fused(counting, voxel, 0.0)
+    yield "Open3D, all depths", lambda: open3d_fused(views, voxel, LEAST)
+    yield "Poisson, points", lambda: poisson(opened.scene)
+
+
+def rows_of(model: Path) -> Iterator[tuple]:
     config = MeshConfig(model=str(model), output=str(model / "mesh.ply"))
     opened = Opened(config)
-    scene, name, path = opened.scene, Path(opened.trained["source_path"]).name, Path(config.output)
-    begin = time.perf_counter()
-    mesh(config)
-    seconds = time.perf_counter() - begin
-    found = trimesh.load(path, process=False)
-    truth = against_truth(found, scene) if name == "still_life" else [None] * (3 * len(SHARES) + 2)
-    far = to_mesh(scene.points, found.vertices, found.faces)[0] / scene.extent * 100
-    numbers = [*truth, np.median(far), np.quantile(far, 0.9)]
-    shown = ("" if value is None else f"{value:.3g}" for value in numbers)
-    return (name, *shown, len(found.faces), f"{seconds:.0f}")
+    scene, name = opened.scene, Path(opened.trained["source_path"]).name
+    for surface, make in surfaces_of(config, opened):
+        begin = time.perf_counter()
+        found = make()
+        seconds = time.perf_counter() - begin
+        truth = against_truth(found, scene) if name == "still_life" else [None] * (3 * len(SHARES) + 2)
+        far = to_mesh(scene.points, found.vertices, found.faces)[0] / scene.extent * 100
+        numbers = [*truth, np.median(far), np.quantile(far, 0.9)]
+        shown = ("" if value is None else f"{value:.3g}" for value in numbers)
+        yield name, surface, *shown, len(found.faces), f"{seconds:.0f}"
 
 
 def main() -> None:
     arguments = parse(__doc__, TRAINED)
-    rows = [row_of(model.resolve()) for model in arguments.models]
-    note = "Shares and distances in percent of the scene's extent; seconds with opening the scene; 2 threads."
+    rows = [row for model in arguments.models for row in rows_of(model.resolve())]
+    note = "Shares and distances in percent of the scene's extent; seconds, ours with drawing depths; 2 threads."
     write_table("mesh", arguments.out, HEADERS, rows, note)
 
 
