@@ -215,3 +215,17 @@ def test_a_process_without_signs_is_named(monkeypatch):
     assert one.silent() == [2]
     one.stopped.set()
     thread.join(5)
+
+
+def test_an_error_of_all_processes_of_a_machine_is_told_once(monkeypatch, capsys):
+    """Two machines with two processes each; that of one process alone is told, too."""
+    store, said = torch.distributed.HashStore(), []
+    monkeypatch.setattr(torch.distributed.distributed_c10d, "_get_default_store", lambda: store)
+    for rank in range(4):
+        monkeypatch.setenv("GROUP_RANK", str(rank // 2))
+        error = OSError(28, "No space left", "model") if rank == 3 else InputError("scene: expected a folder.")
+        with pytest.raises(SystemExit, match="1"), watch.watching(rank, 4, ends=True):
+            raise error
+        said.append(capsys.readouterr().err)
+    scene = "warp-splat: error: scene: expected a folder.\n"
+    assert said == [scene, "", scene, "warp-splat: error: model: No space left.\n"]

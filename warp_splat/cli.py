@@ -23,7 +23,7 @@ from warp_splat.config import (
     SimplifyConfig,
     ViewConfig,
 )
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, tell
 from warp_splat.flags import FOREIGN_FLAGS, default_of, flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
@@ -235,11 +235,8 @@ def main(arguments: list[str] | None = None) -> int:
         alike = False
         return run(config)
     except (InputError, OSError) as error:
-        if os.environ.get("WARP_SPLAT_TRACEBACK"):
-            raise
-        text = f"{error.filename or 'file'}: {error.strerror or error}." if isinstance(error, OSError) else error
         if not alike:
-            print(f"warp-splat: error: {text}", file=sys.stderr)
+            tell(error)
         return 1
     except KeyboardInterrupt:
         print("warp-splat: interrupted; what was saved before stays.", file=sys.stderr)

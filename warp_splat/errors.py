@@ -1,10 +1,21 @@
 """The one exception that a user's mistake may raise: its text is all they see."""
 
+import os
+import sys
+
 REASON_MOST = 300  # characters of a library's own words: on a damaged file, OpenImageIO may list all that it met
 
 
 class InputError(ValueError):
     """Bad input. The message is one sentence: the file or argument, what was expected, what was found, what to do."""
+
+
+def tell(error: InputError | OSError) -> None:
+    """Print the sentence. Raises ``error`` itself where WARP_SPLAT_TRACEBACK is set."""
+    if os.environ.get("WARP_SPLAT_TRACEBACK"):
+        raise error
+    text = f"{error.filename or 'file'}: {error.strerror or error}." if isinstance(error, OSError) else error
+    print(f"warp-splat: error: {text}", file=sys.stderr, flush=True)
 
 
 def reason_of(error: object) -> str:

@@ -168,8 +168,6 @@ def join(device: str, images: int = 0, kind: type[Processes] = Processes) -> Ite
             f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
             f"({error}); start several processes with torchrun, or unset it."
         ) from error
-    if images % count and not kind.sharded:
-        raise InputError(f"--views {images}: expected a multiple of {count} processes; give each as many.")
     # torch loads this later anyhow. Its functions would then keep the group of that moment as a default argument.
     # Nothing would end that group or its gloo threads, which abort a process that shuts down around them.
     import torch.distributed.nn  # noqa: PLC0415 - only of use here
@@ -194,6 +192,8 @@ def join(device: str, images: int = 0, kind: type[Processes] = Processes) -> Ite
         ) from error
     try:
         with watching(rank, count, ends=kind.sharded) as watch:
+            if images % count and not kind.sharded:
+                raise InputError(f"--views {images}: expected a multiple of {count} processes; give each as many.")
             processes = kind(rank, count, local_count, images)
             processes.watch = watch
             yield processes

@@ -11,6 +11,8 @@ from typing import Any
 import psutil
 import torch.distributed as dist
 
+from warp_splat.errors import InputError, tell
+
 GONE = 3.0  # seconds without a sign, of a process of which nothing is heard
 HUNG = 20.0  # of one for which others wait in vain
 LEFT = "left"
@@ -53,11 +55,8 @@ class Watch:
         """Wait until one of the others hangs: then this process can only end."""
         while not self.stopped.wait(1.0):
             if hung := [rank for rank in self.gone(self.patience) if rank != self.rank]:
-                ranks = ", ".join(map(str, hung))
-                words = (
-                    f"Process {self.rank}: no sign of process {ranks} for {HUNG:.0f} s; the last checkpoint is whole."
-                )
-                os.write(2, f"warp-splat: error: {words}\n".encode())
+                words = f"Process {self.rank}: no sign of process {', '.join(map(str, hung))} for {HUNG:.0f} s"
+                os.write(2, f"warp-splat: error: {words}; the last checkpoint is whole.\n".encode())
                 for rank in hung:
                     self.kill(rank)
                 os._exit(1)
@@ -72,7 +71,13 @@ class Watch:
 
 @contextmanager
 def watching(rank: int, count: int, ends: bool) -> Iterator[Watch]:
-    """A watch while the block runs; where one hangs, it ``ends`` this process, which has nothing whole to save."""
+    """A watch while the block runs; where one hangs, it ``ends`` this process, which has nothing whole to save.
+
+    An error that all processes of a machine have, of the scene for instance, is told by the first of them.
+
+    Raises:
+        SystemExit: instead of the error.
+    """
     store = dist.distributed_c10d._get_default_store()
     store.set(f"sign/{rank}", f"{os.getpid()} 0")
     watch = Watch(rank, count, store, HUNG if ends else math.inf)
@@ -81,10 +86,15 @@ def watching(rank: int, count: int, ends: bool) -> Iterator[Watch]:
         thread.start()
     try:
         yield watch
+    except (InputError, OSError) as error:
+        first = True
+        with suppress(RuntimeError):  # the process that kept the store has gone before
+            first = store.add(f"told/{os.environ.get('GROUP_RANK')}/{error}", 1) == 1
+        if first:  # now: torchrun ends this process as soon as another one has ended
+            tell(error)
+        raise SystemExit(1) from error
     finally:
         watch.stopped.set()
         threads[0].join(2.0)
-        try:
+        with suppress(RuntimeError):
             store.set(f"sign/{rank}", LEFT)
-        except RuntimeError:  # the process that kept the store has gone before
-            pass
