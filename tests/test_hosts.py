@@ -1,16 +1,23 @@
 """Two hosts with two processes each, that torchrun lets meet: the bytes of one machine, and how they end if one fails.
 
-Hosts are network namespaces with addresses of their own, between them a cable of 1 Gbit/s. That needs Linux, root, the
-right to make namespaces, and iproute2.
+Hosts are network namespaces with addresses of their own, between them a cable of 1 Gbit/s; or, far from each other, of
+100 Mbit/s and 20 ms, which a thread keeps each packet: few kernels have netem, nearly all have TUN. That needs Linux,
+root, the right to make namespaces, and iproute2.
 """
 
+import fcntl
 import os
 import re
+import select
 import shutil
 import signal
+import struct
 import subprocess
 import sys
+import threading
 import time
+from collections import deque
+from contextlib import contextmanager, suppress
 
 import psutil
 import pytest
@@ -26,6 +33,8 @@ pytestmark = [
     pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="network namespaces need Linux, root"),
     pytest.mark.skipif(not shutil.which("ip") or not shutil.which("tc"), reason="expected ip and tc, of iproute2"),
 ]
+NEAR, FAR = ("1gbit", 0.0), ("100mbit", 0.02)  # rate, and seconds on the way
+TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 0x0001, 0x1000  # of linux/if_tun.h
 ENDLESS = f"-s {SCENE} {SCHEDULE} --iterations 1000000 --checkpoint_interval 0.03 --densify_until_iter 0"
 
 
@@ -40,12 +49,13 @@ class Host:
     def __init__(self, number):
         self.number, self.name = number, f"splat{os.getpid()}{number}"
 
-    def connect(self):
+    def connect(self, rate):
         name, cable = self.name, f"cable{self.number}"
         shell(
+            f"ip link set {cable} netns {name}",
             f"ip -n {name} link set lo up",
             *(f"ip -n {name} addr add 10.77.0.{self.number}/24 dev {cable}", f"ip -n {name} link set {cable} up"),
-            f"ip netns exec {name} tc qdisc add dev {cable} root tbf rate 1gbit burst 256k latency 50ms",
+            f"ip netns exec {name} tc qdisc add dev {cable} root tbf rate {rate} burst 256k latency 50ms",
         )
 
     def start(self, folder, options, *torchrun, before=()):
@@ -78,25 +88,61 @@ def trains(process):
         return False
 
 
+@contextmanager
+def cable(delay):
+    """The devices cable1 and cable2: what one sends, the other receives ``delay`` seconds later."""
+    if not delay:
+        shell("ip link add cable1 type veth peer name cable2")
+        yield
+        return
+    ends, ended = [os.open("/dev/net/tun", os.O_RDWR) for _ in range(2)], threading.Event()
+    for number, end in enumerate(ends, 1):
+        fcntl.ioctl(end, TUNSETIFF, struct.pack("16sH22x", f"cable{number}".encode(), IFF_TUN | IFF_NO_PI))
+    threads = [threading.Thread(target=carry, args=(*pair, delay, ended)) for pair in (ends, ends[::-1])]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+        for end in ends:
+            os.close(end)
+
+
+def carry(source, target, delay, ended):
+    waiting = deque()
+    while not ended.is_set():
+        if select.select([source], [], [], max(waiting[0][0] - time.monotonic(), 0.0) if waiting else 0.1)[0]:
+            with suppress(OSError):  # the host has gone
+                waiting.append((time.monotonic() + delay, os.read(source, 65536)))
+        while waiting and waiting[0][0] <= time.monotonic():
+            with suppress(OSError):
+                os.write(target, waiting.popleft()[1])
+
+
 @pytest.fixture
-def hosts():
+def hosts(request):
     pair = [Host(1), Host(2)]
+    rate, delay = getattr(request, "param", NEAR)
     one, other = (host.name for host in pair)
     try:
         try:
             shell(f"ip netns add {one}", f"ip netns add {other}")
         except subprocess.CalledProcessError as error:
             pytest.skip(f"expected the right to make network namespaces ({error.stderr.decode().strip()})")
-        shell(f"ip link add cable1 netns {one} type veth peer name cable2 netns {other}")
-        for host in pair:
-            host.connect()
-        yield pair
+        with cable(delay):
+            for host in pair:
+                host.connect(rate)
+            yield pair
     finally:
         for host in pair:
             host.end()
             subprocess.run(["ip", "netns", "del", host.name], check=False, capture_output=True)
 
 
+@pytest.mark.parametrize("hosts", [NEAR, FAR], indirect=True, ids=["near", "far"])
 def test_two_hosts_make_the_model_of_one_machine(hosts, tmp_path):
     """Also where packets are lost on the way."""
     if shutil.which("nft"):
@@ -131,7 +177,12 @@ FAILURES = {
 }
 
 
-@pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.parametrize(
+    ("failure", "hosts"),
+    [*((failure, NEAR) for failure in FAILURES), ("dies", FAR), ("hangs", FAR)],
+    indirect=["hosts"],
+    ids=[*FAILURES, "dies far away", "hangs far away"],
+)
 def test_when_a_host_fails_all_end_and_fewer_go_on(failure, hosts, tmp_path):
     fail, said = FAILURES[failure]
     for host in hosts:
