@@ -8,11 +8,13 @@ FOLDER holds a scene of three photographs. A line of JSON for each command: how 
 import json
 import sys
 import traceback
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
+import warp as wp
 from fake_viser import FakeClient, FakeServer, drawn
 from knobs import run_knobs
 
@@ -98,6 +100,42 @@ def call_as_gsplat() -> None:
         image.square().sum().backward()
 
 
+def in_simulation() -> None:
+    """Newton's sensor and its adjoint in a stream of Warp's: all of it there, and the host's picture and gradients.
+
+    The host waits where docs/simulation.md says so.
+    """
+    import newton  # noqa: PLC0415 - optional
+
+    from warp_splat.newton import SensorSplatCamera, camera_of_fov  # noqa: PLC0415
+
+    world, scene, found = newton.ModelBuilder(), newton.ModelBuilder(), []
+    means, quats, scales, opacities, sh = (tensor.detach().cpu().numpy() for tensor in gaussians())
+    splats = newton.Gaussian(
+        means, quats / np.linalg.norm(quats, axis=1)[:, None], scales, opacities, sh.reshape(60, 48)
+    )
+    world.add_shape_gaussian(world.add_body(mass=1.0), gaussian=splats)
+    scene.add_shape_gaussian(-1, gaussian=splats)
+    scene.replicate(world, 2)
+    card = wp.device_from_torch(torch.device("cuda"))
+    for device in (card, wp.get_device("cpu")):
+        model = scene.finalize(device=device, requires_grad=True)
+        sensor, state = SensorSplatCamera(model), model.state()
+        eyes = wp.array([(0, 0, 3, 0, 0, 0, 1)] * 2, dtype=wp.transform, device=device, requires_grad=True)
+        rgb = wp.zeros((2, 24, 40), dtype=wp.vec3, device=device, requires_grad=True)
+        sitecustomize.notes.clear(), sitecustomize.used.clear()
+        stream = wp.ScopedStream(sitecustomize.Stream(7, card)) if device is card else nullcontext()
+        with wp.ScopedDevice(device), stream, wp.Tape() as tape:
+            sensor.update(state, eyes, camera_of_fov(40, 24, 0.8), rgb_image=rgb)
+            tape.backward(grads={rgb: wp.full_like(rgb, wp.vec3(1.0))})
+        assert sitecustomize.used == ({7} if device is card else set())
+        waits = {note["where"].partition(":")[0] for note in sitecustomize.notes}
+        assert waits == ({"raster/checks.py", "raster/bin.py", "raster/api.py"} if device is card else set())
+        found.append([array.numpy() for array in (rgb, eyes.grad, state.body_q.grad)])
+    for one, other in zip(*found, strict=True):
+        assert other.any() and np.linalg.norm(one - other) <= 1e-4 * np.linalg.norm(other)
+
+
 def compare() -> None:
     """What ``warp-splat compare`` measures, of a scene small enough for fibers."""
     workload = layered(10).to(torch.device("cuda"))
@@ -139,6 +177,7 @@ def commands(folder: Path) -> dict:
         "clean": run("clean", model, "--steps", "2", "--device", "cuda"),
         "learned camera": learned_camera,
         "gsplat": call_as_gsplat,
+        **({"simulation": in_simulation} if find_spec("newton") else {}),
         **{mode: (lambda mode=mode: call(mode)) for mode in ADJOINTS},
         "compare": compare,
     }

@@ -53,6 +53,12 @@ def test_commands(folder):
     check(ran(folder, names))
 
 
+@pytest.mark.slow
+def test_newtons_sensor_works_in_the_stream_that_warp_works_in(folder):
+    pytest.importorskip("newton", reason="newton is not installed")
+    check(ran(folder, ["simulation"]))
+
+
 @pytest.mark.long
 def test_every_command(folder):
     found = ran(folder)

@@ -5,7 +5,7 @@ renderer stands on the tape as one function with its own adjoint, whichever of t
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -122,8 +122,8 @@ def rasterize(
                     inputs, [leaves[name] for name in wanted], outputs, [shown[name] for name in reached]
                 )
                 tape.record_func(backward, [array for array in (*inputs, *outputs) if array.size])
-    others = {"strongest": None if found.strongest is None else wp.from_torch(found.strongest)}
-    others |= {"invalid": found.invalid, "dropped": found.dropped, "radii": wp.from_torch(found.radii)}
+        others = {"strongest": None if found.strongest is None else wp.from_torch(found.strongest)}
+        others |= {"invalid": found.invalid, "dropped": found.dropped, "radii": wp.from_torch(found.radii)}
     return TapeOutput(**{"depth": None} | pixels, **others)
 
 
@@ -228,9 +228,6 @@ def rasterize_worlds(
 @contextmanager
 def _torch_on(device: wp.Device, differentiated: bool) -> Iterator[None]:
     """Torch works where and when Warp's own kernels would, whatever the caller has set."""
-    with torch.inference_mode(False), torch.set_grad_enabled(differentiated):
-        if not device.is_cuda:
-            yield
-            return
-        with torch.cuda.stream(wp.stream_to_torch(device)):
-            yield
+    stream = torch.cuda.stream(wp.stream_to_torch(device)) if device.is_cuda else nullcontext()
+    with torch.inference_mode(False), torch.set_grad_enabled(differentiated), stream:
+        yield

@@ -17,7 +17,7 @@ import os
 import sys
 import threading
 import time
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager
 
 import torch
 import warp as wp
@@ -34,6 +34,8 @@ GARBAGE = 0xFF  # of float, NaN
 notes: list[dict] = []
 launched = 0  # kernels and operations on the device so far
 coming: list[tuple[torch.Tensor, torch.Tensor]] = []  # copies to page-locked memory that nobody has waited for
+used: set[int] = set()  # streams in which kernels were launched
+current = [0]  # torch's streams, the last one at work
 memory: dict[int, tuple[int, int, StorageWeakRef]] = {}  # of the device: address and size
 locked: dict[int, StorageWeakRef] = {}  # page-locked memory of the host
 
@@ -166,6 +168,8 @@ def dispatch(func, args, kwargs):
     if name == "aten::_to_copy" and device is not None and given:
         found = found if found.data_ptr() != inner(given[0]).data_ptr() else found.clone()
     launched += card
+    if card and not func.is_view:
+        used.add(current[-1])
     if card and ("::empty" in name or "::new_empty" in name) and found.numel():
         found.untyped_storage().fill_(GARBAGE)
     if pinned and not card:
@@ -278,7 +282,8 @@ def launching(launch):
         global launched
         tables = [options.get(name) or () for name in ("inputs", "outputs", "adj_inputs", "adj_outputs")]
         arrays = [value for table in tables for value in table if isinstance(value, wp.array)]
-        card = options.pop("stream", None) is not None or any(array.device is warp_device(CARD) for array in arrays)
+        stream = options.pop("stream", None)
+        card = stream is not None or any(array.device is warp_device(CARD) for array in arrays)
         for storage in [key for key, (*_, alive) in memory.items() if alive.expired()]:
             del memory[storage]
         for pointer in {p for table in tables for value in table for p in pointers(value) if p}:
@@ -286,6 +291,8 @@ def launching(launch):
             if known != card:
                 raise RuntimeError(f"an illegal memory access was encountered: {kernel.key}")
         launched += card
+        if card:
+            used.add((stream or warp_device(CARD).stream).cuda_stream)
         return launch(kernel, *args, **(options | {"device": warp_device(CARD if card else HOST)}))
 
     return run
@@ -297,9 +304,42 @@ def warp_device(device):
     return warp_card(id(host)) if on_card(device) else host
 
 
+class Stream:
+    """One of torch's, or of Warp's."""
+
+    def __init__(self, number, device):
+        self.cuda_stream, self.device = number, device
+
+
+class Memory:
+    """What Warp takes on the device."""
+
+    def __init__(self, host):
+        self.host, self.expired = host, lambda: False
+
+    def allocate(self, size):
+        address = self.host.allocate(size)
+        memory[-address] = (address, size, self)
+        return address
+
+    def deallocate(self, address, size):
+        del memory[-address]
+        self.host.deallocate(address, size)
+
+
 @functools.cache
 def warp_card(_host):
-    return copy.copy(wp._src.context.runtime.cpu_device)
+    card = copy.copy(wp._src.context.runtime.cpu_device)
+    card._stream, card.default_allocator = Stream(0, card), Memory(card.default_allocator)
+    return card
+
+
+@contextmanager
+def at_work(stream):
+    """What torch.cuda.stream does."""
+    current.append(stream.cuda_stream)
+    yield
+    current.pop()
 
 
 def as_tensor(to_torch, array, requires_grad=None):
@@ -314,21 +354,27 @@ def as_tensor(to_torch, array, requires_grad=None):
 
 def pretend() -> None:
     """Put all that in the place of torch's and Warp's."""
-    stream = type("Stream", (), {"cuda_stream": 0, "device": CARD})()
     names = {"is_available": True, "device_count": 1, "current_device": 0, "is_initialized": True, "empty_cache": None}
-    names |= {"current_stream": stream, "get_device_name": "A GPU that is pretended", "mem_get_info": (2**34, 2**35)}
+    names |= {"get_device_name": "A GPU that is pretended", "mem_get_info": (2**34, 2**35)}
     names |= dict.fromkeys(("memory_reserved", "memory_allocated", "max_memory_allocated"), 0)
     names |= dict.fromkeys(("reset_peak_memory_stats", "set_device", "set_sync_debug_mode"))
     for name, value in names.items():
         setattr(torch.cuda, name, lambda *args, value=value, **options: value)
     torch.cuda.synchronize = lambda *args: wait("synchronize")
-    torch.cuda.stream = lambda *args: nullcontext()
+    torch.cuda.stream, torch.cuda.current_stream = at_work, lambda *args: Stream(current[-1], CARD)
     torch.cuda.Event, torch.Generator = Event, Generator
     torch.Tensor.pin_memory = lambda tensor: torch.ops.aten._pin_memory(tensor)  # noqa: PLW0108 - an attribute that is a function
     wp.config.enable_cpu_blocks = True
     wp.launch, wp.launch_tiled = launching(wp.launch), launching(wp.launch_tiled)
     wp.is_cuda_available, wp.get_cuda_driver_version = (lambda: True), wp.get_cuda_toolkit_version
-    wp.stream_from_torch = lambda stream: warp_device(stream.device) and stream
+    wp.stream_from_torch = lambda stream: Stream(stream.cuda_stream, warp_device(stream.device))
+    wp.stream_to_torch = lambda device: Stream(device.stream.cuda_stream, CARD)
+    device = wp._src.context.Device  # a GPU to who asks in this package, to Warp the CPU
+    device.is_cuda = property(lambda it: it._stream and "/warp_splat/" in sys._getframe(1).f_code.co_filename)
+    device.stream = property(lambda it: it._stream)
+    device.set_stream = lambda it, stream, sync=True: setattr(it, "_stream", stream)
+    read = wp.array.numpy
+    wp.array.numpy = lambda array: (array.device is warp_device(CARD) and wait("copy to the host")) or read(array)
     wp.device_from_torch = wp._src.torch.device_from_torch = warp_device
     wp.to_torch = wp._src.torch.to_torch = functools.partial(as_tensor, wp.to_torch)
     start = threading.Thread._bootstrap_inner
