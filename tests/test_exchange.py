@@ -51,6 +51,23 @@ def test_turned_gaussians_look_the_same_from_the_turned_place(kind, coefficients
     np.testing.assert_allclose(found, expected, atol=1e-5, rtol=0)
 
 
+def test_a_crop_keeps_what_is_in_the_box(tmp_path, fails):
+    before = some_splats()
+    save_gaussians(tmp_path / "a.ply", SplatFile(before), silent)
+    low, high = np.quantile(before.means, 0.2, axis=0), np.quantile(before.means, 0.9, axis=0)
+    box = [f"{value:.9g}" for value in (*low, *high)]
+    kept = [all(low[k] <= mean[k] <= high[k] for k in range(3)) for mean in before.means]
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--crop", *box]) == 0
+    assert 0 < sum(kept) < len(kept)
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "b.ply").splats.means, before.means[kept])
+    for wrong, said in (
+        (box[:5], "expected six numbers"),
+        (box[3:] + box[:3], "the smallest"),
+        ([9] * 3 + [10] * 3, "none"),
+    ):
+        assert said in fails("convert", tmp_path / "a.ply", tmp_path / "c.ply", "--crop", *wrong)
+
+
 @pytest.mark.parametrize("axes", MIRRORS)
 def test_half_turns_and_back_give_the_same_bytes(axes):
     before = some_splats()

@@ -33,6 +33,7 @@ CHANNELS_MOST = 512  # of features
 STRONGEST_MOST = 8  # Gaussians of a pixel that are told
 
 PORT, LAST_PORT = 8080, 65535  # of the viewer
+CROP_HELP = "keep Gaussians with their center in this box: smallest x y z, then largest [world units]"
 PORT_HELP = "of the viewer; if it is busy, the next free one"
 TOLERANCE_HELP = "leave out what changes no pixel by more, of 1; 0: the usual cuts"
 
@@ -123,6 +124,7 @@ class FinishedModel(OnDevice):
     model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
     source_path: str = flag("", "scene folder, for its photographs; default: the one of the training", "-s")
     iteration: int = flag(-1, "which saved model; -1: the last", least=-1)
+    crop: list[float] = flag([], CROP_HELP, many=float)
 
 
 @dataclass
@@ -208,6 +210,7 @@ class ConvertConfig:
 
     source: str = argument("the file to read, or the folder of a trained model")
     target: str = argument("the file to write; its ending says in which format")
+    crop: list[float] = flag([], CROP_HELP, many=float)
     bound: bool = flag(False, "also print how much pictures from around change, measured and with a bound")
 
 
@@ -257,6 +260,7 @@ class ExportHtmlConfig:
 
     model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
     page: str = argument("the page to write, *.html")
+    crop: list[float] = flag([], CROP_HELP, many=float)
     max_gaussians: int = flag(0, "keep only this many, by opacity and size; 0: all that can be seen")
 
 

@@ -43,7 +43,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
     check_numbers(config)
-    iteration, (splats, *_), trained = model_folder.open_model(config.model)
+    iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
     cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
     kept = pack.shown(splats, config.max_gaussians)
     options = {

@@ -22,7 +22,7 @@ def convert(config: ConvertConfig) -> int:
         InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
     """
     format_of(config.target)  # before anything is read
-    iteration, before, trained = open_model(config.source)
+    iteration, before, trained = open_model(config.source, crop=config.crop)
     source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, iteration)
     if os.path.exists(config.target) and os.path.samefile(source, config.target):
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")

@@ -21,7 +21,7 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.files import Unexpected, reading, write_text
-from warp_splat.formats.splats import SplatFile
+from warp_splat.formats.splats import SplatFile, cropped
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter
 
@@ -126,11 +126,11 @@ def is_file_of_gaussians(path: str | Path) -> bool:
     return path.is_file() or (not path.exists() and path.suffix.lower() in FORMATS)
 
 
-def open_model(path: str | Path, iteration: int = -1) -> tuple[int, SplatFile, dict]:
+def open_model(path: str | Path, iteration: int = -1, crop: Sequence[float] = ()) -> tuple[int, SplatFile, dict]:
     """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
 
     Of a file, the iteration is 0. Where there is no cfg_args, the options are that every 8th view was held out, and
-    the antialiasing that the file tells.
+    the antialiasing that the file tells. ``crop`` as :func:`warp_splat.formats.splats.cropped` takes it.
 
     Raises:
         InputError: if there is no such model, or it cannot be read.
@@ -143,6 +143,7 @@ def open_model(path: str | Path, iteration: int = -1) -> tuple[int, SplatFile, d
         file = ply_path(path, iteration)
         options = read_cfg_args(path) if (path / "cfg_args").exists() else options
     gaussians = load_gaussians(file)
+    gaussians = gaussians._replace(splats=cropped(gaussians.splats, crop))
     return iteration, gaussians, {"antialiasing": gaussians.antialiased, **options}
 
 

@@ -64,6 +64,24 @@ def finite_rows(splats: SplatArrays, path, report: Report) -> SplatArrays:
     return splats.take(finite)
 
 
+def cropped(splats: SplatArrays, box: Sequence[float]) -> SplatArrays:
+    """Those with their center in a box: smallest x, y, z, then largest [world units]; all, if it is empty.
+
+    Raises:
+        InputError: if that is no box, or there are none.
+    """
+    if not box:
+        return splats
+    if len(box) != 6 or not np.less(box[:3], box[3:]).all():
+        found = " ".join(f"{value:g}" for value in box)
+        raise InputError(f"--crop: expected six numbers, the smallest x, y and z, then the largest; got {found}.")
+    inside = ((splats.means >= box[:3]) & (splats.means <= box[3:])).all(1)
+    if not inside.any():
+        around = " ".join(f"{value:.3g}" for value in (*splats.means.min(0), *splats.means.max(0)))
+        raise InputError(f"--crop: expected a box with Gaussians in it, found none; all of them lie in {around}.")
+    return splats.take(inside)
+
+
 def sizes(splats: SplatArrays) -> np.ndarray:
     """Opacity times the area of the largest section [N]: what can be said of a Gaussian without any camera."""
     areas = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)

@@ -33,7 +33,7 @@ class Opened(Finished):
 
     def __init__(self, config: FinishedModel):
         used = settle_device(launch.prepare(config.device, config.threads), config.device)
-        super().__init__(config.model, config.iteration)
+        super().__init__(config.model, config.iteration, config.crop)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
         if self.harmonics is not None:

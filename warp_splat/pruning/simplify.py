@@ -188,7 +188,7 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
             "--max_loss, --tolerance, --steps: expected photographs to compare with; name the scene with -s."
         )
     print(UNSEEN)
-    finished = Finished(config.model, config.iteration)
+    finished = Finished(config.model, config.iteration, config.crop)
     require_some(finished)
     file = finished.file
     order = np.argsort(-sizes(file.splats), kind="stable")

@@ -47,7 +47,7 @@ def convert_and_compare(config: ConvertConfig) -> int:
     code = convert(config)
     if config.bound:
         launch.prepare("cpu", 0)
-        finished = Finished(config.source)
+        finished = Finished(config.source, crop=config.crop)
         splats = (finished.file.splats, load_gaussians(config.target).splats)
         means = np.asarray(splats[0].means, np.float64)
         middle = np.median(means, axis=0)

@@ -1,7 +1,7 @@
 """A finished model and how its pictures are made: what render, view, simplify and clean have in common."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +29,7 @@ class Finished:
     Args:
         path: the folder, or the file.
         iteration: which saved model; -1: the last.
+        crop: a box, to leave out what is not in it; see :func:`warp_splat.formats.splats.cropped`.
 
     Attributes:
         iteration: that was found; of a file, 0.
@@ -41,9 +42,9 @@ class Finished:
         InputError: if there is no such model, or it cannot be read.
     """
 
-    def __init__(self, path: str | Path, iteration: int = -1):
+    def __init__(self, path: str | Path, iteration: int = -1, crop: Sequence[float] = ()):
         self.path = str(path)
-        self.iteration, self.file, self.trained = open_model(path, iteration)
+        self.iteration, self.file, self.trained = open_model(path, iteration, crop)
         self.harmonics = read_environment(path, self.iteration)
         self.exposures = read_exposures(path, self.iteration)
 

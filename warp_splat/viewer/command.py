@@ -30,7 +30,7 @@ def view_model(config: ViewConfig) -> int:
     check_numbers(config)
     free_port(config.port)  # before the scene is loaded
     device = settle_device(launch.prepare(config.device, config.threads), config.device)
-    finished = Finished(config.model, config.iteration)
+    finished = Finished(config.model, config.iteration, config.crop)
     model = GaussianModel.from_splats(finished.file.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {finished.iteration}")
     scene = _find_scene(finished, config.source_path)
