@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from warp_splat.cli import main
+from warp_splat.errors import InputError
 from warp_splat.scene.embedded import embedded_scene
 
 ROOT = Path(__file__).parents[1]
@@ -55,6 +56,11 @@ def full_disk(limit):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def no_space(path, *_):
+    """In place of what writes a file."""
+    raise InputError(f"{path}: could not be written (no space left on device).")
 
 
 class CtrlC(io.StringIO):

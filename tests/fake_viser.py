@@ -114,6 +114,13 @@ def some_scene():
     return Scene(views[:2], views[2:], points, np.full((200, 3), 90, np.uint8))
 
 
+def entered(viewer, camera=PHOTO, size=(96, 64), number=1):
+    """A browser that has come."""
+    client = FakeClient(number, camera, size)
+    viewer.server.enter(client)
+    return client
+
+
 def drawn(viewer):
     """Draw until nothing is due; how many frames that took."""
     return sum(1 for _ in iter(viewer.draw, False))

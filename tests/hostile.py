@@ -5,8 +5,11 @@ import struct
 import tracemalloc
 from contextlib import contextmanager
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from warp_splat.errors import InputError
 
 NUMBERS = [0, -1, 1, 2**31, 2**32, 10**12, 2**63, 10**400, 0.5, -0.0, 1e308, True, None, "", [], {}, [[]], "..", 5126]
 
@@ -39,6 +42,15 @@ def one_sentence(error, path, most=600):
     """The message of an error, which names the file that is the matter."""
     message = str(getattr(error, "value", error))
     assert str(path) in message and "\n" not in message and len(message) < most + 2 * len(str(path)), message
+    return message
+
+
+def refusal(run, *words):
+    """The sentence of the InputError that ``run`` raises, in which there are these words."""
+    with pytest.raises(InputError) as caught:
+        run()
+    message = str(caught.value)
+    assert message.endswith(".") and "\n" not in message and all(word in message for word in words), message
     return message
 
 

@@ -197,7 +197,7 @@ def write_transforms(root, names=("images/a.png", "images/b.png"), pixels=None, 
     return root
 
 
-def write_floats(path, pixels, kind="half", names=None):
+def write_floats(path, pixels, kind="half"):
     path.parent.mkdir(parents=True, exist_ok=True)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
     output = oiio.ImageOutput.create(str(path))

@@ -11,14 +11,10 @@ import torch
 
 from warp_splat import Shutter
 from warp_splat.camera import Camera
-from warp_splat.color import to_bytes
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
-from warp_splat.config import RasterOptions
-from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS
-from warp_splat.rendering.finished import make_renderer
 
 FAINTEST = 1e-37  # about the least normal number of float32, the cut where there is none
 C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
@@ -266,9 +262,3 @@ def culling(out, camera, alpha_min: float = oracle.ALPHA_MIN) -> tuple[torch.Ten
     reach = (level * torch.linalg.eigvalsh(splats.cov2d)[:, 1]).sqrt() * splats.live
     copies = 3 if len(inside) > count else 1
     return inside.reshape(copies, count).any(0), reach[:count]
-
-
-def picture_of(model: GaussianModel, background=None, options: RasterOptions | None = None, linear: bool = False):
-    """A function from a camera to the model's image, [H, W, 3] uint8; see ``make_renderer``."""
-    draw = make_renderer(model, background, options)
-    return lambda camera: to_bytes(draw(camera).image, linear)

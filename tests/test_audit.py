@@ -162,6 +162,13 @@ def test_a_module_of_the_folder_where_one_stands_is_audited(tmp_path):
     assert done.stdout.startswith("one: 1 Gaussian on ") and "off by 0.719" in done.stdout, done.stderr
 
 
+def shown_by(place):
+    """What a renderer draws of the scene of one Gaussian."""
+    drawn, camera = SCENES["one"][1]()
+    given = [drawn[name] for name in ("means", "quats", "scales", "opacities", "sh_dc")]
+    return function_of(place)(*given, camera, torch.zeros(3))
+
+
 @pytest.mark.slow
 def test_a_program_may_write_an_exr(tmp_path):
     """Floats come back as they are: above 1, and in more than 256 levels."""
@@ -172,9 +179,7 @@ def test_a_program_may_write_an_exr(tmp_path):
         "image.set_pixels(oiio.ROI(), np.full((48, 64, 3), [1.5, 0.501, 0.25], np.float32))\n"
         "image.write(sys.argv[1])\n"
     )
-    drawn, camera = SCENES["one"][1]()
-    given = [drawn[name] for name in ("means", "quats", "scales", "opacities", "sh_dc")]
-    image = function_of(f"{sys.executable} {program} {{exr}}")(*given, camera, torch.zeros(3))
+    image = shown_by(f"{sys.executable} {program} {{exr}}")
     assert image.dtype == np.float32
     np.testing.assert_allclose(image, np.broadcast_to([1.5, 0.501, 0.25], (48, 64, 3)), rtol=1e-3)
 
@@ -215,10 +220,8 @@ def test_a_page_whose_packages_cannot_be_fetched_says_so(tmp_path, monkeypatch):
 
 
 def test_a_program_that_writes_no_picture_says_so():
-    drawn, camera = SCENES["one"][1]()
-    given = [drawn[name] for name in ("means", "quats", "scales", "opacities", "sh_dc")]
     with pytest.raises(RuntimeError, match="wrote no picture"):
-        function_of("true {out}")(*given, camera, torch.zeros(3))
+        shown_by("true {out}")
 
 
 def test_tiny_rotations_are_not_lost_in_gsplats_function():

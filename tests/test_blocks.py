@@ -129,10 +129,7 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
 
 
 def test_what_a_block_cannot_have(trained, tmp_path, fails):
-    assert "expected no part that learns" in fails(
-        "train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts", "exposure"
-    )
-    assert "expected parts by name" in fails(
-        "train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts", "auto"
-    )
+    block = ("train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts")
+    assert "expected no part that learns" in fails(*block, "exposure")
+    assert "expected parts by name" in fails(*block, "auto")
     assert "--block 2/2: expected 1/2" in fails("train", "--resume", trained, "--block", "2/2")

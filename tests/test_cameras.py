@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hostile import refusal
 from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
@@ -51,7 +52,7 @@ def test_camera_copies_what_it_is_given():
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("width", 0),
+        *(("width", value) for value in (np.nan, np.inf, 0, -3, 2.5)),
         ("height", 2.5),
         ("fx", 0.0),
         ("fy", -3.0),
@@ -66,16 +67,7 @@ def test_camera_copies_what_it_is_given():
     ],
 )
 def test_bad_value_is_named(field, value):
-    with pytest.raises(InputError, match=f"^Camera {field}: expected") as caught:
-        Camera(**{**FIELDS, field: value})
-    assert str(caught.value).endswith(".")
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 0, -3, 2.5])
-def test_size_that_is_no_size(value):
-    with pytest.raises(InputError, match="width"):
-        Camera(value, 10, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))
+    assert refusal(lambda: Camera(**{**FIELDS, field: value})).startswith(f"Camera {field}: expected")
 
 
 LENS = Camera(80, 60, 70.0, 71.0, 41.0, 29.0, np.eye(3), np.zeros(3))

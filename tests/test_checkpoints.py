@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from commands import ROOT, SCENE, SHORT, full_disk, started, train
+from commands import ROOT, SCENE, SHORT, no_space, started, train
 from scene_files import pose, write_colmap
 from splat_files import some_splats
 from test_distributed import torchrun
-from trainings import SCHEDULE, Pretended, begin, check_same, resumed, state_of, steps
+from trainings import SCHEDULE, Pretended, begin, check_same, resumed, state_of, stepped, steps
 
 from warp_splat.cli import main, parse
 from warp_splat.errors import InputError
@@ -233,8 +233,7 @@ def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     if not gone:
         monkeypatch.setattr("scene_files.pose", lambda index: (pose(index)[0], pose(index)[0] @ (0.0, 0.0, 5.0)))
-    root = write_colmap(tmp_path / "scene")
-    (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
+    root = write_colmap(tmp_path / "scene", points=())
     save_gaussians("start.ply", SplatFile(some_splats(50)))
     begin = ["train", "-s", str(root), "--start_ply", "start.ply", "--viewer", "--port", "1234", "-m"]
     monkeypatch.setattr("warp_splat.training.command._watched", lambda *_: nullcontext())
@@ -267,11 +266,17 @@ def test_another_scene_is_refused(whole, tmp_path, fails):
     assert files_of(whole) == before
 
 
-def test_resume_on(device, scene, tmp_path):
-    """A checkpoint of a CPU goes on where one is: the same parameters, then another step."""
-    trainer, run = begin(scene, tmp_path)
-    steps(trainer, run, STOP)
+@pytest.fixture
+def stopped(scene, tmp_path):
+    """A trainer and its run, which have kept a checkpoint."""
+    trainer, run = stepped(scene, tmp_path, STOP)
     keep(trainer, run)
+    return trainer, run
+
+
+def test_resume_on(device, scene, stopped, tmp_path):
+    """A checkpoint of a CPU goes on where one is: the same parameters, then another step."""
+    trainer, run = stopped
     other, continued = begin(scene, tmp_path, device=device)
     restore(other, continued, load_checkpoint(tmp_path))
     assert all(leaf.device.type == device for leaf in other.model.parameters.values())
@@ -282,12 +287,9 @@ def test_resume_on(device, scene, tmp_path):
     assert [float(loss) for loss in continued.losses] == pytest.approx([float(loss) for loss in run.losses], rel=1e-3)
 
 
-def test_other_numbers_of_processes(scene, tmp_path):
+def test_other_numbers_of_processes(scene, stopped, tmp_path):
     """Statistics are sums over the processes; steps of Adam are counted in images."""
-    trainer, run = begin(scene, tmp_path)
-    steps(trainer, run, STOP)
-    keep(trainer, run)
-    checkpoint = load_checkpoint(tmp_path)
+    (trainer, _), checkpoint = stopped, load_checkpoint(tmp_path)
     config = TrainConfig(**SCHEDULE)
     pair = [Trainer(scene, config, Pretended(rank, 2)) for rank in (0, 1)]
     for one in pair:
@@ -379,21 +381,11 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, 
 
 
 def test_a_disk_that_is_full_costs_the_checkpoint_only(tmp_path, monkeypatch, capsys):
-    path = tmp_path / LAST
-    save_checkpoint(path, {"a": np.zeros(3, np.float32)}, {"count": 1})
-    refused = pytest.raises(InputError, match=r"checkpoint.safetensors: could not be written .* is untouched")
-    with full_disk(2**20), refused:
-        save_checkpoint(path, {"a": np.zeros(2**20, np.float32)}, {"count": 2})
-    assert load_checkpoint(path).count("count") == 1 and os.listdir(tmp_path) == [LAST]
-
-    def full(path, *rest):
-        raise InputError(f"{path}: could not be written (no space left on device).")
-
-    monkeypatch.setattr("warp_splat.training.record.save_checkpoint", full)
+    monkeypatch.setattr("warp_splat.training.record.save_checkpoint", no_space)
     assert train(tmp_path / "model", "--iterations", "5", "--checkpoint_iterations", "3") == 0
     assert capsys.readouterr().err.count("no space left") == 3  # at the start, after iteration 3, at the end
     assert ply_path(tmp_path / "model", 5).is_file()
 
-    monkeypatch.setattr("warp_splat.evaluation.report.contact_sheet", full)
+    monkeypatch.setattr("warp_splat.evaluation.report.contact_sheet", no_space)
     assert train(tmp_path / "other", "--iterations", "5") == 1
     assert "Done after 5 iterations" in capsys.readouterr().out

@@ -36,7 +36,7 @@ def torchrun(*arguments) -> str:
     return run.stdout
 
 
-def gradients_of_ranks(scene, trainers, iteration):
+def gradients_of_ranks(trainers, iteration):
     """Each rank's gradients and loss, all from the model of the first trainer."""
     found = []
     for trainer in trainers:
@@ -61,7 +61,7 @@ def test_a_step_of_two_processes_is_one_of_their_mean_gradient(optimizer_type, s
     moments = dict.fromkeys(trainers[0].model.NAMES, (0.0, 0.0))
     for step in range(1, STEPS + 1):
         before = {name: leaf.detach().clone() for name, leaf in trainers[0].model.parameters.items()}
-        first, second = gradients_of_ranks(scene, trainers, 2 * step)
+        first, second = gradients_of_ranks(trainers, 2 * step)
         assert not torch.equal(first["means"], second["means"])  # other views
         for rank in (0, 1):
             found = load(rank, step, "gradients")
@@ -154,18 +154,11 @@ sys.exit(main(["train", *sys.argv[1:]]))
 @pytest.mark.parametrize(
     ("failure", "said"),
     [
-        pytest.param(
-            "raise MemoryError",
-            ["Out of memory on cpu", "Process 0: expected an answer", "but one has ended"],
-            marks=pytest.mark.long,  # the gate kills one
-        ),
-        pytest.param(
-            "os.kill(os.getpid(), signal.SIGSTOP)",
-            ["Process 0: expected an answer", "but one was silent"],
-            marks=pytest.mark.long,
-        ),
+        ("raise MemoryError", ["Out of memory on cpu", "Process 0: expected an answer", "but one has ended"]),
+        ("os.kill(os.getpid(), signal.SIGSTOP)", ["Process 0: expected an answer", "but one was silent"]),
     ],
 )
+@pytest.mark.long  # the gate kills one
 def test_when_a_process_fails_or_hangs_the_other_saves_and_stops(failure, said, tmp_path):
     script = tmp_path / "failing.py"
     script.write_text(FAILING.replace("FAIL", failure))
@@ -228,7 +221,7 @@ def test_several_views_a_step_in_one_process_are_the_mean_of_their_gradients(sce
     trainers = [Trainer(scene, config, Pretended(rank, 4)) for rank in range(4)]
     alone = Trainer(scene, config, Processes(images=4))
     for iteration in (4, 8):
-        parts, loss = gradients_of_ranks(scene, trainers, iteration), alone.differentiate(iteration)
+        parts, loss = gradients_of_ranks(trainers, iteration), alone.differentiate(iteration)
         for name, found in {"loss": loss, **{key: leaf.grad for key, leaf in alone.model.parameters.items()}}.items():
             expected = (((parts[0][name] + parts[1][name]) + parts[2][name]) + parts[3][name]) / 4
             assert torch.equal(found, expected), (iteration, name)

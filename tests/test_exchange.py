@@ -5,7 +5,8 @@ import struct
 import numpy as np
 import pytest
 from commands import changes_told
-from scenes import C0, picture_of
+from common import picture_of
+from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import (
     ENDINGS,
@@ -145,11 +146,10 @@ def test_gltf_nodes_move_turn_and_scale(tmp_path):
 
 
 def test_gltf_pieces_are_joined(tmp_path):
-    before = place(tmp_path, [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}], scenes=[{"nodes": [0, 1]}])
+    place(tmp_path, [{"mesh": 0}] * 30, scenes=[{"nodes": list(range(30))}])
     with pytest.raises(InputError, match="more Gaussians than its data has room for"):
-        place(tmp_path, [{"mesh": 0}] * 30, scenes=[{"nodes": list(range(30))}])
         load_gaussians(tmp_path / "b.glb")
-    place(tmp_path, [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}], scenes=[{"nodes": [0, 1]}])
+    before = place(tmp_path, [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}], scenes=[{"nodes": [0, 1]}])
     after = load_gaussians(tmp_path / "b.glb", report=silent).splats
     np.testing.assert_array_equal(after.means, np.concatenate([before.means, before.means - [5, 0, 0]]).astype("f4"))
 
@@ -214,6 +214,12 @@ def test_round_trip_returns_the_scene(tmp_path, ending, coefficients):
     again = tmp_path / f"b{ending}"
     after = save_gaussians(again, after, report=silent)
     assert "color" not in str(losses(after, load_gaussians(again)))  # a second time costs nothing
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".usda"])
+def test_no_gaussians(tmp_path, ending):
+    save_gaussians(tmp_path / f"a{ending}", some_file(0), report=silent)
+    assert len(load_gaussians(tmp_path / f"a{ending}", report=silent).splats.means) == 0
 
 
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".spz", ".sog", ".glb", ".gltf"])
@@ -322,11 +328,10 @@ def test_convert_bounds_what_pictures_lose(tmp_path, capsys, ending):
     assert 0.0 < measured <= bound
 
 
-def test_render_refuses_a_bound_of_a_video(tmp_path, fails):
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [("--orbit --bound", "--bound: expected views"), ("--device cpu", "name the scene with -s, or use --orbit")],
+)
+def test_what_render_makes_of_a_file_alone(tmp_path, fails, options, sentence):
     save_gaussians(tmp_path / "a.spz", some_file(100))
-    assert "--bound: expected views" in fails("render", "-m", tmp_path / "a.spz", "--orbit", "--bound")
-
-
-def test_render_takes_a_file(tmp_path, fails):
-    save_gaussians(tmp_path / "a.spz", some_file(100))
-    assert "name the scene with -s, or use --orbit" in fails("render", "-m", tmp_path / "a.spz", "--device", "cpu")
+    assert sentence in fails("render", "-m", tmp_path / "a.spz", *options.split())

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from commands import SCENE, train
-from fake_viser import FakeClient, at_rest, drawn, some_gaussians, some_scene
+from fake_viser import at_rest, drawn, entered, some_gaussians, some_scene
 from make_faults import make_faulty
-from trainings import begin, steps
+from trainings import begin, stepped, steps
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
@@ -114,8 +114,7 @@ def test_rates_cannot_fall_to_nothing(scene, tmp_path):
 
 @pytest.mark.parametrize("kind", ["gain", "affine"])
 def test_the_folder_has_the_maps_in_the_layout_of_the_reference(kind, scene, tmp_path):
-    trainer, run = begin(scene, tmp_path, exposure=kind)
-    steps(trainer, run, 9)
+    trainer, run = stepped(scene, tmp_path, 9, exposure=kind)
     save_model(trainer, run)
     maps = json.loads((tmp_path / "exposure.json").read_text())
     assert list(maps) == [view.name for view in scene.train]
@@ -221,8 +220,7 @@ def test_it_learns_gains_to_two_percent_of_light(kind, scene, tmp_path):
     changed = replace(
         scene, train=[replace(v, photograph=Decoded(image)) for v, image in zip(few, images, strict=True)]
     )
-    trainer, run = begin(changed, tmp_path, exposure=kind, iterations=300, **still)
-    steps(trainer, run, 300)
+    trainer, _ = stepped(changed, tmp_path, 300, exposure=kind, iterations=300, **still)
     gray = torch.full((1, 1, 3), 0.4)
     found = [trainer.parts[0].image(gray, None, SimpleNamespace(view=view)).mean().item() for view in changed.train]
     stops = 2.4 * np.log2((np.array(found) + 0.055) / 0.455)
@@ -303,13 +301,12 @@ def test_damaged_exposures_are_one_sentence(changes, trained, fails):
 
 def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
     at_rest(monkeypatch)
-    model, client = GaussianModel.from_splats(some_gaussians(50)), FakeClient(1, some_scene().test[0].camera, (120, 60))
-    draw, frames = make_renderer(model), []
+    model, frames = GaussianModel.from_splats(some_gaussians(50)), []
+    draw = make_renderer(model)
     for factor in (1.0, 0.25):
         exposed = lambda image, view, factor=factor: image * factor  # noqa: E731
         with server.Viewer(draw, lambda: model.parameters["means"], some_scene(), 8080, exposed=exposed) as viewer:
-            client = FakeClient(1, some_scene().train[1].camera, size=(120, 60))
-            viewer.server.enter(client)
+            client = entered(viewer, some_scene().train[1].camera, size=(120, 60))
             drawn(viewer)
             free = client.frames[-1][0]
             viewer.watchers[1].view.value = "0.png"
@@ -323,8 +320,7 @@ def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
 
 @pytest.mark.parametrize("options", [{"exposure": "affine"}, {"exposure": "gain", "vignetting": True}], ids=str)
 def test_training_shows_what_it_compares(options, scene, tmp_path):
-    trainer, run = begin(scene, tmp_path, **options)
-    steps(trainer, run, 12)
+    trainer, _ = stepped(scene, tmp_path, 12, **options)
     view, (part,) = scene.train[3], trainer.parts
     image, exposures = trainer.look(view.camera).image, trainer.exposures
     expected = part.image(image, None, SimpleNamespace(view=view)).detach()

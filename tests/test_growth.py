@@ -159,7 +159,7 @@ def test_a_split_leaves_the_picture_about_as_it_was():
     assert changes[0] < 0.5 * changes[1] and changes[0] < 0.03
 
 
-def test_processes_add_what_they_saw(scene, monkeypatch):
+def test_processes_add_what_they_saw(monkeypatch):
     """Two that saw half each split the same ones as one that saw all."""
     model = GaussianModel.from_points(np.random.default_rng(0).normal(size=(50, 3)), np.zeros((50, 3), np.uint8), 0)
     alone, first = (growth_on(GaussianModel(model.parameters), 70) for _ in range(2))

@@ -11,7 +11,7 @@ import warp_splat
 from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.compare.oracle import exact_render
 from warp_splat.config import ADJOINTS
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA, using
 
 CAMERA = Camera(40, 24, 30.0, 30.0, 20.0, 12.0, np.eye(3), np.zeros(3))
 DEPTHS, OPACITIES = (2.0, 3.0, 5.0), (0.5, 0.6, 0.9)
@@ -26,13 +26,13 @@ def three():
     return means, torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), scales, torch.tensor(OPACITIES), sh
 
 
-@pytest.mark.parametrize("driver", ["own", "cuda"])
+@pytest.mark.parametrize("driver", [CPU, CUDA])
 def test_a_plane_and_three_splats(driver):
     """A slanted plane, nearer on the right; no plane in the first columns."""
     surface = np.linspace(6.0, 1.0, CAMERA.width, dtype=np.float32)[None].repeat(CAMERA.height, 0)
     surface[:, :3], surface[:, 3:5] = 0.0, np.nan
     options = RasterOptions(depth=True, strongest=1, hidden_from=torch.from_numpy(surface))
-    with using(CUDA) if driver == "cuda" else using(warp_splat.raster.drivers.CPU):
+    with using(driver):
         out = warp_splat.rasterize(*three(), CAMERA, options=options)
     for x in range(CAMERA.width):
         color, light, sum_z, strongest = np.zeros(3), 1.0, 0.0, (0.0, -1)
@@ -47,21 +47,25 @@ def test_a_plane_and_three_splats(driver):
         assert (out.strongest[:, x, 0] == strongest[1]).all()
 
 
-@pytest.mark.parametrize("driver", ["own", "cuda"])
-@pytest.mark.parametrize("mode", ADJOINTS)
-def test_one_depth_for_all_is_a_scene_without_what_is_behind(mode, driver):
-    """Image and gradients, by any adjoint, are those of the Gaussians in front alone."""
+def half_hidden():
+    """A scene, a surface at the median depth of its Gaussians, and which are in front."""
     scene = SCENES["degree1"]()
     depths = warp_splat.rasterize(*scene.parameters(), scene.camera).depths
     limit = float(depths[depths > 0].median())
-    surface = torch.full((scene.camera.height, scene.camera.width), limit)
-    found = []
+    return scene, torch.full((scene.camera.height, scene.camera.width), limit), depths < limit
+
+
+@pytest.mark.parametrize("driver", [CPU, CUDA])
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_one_depth_for_all_is_a_scene_without_what_is_behind(mode, driver):
+    """Image and gradients, by any adjoint, are those of the Gaussians in front alone."""
+    (scene, surface, front), found = half_hidden(), []
     for options, kept in (
         (RasterOptions(depth=True, hidden_from=surface), slice(None)),
-        (RasterOptions(depth=True), depths < limit),
+        (RasterOptions(depth=True), front),
     ):
         leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
-        with using(CUDA) if driver == "cuda" else using(warp_splat.raster.drivers.CPU):
+        with using(driver):
             out = warp_splat.rasterize(*(leaf[kept] for leaf in leaves), scene.camera, scene.background, mode, options)
             weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image)
             ((out.image * weights).sum() + out.alpha.sum() + out.depth.mean()).backward()
@@ -72,14 +76,9 @@ def test_one_depth_for_all_is_a_scene_without_what_is_behind(mode, driver):
 
 
 def test_the_scene_in_front_agrees_with_float64():
-    scene = SCENES["degree1"]()
-    depths = warp_splat.rasterize(*scene.parameters(), scene.camera).depths
-    limit = float(depths[depths > 0].median())
-    surface = torch.full((scene.camera.height, scene.camera.width), limit)
+    scene, surface, front = half_hidden()
     out = warp_splat.rasterize(*scene.parameters(), scene.camera, options=RasterOptions(hidden_from=surface))
-    exact = exact_render(
-        *(tensor[depths < limit].double() for tensor in scene.parameters()), scene.camera, torch.zeros(3)
-    )
+    exact = exact_render(*(tensor[front].double() for tensor in scene.parameters()), scene.camera, torch.zeros(3))
     assert (out.image - exact.image).abs().max() < 1e-4
 
 

@@ -12,7 +12,7 @@ import safetensors.numpy
 import torch
 from hostile import changed, changed_json, little_memory, one_sentence, tried
 from hypothesis import strategies as st
-from trainings import begin, steps
+from trainings import begin, stepped
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import LAST, load_checkpoint, save_checkpoint
@@ -25,8 +25,7 @@ from warp_splat.training.record import Run, keep, restore
 def kept(scene, tmp_path_factory):
     """A trainer, and the checkpoint that it wrote."""
     folder = tmp_path_factory.mktemp("kept")
-    trainer, run = begin(scene, folder)
-    steps(trainer, run, 12)
+    trainer, run = stepped(scene, folder, 12)
     run.history.append({"iteration": 5, "loss": 0.5, "psnr": 20.0, "gaussians": 4500, "seconds": 1.0})
     keep(trainer, run)
     return trainer, load_checkpoint(folder)

@@ -47,11 +47,7 @@ def test_names_that_leave_the_folder_are_refused(tmp_path, name):
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_without_points_random_ones_in_the_views(tmp_path, kind):
-    if kind == "colmap":
-        root = write_colmap(tmp_path)
-        (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
-    else:
-        root = write_transforms(tmp_path, points=False)
+    root = write_colmap(tmp_path, points=()) if kind == "colmap" else write_transforms(tmp_path, points=False)
     scene, lines = load(root)
     assert scene.points.shape == scene.colors.shape == (50_000, 3) and scene.points.dtype == np.float32
     assert scene.random_points and not lines  # train says so, while render has no need of them

@@ -25,17 +25,23 @@ def oracle(x, y, share):
     return (1 - share) * (x - y).abs().mean() + share * (1 - ssim.mean())
 
 
-def check(image, target, share=0.2, mask=None, value=1e-6, slope=1e-5):
-    """Value and gradient against float64, relative to L2; both, as the kernels have them."""
-    leaf, exact = image.clone().requires_grad_(), image.double().requires_grad_()
+def differentiated(image, target, share=0.2, mask=None):
+    """Value and gradient."""
+    leaf = image.clone().requires_grad_()
     loss = image_loss(leaf, target, share, mask)
     loss.backward()
+    return loss.item(), leaf.grad
+
+
+def check(image, target, share=0.2, mask=None, value=1e-6, slope=1e-5):
+    """Value and gradient against float64, relative to L2; both, as the kernels have them."""
+    (loss, gradient), exact = differentiated(image, target, share, mask), image.double().requires_grad_()
     keep = 1.0 if mask is None else mask.double()
     expected = oracle(exact * keep, (target / 255.0 if target.dtype == torch.uint8 else target) * keep, share)
     expected.backward()
-    assert abs(loss.item() - expected.item()) < value
-    assert (leaf.grad - exact.grad).norm() < slope * exact.grad.norm()
-    return loss.item(), leaf.grad
+    assert abs(loss - expected.item()) < value
+    assert (gradient - exact.grad).norm() < slope * exact.grad.norm()
+    return loss, gradient
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
@@ -48,11 +54,8 @@ def both(image, target, share=0.2):
     """Value and gradient by the kernels of a CPU, and by those of a GPU in fibers."""
     found = []
     for driver in (CPU, CUDA):
-        leaf = image.clone().requires_grad_()
         with using(driver):
-            loss = image_loss(leaf, target, share)
-            loss.backward()
-        found.append((loss.item(), leaf.grad))
+            found.append(differentiated(image, target, share))
     return found
 
 
@@ -131,10 +134,8 @@ def by_threads(image, target, threads):
     results = []
     for count in (1, 2, 3, 7):
         threads(count)
-        leaf = image.clone().requires_grad_()
-        loss = image_loss(leaf, target)
-        loss.backward()
-        results.append(torch.cat([loss.detach().reshape(1), leaf.grad.ravel()]))
+        loss, gradient = differentiated(image, target)
+        results.append(torch.cat([torch.tensor([loss]), gradient.ravel()]))
     assert len(losses._bands(len(image))[0]) > 2  # or there was nothing to compare
     return results
 

@@ -12,7 +12,6 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.meshing.command import without_islands
 from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, footprint, fused, surface_of, voxels_of
-from warp_splat.runtime import pool
 
 trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
 VOXEL, VIEWS, DISTANCE = 0.08, 24, 4.0
@@ -65,13 +64,12 @@ def test_a_disc_is_where_rays_meet_its_plane():
     np.testing.assert_allclose(depth[y, x], DISTANCE * normal[2] / (along @ normal), rtol=1e-3)
 
 
-def test_any_number_of_threads():
+def test_any_number_of_threads(threads):
     views = [ball(index) for index in range(4)]
     found = []
     for count in (1, 3):
-        pool.set_threads(count)
+        threads(count)
         found.append(surface(agreed(views)))
-    pool.set_threads(2)
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
 

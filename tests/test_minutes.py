@@ -6,7 +6,7 @@ import tomllib
 import numpy as np
 import pytest
 from commands import SCENE
-from trainings import begin, state_of, steps
+from trainings import begin, state_of, stepped, steps
 
 from warp_splat.cli import main, parse
 from warp_splat.errors import InputError
@@ -172,9 +172,8 @@ def test_the_first_process_decides():
 def test_bytes_are_those_of_the_flags(settled, scene, tmp_path):
     """Settled while the set grows, and beyond the planned end; a part's rates fall to the planned end."""
     options = {"parts": "exposure", "cooldown": 12, "coarse": 2, "coarse_until_iter": 10, "densify_until_iter": 33}
-    trainer, run = begin(scene, tmp_path / "a", minutes=1.0, **options)
+    trainer, run = stepped(scene, tmp_path / "a", settled - 5, minutes=1.0, **options)
     (tmp_path / "a").mkdir()
-    steps(trainer, run, settled - 5)
     run.spent = 30.0
     keep(trainer, run)
     trainer, run = begin(scene, tmp_path / "a", minutes=1.0, **options)
@@ -185,9 +184,8 @@ def test_bytes_are_those_of_the_flags(settled, scene, tmp_path):
     assert trainer.config.learn.end == settled + 10 and trainer.config.learn.minutes == 0
     steps(trainer, run, settled + 10)
     found, facts = state_of(trainer, run)
-    trainer, run = begin(scene, tmp_path, settle_from_iter=settled + 1, **{**options, "cooldown": 9})
-    steps(trainer, run, settled + 10)
-    expected, others = state_of(trainer, run)
+    options |= {"settle_from_iter": settled + 1, "cooldown": 9}
+    expected, others = state_of(*stepped(scene, tmp_path, settled + 10, **options))
     assert found.keys() == expected.keys() and [name for name in found if found[name] != expected[name]] == []
     assert {**facts, "options": 0} == {**others, "options": 0}
 

@@ -19,7 +19,6 @@ from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
-from warp_splat.runtime import pool
 
 newton = pytest.importorskip("newton", reason="newton is not installed")
 from newton.sensors import SensorCamera  # noqa: E402 - behind the question for it
@@ -319,16 +318,14 @@ def test_refused_in_one_sentence(simulation):
         camera_of_fov(WIDTH, HEIGHT, 0)
 
 
-def test_any_number_of_threads_gives_the_same_bytes(simulation):
+def test_any_number_of_threads_gives_the_same_bytes(simulation, threads):
     """As many pixels as threads share."""
     state, transforms, camera = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform), camera_of_fov(160, 96, FOV)
     kinds, found = {"rgb_image": wp.vec3, "color_image": wp.uint32, "shape_index_image": wp.uint32}, []
-    before = pool.get_threads()
-    for threads in (1, 3):
+    for count in (1, 3):
         made = {name: wp.zeros((2, 96, 160), dtype=kind) for name, kind in kinds.items()}
-        pool.set_threads(threads)
+        threads(count)
         simulation.sensor.update(state, transforms, camera, **made)
         found.append([array.numpy() for array in made.values()])
-    pool.set_threads(before)
     assert found[0][0].std() > 0.05
     assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))

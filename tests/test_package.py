@@ -48,9 +48,23 @@ def test_unknown_name():
         _ = warp_splat.nothing_like_it
 
 
-def test_import_is_light():
-    code = "import sys, warp_splat; print({'torch', 'warp', 'numpy'} & set(sys.modules))"
-    assert python("-c", code).stdout.strip() == "set()"
+HELP = """
+from warp_splat.cli import main
+try: main(["train", "--help"])
+except SystemExit as end: assert end.code == 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("import warp_splat", {"torch", "warp", "numpy"}),
+        ("import warp_splat.evaluation.report, warp_splat.formats.png", {"matplotlib", "av"}),
+        (HELP, {"torch", "warp", "numpy"}),
+    ],
+)
+def test_what_is_not_needed_is_not_imported(code, absent):
+    python("-c", f"{code}\nimport sys; assert not {absent} & set(sys.modules)")
 
 
 def image(count=3000):

@@ -173,11 +173,6 @@ def test_older_files_have_no_ranges_of_colors(tmp_path):
     np.testing.assert_allclose(found.means, splats.means, atol=0.02)
 
 
-def test_no_gaussians(tmp_path):
-    save_gaussians(tmp_path / "a.compressed.ply", some_file(0), report=silent)
-    assert len(load_gaussians(tmp_path / "a.compressed.ply", report=silent).splats.means) == 0
-
-
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [

@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 import pytest
+from common import picture_of
 from pages import CAMERAS, EVIL, OPTIONS, Blocks, many_splats, unpacked
-from scenes import picture_of
 from splat_files import covariances, some_splats
 
 from warp_splat.evaluation.metrics import psnr

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 from browser import browser_page
+from common import picture_of
 from pages import EVIL, many_splats
-from scenes import picture_of
 from splat_files import some_splats
 
 from warp_splat.cli import main

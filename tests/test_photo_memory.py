@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from commands import train
 from scene_files import texture, write_colmap, write_image
-from trainings import begin, check_same, resumed, steps
+from trainings import begin, check_same, resumed, stepped, steps
 
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS
@@ -27,15 +27,13 @@ def bounded():
 
 @pytest.mark.parametrize("options", [{"coarse": 4, "coarse_until_iter": 30}, {"parts": "exposure,background"}], ids=str)
 def test_a_bound_changes_no_byte(options, scene, bounded, tmp_path):
-    whole, run = begin(scene, tmp_path, **options)
-    steps(whole, run, 36)
+    whole = stepped(scene, tmp_path, 36, **options)
     for limited in bounded:
         assert limited.memory.limit < SIZE * len(scene.train)
         trainer, other = begin(limited, tmp_path, **options)
         steps(trainer, other, 36, lambda t=trainer: check_kept(t))
-        check_same((trainer, other), (whole, run))
-    found = resumed(bounded[1], tmp_path / "resumed", (20, 36), then=scene, **options)
-    check_same(found, (whole, run))
+        check_same((trainer, other), whole)
+    check_same(resumed(bounded[1], tmp_path / "resumed", (20, 36), then=scene, **options), whole)
 
 
 def check_kept(trainer):
@@ -80,8 +78,7 @@ def test_views_in_turn_are_those_of_the_scene_and_nothing_stays(scene, bounded):
 
 
 def test_evaluation_is_the_same(scene, bounded, tmp_path):
-    trainer, run = begin(scene, tmp_path)
-    steps(trainer, run, 3)
+    trainer, _ = stepped(scene, tmp_path, 3)
     written = []
     for place, views in enumerate((scene.train[:9], bounded[0].train[:9])):
         folder = tmp_path / str(place)

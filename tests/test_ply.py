@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import full_disk
 from splat_files import some_splats
 
 from warp_splat.errors import InputError
@@ -47,19 +46,6 @@ def test_bytes_are_the_documented_layout(tmp_path, count, coefficients):
     for before, after in zip(splats, load_ply(tmp_path / "a.ply").splats, strict=True):
         assert after.dtype == np.float32
         np.testing.assert_array_equal(before, after)
-
-
-def test_a_reader_that_knows_only_the_62_floats(tmp_path):
-    splats = some_splats(7)
-    save_ply(tmp_path / "a.ply", SplatFile(splats))
-    body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)[1]
-    assert len(body) == 248 * 7
-    rows = np.frombuffer(body, [(name, "<f4") for name in reference_names(16)])
-    rest = np.stack([rows[f"f_rest_{index}"] for index in range(45)], axis=1)
-    np.testing.assert_array_equal(rest.reshape(-1, 3, 15), splats.sh[:, 1:].transpose(0, 2, 1))
-    np.testing.assert_array_equal(rows["rot_0"], splats.quats[:, 0])
-    np.testing.assert_array_equal(rows["opacity"], splats.opacities)
-    assert not rows["nx"].any()
 
 
 def named(means, sh, opacities, scales, quats):
@@ -238,16 +224,6 @@ def test_shapes_are_checked(tmp_path, change, sentence):
     with pytest.raises(InputError, match="points, colors"):
         save_points(tmp_path / "a.ply", some_splats().means, some_splats().means[:2])
     assert not list(tmp_path.iterdir())
-
-
-def test_full_disk_keeps_the_older_file(tmp_path):
-    path = tmp_path / "a.ply"
-    save_ply(path, SplatFile(some_splats(seed=1)))
-    before = path.read_bytes()
-    with full_disk(limit=1500), pytest.raises(InputError, match=r"a\.ply.*untouched"):
-        save_ply(path, SplatFile(some_splats(seed=2)))
-    assert path.read_bytes() == before
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])

@@ -10,7 +10,7 @@ import torch
 from commands import SCENE, train
 from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
-from trainings import begin, state_of, steps
+from trainings import begin, state_of, stepped
 
 from warp_splat.cli import main
 from warp_splat.evaluation import alignment
@@ -83,13 +83,12 @@ def twisted(camera, twist, extent):
 
 
 def test_only_what_is_seen_learns_and_the_set_stays(scene, tmp_path):
-    trainer, run = begin(scene, tmp_path, **ALL)
+    trainer, _ = begin(scene, tmp_path, **ALL)
     pose = trainer.parts[0]
     trainer.differentiate(1)
     assert int((pose.moves.grad != 0).any(1).sum()) == 1 and pose.stretches.grad.shape == (1, 4)
     assert bool((pose.stretches.grad != 0).all())
-    trainer, run = begin(scene, tmp_path, **ALL)
-    steps(trainer, run, 12)
+    trainer, _ = stepped(scene, tmp_path, 12, **ALL)
     pose, moved = trainer.parts[0], trainer.refined(scene.train)
     numbers = pose.moves.detach().double().numpy()
     assert np.abs(numbers).max() > 1e-4 and len(pose.gauge) == 7
@@ -239,8 +238,7 @@ def test_a_scene_that_changed_is_refused(trained, tmp_path, fails):
 def test_without_it_nothing_changes(scene, tmp_path):
     states = []
     for options in ({}, {"pose_lr": 9.0, "pose_reg": 9.0, "pose_intrinsics": "all"}):
-        trainer, run = begin(scene, tmp_path, **options)
-        steps(trainer, run, 12)
+        trainer, run = stepped(scene, tmp_path, 12, **options)
         states.append(state_of(trainer, run)[0])
         assert trainer.refined(scene.train) is scene.train and trainer.where_taken() is None
     assert states[0] == states[1]

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile import refusal
 from scene_files import (
     HEIGHT,
     WIDTH,
@@ -192,12 +193,7 @@ def test_bad_input_is_one_sentence_that_names_the_file(tmp_path, make, parts):
     source, options = make(tmp_path)
     if "transforms_test.json" in {path.name for path in tmp_path.iterdir()}:
         (tmp_path / "transforms_test.json").unlink()
-    with pytest.raises(InputError) as caught:
-        load(source, **options)
-    message = str(caught.value)
-    assert all(part in message for part in parts), message
-    assert "\n" not in message and message.endswith(".")
-    assert ". " not in message.replace(str(tmp_path), "")
+    assert ". " not in refusal(lambda: load(source, **options), *parts).replace(str(tmp_path), "")
 
 
 @pytest.mark.parametrize("place", [8 + 4, 8 + 4 + 32], ids=["rotation", "translation"])

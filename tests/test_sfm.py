@@ -15,12 +15,12 @@ import pycolmap
 import pytest
 import room
 from commands import python, started
+from hostile import refusal
 from scene_files import texture, write_blender, write_image
 from scipy.ndimage import gaussian_filter
 
 from warp_splat.cli import main
 from warp_splat.config import SfmConfig
-from warp_splat.errors import InputError
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
 from warp_splat.sfm import matching, stages
@@ -142,14 +142,6 @@ def test_photographs_that_cannot_be_read_are_left_out(photos, tmp_path, capsys):
     assert len(load_scene(tmp_path / "scene", report=print).train) == COUNT - 1
 
 
-def cannot(run, *words):
-    with pytest.raises(InputError) as caught:
-        run()
-    sentence = str(caught.value)
-    assert sentence.endswith(".") and "\n" not in sentence and all(word in sentence for word in words)
-    return sentence
-
-
 def flat_photos(folder, count=4, keep=None):
     """Photographs of one color each, or of each file its first bytes."""
     for index in range(count):
@@ -185,46 +177,46 @@ def holding(*names):
 )
 def test_bad_photographs_get_one_sentence(tmp_path, make, words):
     make(tmp_path / "photos")
-    cannot(lambda: sfm(SfmConfig(str(tmp_path / "photos"), str(tmp_path / "scene"), quiet=True)), "photos", *words)
+    refusal(lambda: sfm(SfmConfig(str(tmp_path / "photos"), str(tmp_path / "scene"), quiet=True)), "photos", *words)
     assert (tmp_path / "scene").exists() == (make is flat_photos)  # of which there are features
 
 
 def test_a_folder_in_use_stays_as_it_is(photos, scene, tmp_path):
     other = write_blender(tmp_path / "other")
     before = sorted(other.rglob("*"))
-    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(other))), "other", "in use")
+    refusal(lambda: sfm(SfmConfig(str(photos[0]), str(other))), "other", "in use")
     assert sorted(other.rglob("*")) == before
-    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(photos[0]))), "another folder")
-    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(scene), seed=1)), "begun with others")
+    refusal(lambda: sfm(SfmConfig(str(photos[0]), str(photos[0]))), "another folder")
+    refusal(lambda: sfm(SfmConfig(str(photos[0]), str(scene), seed=1)), "begun with others")
     flat_photos(tmp_path / "a" / "images")
     for source, target in (("a/images", "a"), ("a", "a/images")):
         words = "does not hold the photographs", "written over", f"{tmp_path / target}_scene"
         config = SfmConfig(str(tmp_path / source), str(tmp_path / target))
-        cannot(partial(sfm, config), *words)
-    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "x"), frames=2)), "--frames")
+        refusal(partial(sfm, config), *words)
+    refusal(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "x"), frames=2)), "--frames")
 
 
 def test_a_damaged_database_gets_one_sentence(photos, scene, tmp_path):
     shutil.copytree(scene / "sfm", tmp_path / "scene" / "sfm")
     (tmp_path / "scene" / "sfm" / "database.db").write_bytes(b"SQLite format 3\0" + bytes(5000))
-    cannot(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "scene"), quiet=True)), "sfm", "remove this folder")
+    refusal(lambda: sfm(SfmConfig(str(photos[0]), str(tmp_path / "scene"), quiet=True)), "sfm", "remove this folder")
 
 
 def test_training_on_photographs_alone_names_the_command(tmp_path, monkeypatch):
     folder, clip = tmp_path / "my photos", tmp_path / "clip.mp4"
     flat_photos(folder, 4)
-    cannot(lambda: load_scene(folder), "4 photographs alone", "--sfm", f"`warp-splat sfm '{folder}' '{folder}_scene'`")
+    refusal(lambda: load_scene(folder), "4 photographs alone", "--sfm", f"`warp-splat sfm '{folder}' '{folder}_scene'`")
     monkeypatch.chdir(folder)
-    cannot(lambda: load_scene("."), f"`warp-splat sfm . '{folder}_scene'`")
+    refusal(lambda: load_scene("."), f"`warp-splat sfm . '{folder}_scene'`")
     clip.write_bytes(b"x")
-    cannot(lambda: load_scene(clip), "a video", f"sfm {clip} {tmp_path / 'clip_scene'}")
+    refusal(lambda: load_scene(clip), "a video", f"sfm {clip} {tmp_path / 'clip_scene'}")
 
 
 def test_training_with_sfm_makes_the_scene_once(photos, capsys):
     source, made = str(photos[0]), f"{photos[0]}_scene"
     assert scene_for(source, 1, quiet=True) == made and len(load_scene(made).train) == COUNT
     assert scene_for(made, 1) == made
-    cannot(lambda: scene_for(source, 2), "one process", "warp-splat sfm")
+    refusal(lambda: scene_for(source, 2), "one process", "warp-splat sfm")
 
 
 def test_the_sharpest_frame_of_each_span_is_taken(tmp_path):
@@ -256,7 +248,7 @@ def test_a_video_that_cannot_be_decoded_gets_one_sentence(tmp_path, keep, words)
     data = (tmp_path / "clip.mp4").read_bytes()
     (tmp_path / "clip.mp4").write_bytes(data[: int(len(data) * keep)] or b"nothing of a video")
     config = SfmConfig(str(tmp_path / "clip.mp4"), str(tmp_path / "scene"), quiet=True)
-    cannot(lambda: sfm(config), *words)
+    refusal(lambda: sfm(config), *words)
 
 
 @pytest.mark.slow

@@ -8,13 +8,16 @@ import sys
 import av
 import numpy as np
 import pytest
-from commands import SCENE, full_disk, python
+from commands import SCENE, full_disk
+from splat_files import some_file
 
 from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import METRICS, psnr
+from warp_splat.formats.checkpoint import save_checkpoint
 from warp_splat.formats.model_folder import ply_path
+from warp_splat.formats.ply import save_ply
 from warp_splat.formats.png import load_png, save_png, save_video
 from warp_splat.text import format_table, table_of
 
@@ -130,11 +133,6 @@ def test_running_mean_keeps_constants_and_slopes():
     np.testing.assert_allclose(report._smooth(line)[10:-10], line[10:-10])
 
 
-def test_importing_the_report_loads_no_matplotlib():
-    modules = "warp_splat.evaluation.report, warp_splat.formats.png"
-    python("-c", f"import sys, {modules}; sys.exit(not {{'matplotlib', 'av'}}.isdisjoint(sys.modules))")
-
-
 def test_table_of_records():
     """A template or a function for each column; what is missing is a dash, also where several numbers are asked for."""
     records = [{"a": 1.25, "b": None}, {"a": float("nan")}, {"a": 2, "b": "x"}]
@@ -182,16 +180,18 @@ def test_video_errors_leave_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_full_disk_keeps_the_older_pictures(tmp_path):
+def test_full_disk_keeps_the_older_files(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (128, 128, 3)).astype(np.uint8)
     writers = {
         "a.png": lambda path: save_png(path, noise),
         "b.png": lambda path: report.contact_sheet(path, {"": [("a", noise, noise, "")]}),
         "c.mp4": lambda path: save_video(path, [noise] * 3, fps=10),
+        "d.ply": lambda path: save_ply(path, some_file()),
+        "e.safetensors": lambda path: save_checkpoint(path, {"a": noise}, {"count": 2}),
     }
     for name, write in writers.items():
         (tmp_path / name).write_text("older")
-        with full_disk(2000), pytest.raises(InputError, match="untouched"):
+        with full_disk(2000), pytest.raises(InputError, match=f"{name}: could not be written .* is untouched"):
             write(tmp_path / name)
         assert (tmp_path / name).read_text() == "older"
     assert len(list(tmp_path.iterdir())) == len(writers)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from commands import SCENE
+from common import picture_of
 from make_faults import beyond, make_faulty, sky_light
-from scenes import picture_of
 from scipy.spatial.transform import Rotation
-from trainings import begin, steps
+from trainings import begin, stepped, steps
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
@@ -33,8 +33,7 @@ from warp_splat.training.trial import weigh
 def trained(scene, tmp_path_factory):
     """A trainer with a sky, and the folder where it was saved."""
     folder = tmp_path_factory.mktemp("sky")
-    trainer, run = begin(scene, folder, parts="sky")
-    steps(trainer, run, 12)
+    trainer, run = stepped(scene, folder, 12, parts="sky")
     save_model(trainer, run)
     return trainer, folder
 

@@ -90,11 +90,6 @@ def test_a_stage_holds_what_the_schema_says_and_comes_back(tmp_path, ending, coe
     assert after.antialiased and after.coordinates == where
 
 
-def test_no_gaussians_are_a_stage_too(tmp_path):
-    save_gaussians(tmp_path / "a.usda", some_file(0), report=silent)
-    assert len(load_gaussians(tmp_path / "a.usda", report=silent).splats.means) == 0
-
-
 def test_fields_are_joined_as_their_parents_place_them(tmp_path):
     """Z up and centimeters; one field moved, turned and scaled, one mirrored, one hidden, in half precision."""
     stage, parts = stage_of(tmp_path, "Z", 0.01), [some_splats(30, 16, 1), some_splats(20, 4, 2)]

@@ -7,7 +7,7 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 import torch
-from fake_viser import PHOTO, FakeClient, at_rest, drawn, some_gaussians, some_scene, wxyz
+from fake_viser import PHOTO, FakeClient, at_rest, drawn, entered, some_gaussians, some_scene, wxyz
 from scene_files import write_colmap
 
 from warp_splat.color import to_srgb
@@ -72,8 +72,7 @@ def test_no_other_name_gets_the_page(served, host, status):
 
 
 def test_frames_are_quick_while_moving_and_sharp_at_rest(viewer, monkeypatch):
-    client = FakeClient(1, PHOTO, size=(960, 640))
-    viewer.server.enter(client)
+    client = entered(viewer, size=(960, 640))
     viewer.watchers[1].pace.pixels = 96 * 64
     assert viewer.moving and drawn(viewer) == 1 and drawn(viewer) == 0
     frame, quality = client.frames[-1]
@@ -89,8 +88,7 @@ def test_frames_are_quick_while_moving_and_sharp_at_rest(viewer, monkeypatch):
 
 def test_a_training_camera_and_its_photograph(viewer, monkeypatch):
     at_rest(monkeypatch)
-    client = FakeClient(1, PHOTO, size=(120, 60))
-    viewer.server.enter(client)
+    client = entered(viewer, size=(120, 60))
     looks = viewer.watchers[1]
     looks.opacity.value = 1.0
     drawn(viewer)
@@ -123,8 +121,7 @@ def picture_of(viewer, camera):
 
 def test_kinds_of_frames(viewer, monkeypatch):
     at_rest(monkeypatch)
-    client = FakeClient(1, some_scene().train[0].camera)
-    viewer.server.enter(client)
+    client = entered(viewer, some_scene().train[0].camera)
     frames = {}
     for kind in ("image", "depth", "alpha"):
         viewer.watchers[1].kind.value = kind
@@ -156,8 +153,7 @@ def test_two_browsers_and_one_that_leaves(viewer, monkeypatch):
 
 
 def test_one_that_leaves_while_its_frame_is_drawn(viewer):
-    client = FakeClient(1, PHOTO)
-    viewer.server.enter(client)
+    client = entered(viewer)
     draw = viewer.draw_camera
 
     def leave(camera, depth):
@@ -171,8 +167,7 @@ def test_one_that_leaves_while_its_frame_is_drawn(viewer):
 @pytest.mark.parametrize("size", [(0, 0), (100_000, 100_000)])
 def test_windows_of_strange_sizes(viewer, monkeypatch, size):
     at_rest(monkeypatch)
-    client = FakeClient(1, PHOTO, size=size)
-    viewer.server.enter(client)
+    client = entered(viewer, size=size)
     assert drawn(viewer) == 1
     assert [frame.shape[0] * frame.shape[1] <= MOST for frame, _ in client.frames] == [True] * (size != (0, 0))
 
@@ -184,8 +179,7 @@ def test_small_models(fake_viser, count, coefficients):
     model = GaussianModel.from_splats(some_gaussians(count, coefficients))
     draw = make_renderer(model)
     with server.Viewer(draw, lambda: model.parameters["means"], None, 8080) as viewer:
-        client = FakeClient(1, PHOTO)
-        viewer.server.enter(client)
+        client = entered(viewer)
         for kind in ("image", "depth", "alpha"):
             viewer.watchers[1].kind.value = kind
             assert drawn(viewer) == 1

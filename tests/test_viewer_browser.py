@@ -69,12 +69,16 @@ def screenshot(page, folder):
     return load_png(folder / "screenshot.png")
 
 
+def drag(page, begin, end, steps):
+    page.mouse.move(*begin)
+    page.mouse.down()
+    page.mouse.move(*end, steps=steps)
+    page.mouse.up()
+
+
 def dragged(page, folder):
     """A screenshot after a drag to the right, at rest."""
-    page.mouse.move(300, 300)
-    page.mouse.down()
-    page.mouse.move(500, 340, steps=10)
-    page.mouse.up()
+    drag(page, (300, 300), (500, 340), 10)
     page.wait_for_timeout(1000)
     return screenshot(page, folder)
 
@@ -107,10 +111,7 @@ def test_view(scene, model, tmp_path):
         page.get_by_role("slider").press("Home")
         eventually(lambda: likeness(shot(), wanted) > level)
 
-        page.mouse.move(400, 400)
-        page.mouse.down()
-        page.mouse.move(460, 420, steps=5)
-        page.mouse.up()
+        drag(page, (400, 400), (460, 420), 5)
         eventually(lambda: likeness(shot(), wanted) < 25)
         page.get_by_role("button", name="again").click()
         eventually(lambda: likeness(shot(), wanted) > level)
@@ -138,16 +139,10 @@ def test_second_browser_busy_port_and_missing_scene(model, tmp_path):
             open_page(page, address)
             other = page.context.browser.new_page(viewport={"width": 300, "height": 200})
             open_page(other, address)
-            other.mouse.move(50, 150)
-            other.mouse.down()
-            other.mouse.move(90, 160, steps=3)
-            other.mouse.up()
+            drag(other, (50, 150), (90, 160), 3)
             before = screenshot(page, tmp_path)
             other.close()
-            page.mouse.move(400, 400)
-            page.mouse.down()
-            page.mouse.move(460, 420, steps=5)
-            page.mouse.up()
+            drag(page, (400, 400), (460, 420), 5)
             eventually(lambda: likeness(screenshot(page, tmp_path), before) < 25)  # the first goes on
             assert errors == []
             page.close()

@@ -147,8 +147,7 @@ class Visited(FakeServer):
 
 def visited(monkeypatch, folder):
     """The command that trains a small scene while somebody looks, who leaves at the second wait."""
-    root = write_colmap(folder / "scene")
-    (root / "sparse" / "0" / "points3D.txt").write_text("# none\n")
+    root = write_colmap(folder / "scene", points=())
     monkeypatch.setattr(sys.modules["viser"], "ViserServer", Visited)
     monkeypatch.setattr(server, "DESERTED", 0.0)
     monkeypatch.setattr("warp_splat.training.live.REFRESH", 0.0)

@@ -51,6 +51,13 @@ def steps(trainer, run, end, watch=lambda: None):
         watch()
 
 
+def stepped(scene, folder, end, **options):
+    """A trainer and its run after ``end`` steps."""
+    trainer, run = begin(scene, folder, **options)
+    steps(trainer, run, end)
+    return trainer, run
+
+
 def state_of(trainer, run):
     """All that the state holds, as bytes and values."""
     tensors, facts = trainer.state()
