@@ -198,6 +198,14 @@ def empty():
     return replace(scene, **{name: getattr(scene, name)[:0] for name in PARAMETERS})
 
 
+def one_gaussian(device, mean, scale):
+    """The five inputs of one that is round and light."""
+    one = torch.ones(1, 1, device=device)
+    quats = one * torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
+    shapes = [one * torch.tensor([mean], device=device), quats, scale * one.expand(1, 3), 0.9 * one[0]]
+    return [tensor.clone().requires_grad_() for tensor in (*shapes, one.expand(1, 1, 3))]
+
+
 def _clouds(degree):
     return lambda: cloud(10 + degree, 120, make_camera(37, 29, seed=degree), degree=degree)
 

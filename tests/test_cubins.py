@@ -1,13 +1,10 @@
 """Every CUDA kernel compiles ahead of time for every architecture, without spills, and needs no more than it did."""
 
 import json
-from pathlib import Path
 
 import cubins
 import pytest
-
-ROOT = Path(__file__).parents[1]
-
+from commands import ROOT
 
 #: Kernel and architecture: through a lens, or with a rolling shutter, 184 bytes lie in memory.
 SPILLING = {("project, adjoint", 100), ("project, adjoint", 120)}

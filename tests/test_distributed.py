@@ -5,15 +5,13 @@ import math
 import os
 import re
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import psutil
 import pytest
 import torch
-from commands import ROOT, SCENE
+from commands import ROOT, SCENE, python, started
 from torchrun_steps import CONFIG, STEPS
 from trainings import Pretended
 
@@ -24,16 +22,12 @@ from warp_splat.runtime.distributed import ALONE, GroupError, Processes, join
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+TORCHRUN = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 
 
 def torchrun(*arguments) -> str:
     """What a run of two processes prints."""
-    command = [*TORCHRUN, *map(str, arguments)]
-    run = subprocess.run(command, check=False, capture_output=True, text=True, env=ENVIRONMENT, timeout=300)
-    assert run.returncode == 0, run.stderr
-    return run.stdout
+    return python(*TORCHRUN, *arguments).stdout
 
 
 def gradients_of_ranks(trainers, iteration):
@@ -110,8 +104,7 @@ def adam(config, extent, step, name, value, gradient, moments, shown):
 def start(folder, *options):
     """torchrun on a run that would take hours, once it has saved a model; the processes by rank."""
     command = [*TORCHRUN, ROOT / "train.py", "-s", SCENE, "-m", folder, "-r", "8", "--eval", "--iterations", "1000000"]
-    command += ["--save_iterations", "20", "--densify_from_iter", "10000000", *options]
-    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    run = started(*command, "--save_iterations", "20", "--densify_from_iter", "10000000", *options)
     deadline = time.monotonic() + 120
     while not ply_path(folder, 20).exists() and run.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -163,9 +156,7 @@ def test_when_a_process_fails_or_hangs_the_other_saves_and_stops(failure, said, 
     script = tmp_path / "failing.py"
     script.write_text(FAILING.replace("FAIL", failure))
     options = ["-s", SCENE, "-m", tmp_path, "-r", "8", "--iterations", "1000000", "--test_iterations"]
-    run = subprocess.run(
-        [*TORCHRUN, script, *options], check=False, capture_output=True, text=True, env=ENVIRONMENT, timeout=200
-    )
+    run = python(*TORCHRUN, script, *options, check=False)
     assert run.returncode != 0 and all(words in run.stderr for words in said)
     assert len(load_ply(ply_path(tmp_path, 56)).splats.means) == 4500
     assert str(ply_path(tmp_path, 56)) in run.stdout and "warp_splat/" not in run.stderr

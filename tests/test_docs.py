@@ -14,7 +14,7 @@ import make_pages
 import numpy as np
 import pytest
 import room
-from commands import CtrlC
+from commands import ROOT, SCENE, CtrlC
 from scene_files import write_image
 
 from warp_splat.cli import COMMANDS, main, parse
@@ -24,9 +24,7 @@ from warp_splat.scene.images import read_size
 from warp_splat.training.growth import GROWTHS
 from warp_splat.training.parts import PARTS
 
-ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-SCENE = ROOT / "assets" / "still_life"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
 USERS = [page for page in PAGES if page.name != "CONTRIBUTING.md"]  # whose commands are tried; the others run for long
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

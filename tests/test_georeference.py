@@ -7,12 +7,12 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from splat_files import some_file
 
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import MODEL_FROM_WORLD, read_coordinates, write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import write_cameras
-from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.inspect.subject import Subject
 from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
@@ -125,9 +125,7 @@ def test_gps_of_photographs_is_read_as_utm(tmp_path):
 
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".glb", ".gltf"])
 def test_files_of_gaussians_keep_the_origin(tmp_path, ending):
-    random = np.random.default_rng(0)
-    shapes = [(4, 3), (4, 1, 3), (4,), (4, 3), (4, 4)]
-    splats = SplatFile(SplatArrays(*(random.normal(size=shape).astype(np.float32) for shape in shapes)))
+    splats = some_file(4, 1)
     where = {"origin": UTM.tolist(), "axes": "x east, y down, z north", "reference": "UTM"}
     save_gaussians(tmp_path / f"a{ending}", splats._replace(coordinates={**where, "residuals": {}}))
     assert load_gaussians(tmp_path / f"a{ending}").coordinates == where

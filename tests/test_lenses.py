@@ -175,18 +175,11 @@ def test_lenses_at_their_ends(model, coefficients, device):
 @pytest.mark.parametrize("projection", ["affine", pytest.param("unscented", marks=pytest.mark.long)])
 def test_a_panorama_shows_what_is_straight_behind(projection, device):
     """Half of it at either end of the picture."""
-    leaves, options = one_gaussian(device, [0.0, 0.0, -3.0], 0.3), RasterOptions(projection=projection)
+    leaves, options = scenes.one_gaussian(device, [0.0, 0.0, -3.0], 0.3), RasterOptions(projection=projection)
     alpha = rasterize(*leaves, panorama(), options=options).alpha.detach()
     assert alpha[:, [0, -1]].max() > 0.7 and alpha[:, alpha.shape[1] // 2].max() == 0
     torch.testing.assert_close(alpha, alpha.flip(1), rtol=0, atol=1e-4)
     torch.testing.assert_close(alpha, alpha.flip(0), rtol=0, atol=1e-4)
-
-
-def one_gaussian(device, mean, scale):
-    one = torch.ones(1, 1, device=device)
-    quats = one * torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
-    shapes = [one * torch.tensor([mean], device=device), quats, scale * one.expand(1, 3), 0.9 * one[0]]
-    return [tensor.clone().requires_grad_() for tensor in (*shapes, one.expand(1, 1, 3))]
 
 
 def panorama():
@@ -197,7 +190,7 @@ def panorama():
 @pytest.mark.parametrize("down", [3.0, -3.0])
 def test_a_pole_is_seen_at_all_longitudes(down, device):
     """As a band all around, which is fainter at most by 30 %, half a turn away; on that side alone; with gradients."""
-    leaves = one_gaussian(device, [1e-4, down, 1e-4], 0.3)
+    leaves = scenes.one_gaussian(device, [1e-4, down, 1e-4], 0.3)
     out = rasterize(*leaves, panorama())
     at_pole, away = (out.alpha[-1], out.alpha[0]) if down > 0 else (out.alpha[0], out.alpha[-1])
     assert at_pole.min() > 0.7 * at_pole.max() > 0.4 and away.max() == 0

@@ -2,10 +2,10 @@
 
 import re
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import SCENE
 
 from warp_splat.cli import COMMANDS, main, make_parser, parse
 from warp_splat.errors import InputError
@@ -132,9 +132,6 @@ def test_help_of_each_command_is_short_at_its_head(command, capsys):
     with pytest.raises(SystemExit):
         make_parser().parse_args([command, "--help"])
     assert capsys.readouterr().out.index("\n\n") < 80
-
-
-SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,10 @@
 
 import re
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import pytest
 import torch
-from commands import SCENE, train
+from commands import ROOT, SCENE, train
 from trainings import Pretended, begin, check_same, resumed, state_of
 
 from warp_splat.cli import main, parse
@@ -20,8 +19,6 @@ from warp_splat.training.parts import PARTS
 from warp_splat.training.record import keep
 from warp_splat.training.seams import Change, Entry, Verdict
 from warp_splat.training.trainer import Trainer
-
-PACKAGE = Path(__file__).parents[1] / "warp_splat"
 
 
 @dataclass(frozen=True)
@@ -175,7 +172,7 @@ def test_flags_files_and_output_know_them(tmp_path, capsys, fails):
 
 def test_neither_trainer_nor_command_line_knows_one_by_name():
     files = ("cli", "training/trainer", "training/command", "training/opening", "training/record")
-    texts = [(PACKAGE / f"{file}.py").read_text() for file in files]
+    texts = [(ROOT / f"warp_splat/{file}.py").read_text() for file in files]
     words = set(re.findall(r"\w+", re.sub(r'""".*?"""|#[^\n]*', "", "\n".join(texts), flags=re.DOTALL)))
     for entry in (*PARTS.values(), *GROWTHS.values()):
         found = words & {*entry.place.split(".")[-2:], *(item.name for item in fields(entry.options))}

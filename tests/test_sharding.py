@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from commands import ROOT, SCENE
+from commands import ROOT, SCENE, python
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_own, save_checkpoint, save_in_blocks
@@ -113,14 +113,9 @@ def test_pieces_are_sorted_and_drawn_for_as_those_of_the_whole(count, monkeypatc
 
 def train(folder, count, options):
     """The model of a training by ``count`` processes, of which each holds a block; of one, that holds it all."""
-    command = [sys.executable]
-    if count > 1:
-        command += ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
-    command += [str(ROOT / "train.py"), "-m", str(folder), *options.split()]
-    command += ["--shard", "--viewer"] if count > 1 else ["--no-shard"]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    run = subprocess.run(command, check=False, capture_output=True, text=True, env=environment, timeout=280)
-    assert run.returncode == 0, run.stderr
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", count] if count > 1 else []
+    sharded = ["--shard", "--viewer"] if count > 1 else ["--no-shard"]
+    python(*torchrun, ROOT / "train.py", "-m", folder, *options.split(), *sharded)
     (model,) = folder.glob("point_cloud/*/point_cloud.ply")
     return model.read_bytes()
 

@@ -156,7 +156,6 @@ def test_format_table():
 
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 63), (1, 1)])
 def test_video_plays_everywhere(tmp_path, height, width):
-    av = pytest.importorskip("av")
     colors = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200]], np.uint8)
     save_video(tmp_path / "a.mp4", (np.full((height, width, 3), color, np.uint8) for color in colors), fps=24)
     with av.open(str(tmp_path / "a.mp4")) as container:
@@ -172,7 +171,6 @@ def test_video_plays_everywhere(tmp_path, height, width):
 
 
 def test_video_errors_leave_no_file(tmp_path):
-    pytest.importorskip("av")
     frame = np.zeros((8, 8, 3), np.uint8)
     for frames, sentence in (([], "at least one"), ([frame, frame[:4]], "each, got"), ([frame[0]], "image: expected")):
         with pytest.raises(InputError, match=sentence):

@@ -7,7 +7,7 @@ import exact_cameras
 import numpy as np
 import pytest
 import torch
-from scenes import SCENES, SHUTTER, scene_of
+from scenes import SCENES, SHUTTER, one_gaussian, scene_of
 from scipy.spatial.transform import Rotation
 from test_rasterize import relative_error, run, truth
 
@@ -125,11 +125,8 @@ def test_nothing_that_only_other_rows_see_is_lost(device):
     first = camera.at(3)
     ray = first.rays(np.array([[10.0, 3.5]]))[0]
     near = replace(camera, shutter=Shutter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    for view, point in ((camera, 4.0 * first.rotation.T @ ray), (near, np.array([0.0, -0.05, 0.15]))):
-        means = torch.tensor(point[None], dtype=torch.float32, device=device)
-        one = torch.ones(1, 1, device=device)
-        quats = one * torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
-        given = (means, quats, 0.01 * one.expand(1, 3), 0.9 * one[0], torch.ones(1, 1, 3, device=device))
+    for view, point in ((camera, (4.0 * first.rotation.T @ ray).tolist()), (near, [0.0, -0.05, 0.15])):
+        given = one_gaussian(device, point, 0.01)
         assert rasterize(*given, view).alpha.max() > 0.3
         assert rasterize(*given, replace(view, shutter=None)).alpha.max() == 0
 

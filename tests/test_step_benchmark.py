@@ -1,7 +1,5 @@
 """What ``benchmarks/step.py``, ``savings.py`` and ``derivatives.py`` count and compare is right."""
 
-from pathlib import Path
-
 import derivatives
 import gpu_steps
 import limits
@@ -20,8 +18,6 @@ from warp_splat.config import ADJOINTS, ALPHA_MIN, T_MIN
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch, pool
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture

@@ -2,12 +2,12 @@
 
 import re
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from commands import ROOT
 from scenes import SCENES, cloud, make_camera
 
 import warp_splat
@@ -15,7 +15,6 @@ from warp_splat import CameraParameters, InputError, RasterOptions, tape
 from warp_splat.config import ADJOINTS
 from warp_splat.raster.drivers import CUDA, using
 
-PAGE = Path(__file__).parents[1] / "docs" / "tape.md"
 KINDS = {"means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": wp.float32, "sh": wp.vec3}
 TWIST = [0.01, -0.02, 0.015, 0.05, -0.03, 0.02]
 
@@ -219,7 +218,7 @@ def test_a_body_in_flight_is_fitted_to_pictures(tmp_path, monkeypatch):
     """The page's example: two kernels, the renderer and a third kernel, eighty times on a tape."""
     monkeypatch.syspath_prepend(tmp_path)
     names = {}
-    for text in re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL):
+    for text in re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/tape.md").read_text(), re.MULTILINE | re.DOTALL):
         if file := re.match(r"# (\w+\.py)\n", text):
             (tmp_path / file[1]).write_text(text)
         else:

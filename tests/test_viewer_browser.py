@@ -3,13 +3,12 @@
 import re
 import socket
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from browser import browser_page
-from commands import PATIENCE, end, served
+from commands import PATIENCE, SCENE, end, served
 from torch.nn import functional
 
 from warp_splat.camera import Camera
@@ -22,7 +21,6 @@ from warp_splat.rendering.finished import make_renderer
 from warp_splat.scene import load_scene
 from warp_splat.viewer.browser_camera import framed
 
-SCENE = Path(__file__).parents[1] / "assets" / "still_life"
 WIDTH, HEIGHT = 1000, 600
 pytestmark = pytest.mark.slow  # half a minute each where WebGL runs in software
 #: The picture without viser's panel, its warning that WebGL runs in software, and its axes.
