@@ -83,6 +83,10 @@ OPTIONS = st.fixed_dictionaries(
     options={"alpha_min": 0.0, "sh_degree": 0, "max_steps": 7}, seed=0, count=29, largest=1.0, opacity=(0.9, 1.0),
     aspect=1e-4, bright=0.0, behind=0.0,
 )  # fmt: skip
+@example(  # the short axes of long needles count
+    options={"alpha_min": 0.0, "antialiasing": True, "projection": "unscented"}, seed=37, count=37, largest=60.0,
+    opacity=(0.001, 0.02), aspect=1e-4, bright=0.0, behind=0.0,
+)  # fmt: skip
 @given(
     options=OPTIONS,
     seed=st.integers(0, 999),

@@ -183,6 +183,15 @@ def test_scene(name, options, adjoint, device, record_property):
         check_depth(out, expected.out)
 
 
+def test_seven_points_know_the_short_axes_of_long_needles(device):
+    """Their area is what antialiasing asks for. Gradients lose digits, as the points lie far apart."""
+    name, options = "needles_long", RasterOptions(projection="unscented", antialiasing=True)
+    (out, gradients), expected = run(name, device, options, "manual"), truth(name, options)
+    check_image(out, expected.out)
+    errors = {key: relative_error(gradient, expected.gradients[key]) for key, gradient in gradients.items()}
+    assert all(error < 1e-3 for error in errors.values()), errors
+
+
 @pytest.mark.parametrize("adjoint", ADJOINTS[1:])
 @pytest.mark.parametrize("name", ["dense_tile", "saturated", "degree3"])
 def test_modes_share_the_image_and_agree_on_the_gradients(name, adjoint, device):

@@ -8,10 +8,13 @@ Gaussian weighs 0 in the one and 2 in the other, each other point 1/6:
     covariance  sum d_a d_a' / 3 + sum b_a b_a' / 3 + 2 (p_0 - m) (p_0 - m)'
 
 with half the difference d_a of the two points along an axis, and b_a from the mean to their middle. The first sum is
-what the affine projection has; its determinant is again a sum of squares. The others are of second order.
+what the affine projection has. The others are of second order, and together sum c_a c_a' / 3, where c_a goes from p_0
+to the middle, and by (sqrt(8) - 2) (m - p_0) / 2 beyond. So the determinant is again a sum of squares: of the products
+of each two of the six vectors, over 9 (Cauchy and Binet).
 """
 
 import functools
+import itertools
 
 import numpy as np
 import warp as wp
@@ -22,6 +25,7 @@ from warp_splat.kernels.project.lens import NOWHERE, OUTLINE, image_of
 from warp_splat.lenses.formulas import PINHOLE, Family
 
 STEP = 3.0**0.5  # standard deviations
+BEYOND = (8.0**0.5 - 2.0) / 2.0  # of the mean: its weight of 2 comes with the middles
 LEAST = 1.0e-30  # px^2 or px^4, of what has a root
 
 
@@ -65,16 +69,15 @@ def through(family: Family, learned: bool = False) -> Projection:
         halves = [[0.5 * (a - b) for a, b in zip(*pair, strict=True)] for pair in pairs]
         middles = [[0.5 * (a + b) for a, b in zip(*pair, strict=True)] for pair in pairs]
         mean = [(middles[0][axis] + middles[1][axis] + middles[2][axis]) / 3.0 for axis in range(2)]
-        bends = [[part - whole for part, whole in zip(middle, mean, strict=True)] for middle in middles]
-        (dxx, dxy, dyy), (bxx, bxy, byy) = _squares(halves), _squares(bends)
-        bxx, bxy, byy = bxx + 2.0 * mean[0] * mean[0], bxy + 2.0 * mean[0] * mean[1], byy + 2.0 * mean[1] * mean[1]
-        crosses = [halves[a][0] * halves[b][1] - halves[a][1] * halves[b][0] for a, b in ((0, 1), (1, 2), (2, 0))]
+        bends = [[part + BEYOND * whole for part, whole in zip(middle, mean, strict=True)] for middle in middles]
+        vectors = [*halves, *bends]
+        xx, xy = (sum(vector[0] * vector[axis] for vector in vectors) / 3.0 for axis in range(2))
+        crosses = [v[0] * w[1] - v[1] * w[0] for v, w in itertools.combinations(vectors, 2)]
         sharp = sum(cross * cross for cross in crosses) / 9.0
-        sharp = sharp + (dxx * byy + dyy * bxx - 2.0 * (dxy * bxy)) + (bxx * byy - bxy * bxy)
-        across = np.sqrt(_at_least(dxx + bxx))
+        across = np.sqrt(_at_least(xx))
         up = np.sqrt(_at_least(sharp)) / across
         none = Number(notes, None)
-        rows = [across, none, none, (dxy + bxy) / across, up, none]
+        rows = [across, none, none, xy / across, up, none]
         drawn, place = given["drawn"], [px + mean[0], py + mean[1]]
         if family.wide:
             drawn, place = drawn * seen, [np.where(seen, number, NOWHERE) for number in place]
@@ -82,11 +85,6 @@ def through(family: Family, learned: bool = False) -> Projection:
         return write_function(f"{family.formula.__name__}_points", notes, OUTLINE, [*place, *rows, drawn], lanes, more)
 
     return Projection(make_identity, make_outline, family.wide, learned)
-
-
-def _squares(pairs: list[list[Number]]) -> list[Number]:
-    """Sums of the products of 2D vectors, over 3: xx, xy, yy."""
-    return [sum(pair[a] * pair[b] for pair in pairs) / 3.0 for a, b in ((0, 0), (0, 1), (1, 1))]
 
 
 def _at_least(x: Number) -> Number:
