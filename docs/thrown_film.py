@@ -18,6 +18,7 @@ import warp as wp
 from newton.sensors import SensorCamera
 
 from warp_splat.cli import main
+from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import find_iteration, ply_path, read_cameras
 from warp_splat.formats.png import save_video
 from warp_splat.newton import SensorSplatCamera, gaussian_of_file
@@ -73,7 +74,13 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-m", dest="model", type=Path, required=True, help="folder of a model of the embedded scene")
     model = parser.parse_args().model
-    frames = list(film(simulation(model), dict(read_cameras(model))[VIEW]))
+    try:
+        simulated, camera = simulation(model), dict(read_cameras(model)).get(VIEW)
+    except InputError as error:
+        parser.error(str(error))
+    if camera is None:
+        parser.error(f"{model}: expected a model of the embedded scene, found none with {VIEW}; train one.")
+    frames = list(film(simulated, camera))
     save_video(model / "thrown.mp4", frames, RATE / 2)
     sheet = np.concatenate([np.concatenate([frames[number] for number in row], axis=1) for row in SHOWN])
     matplotlib.image.imsave(model / "thrown.jpg", sheet)

@@ -1,11 +1,13 @@
 """The audit of renderers: a deliberately wrong one is found out, one that hangs or dies gets a row."""
 
+import functools
 import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import audit_targets
 import numpy as np
@@ -197,6 +199,8 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["x", "--command", "prog '{out}"], "expected {ply}, {cameras} and {out}"),
         (["wrong_renderer:torch"], "expected a function, found module"),
         (["audit_targets.own:manual", "--case", "nothing"], "expected one of one, two"),
+        (["audit_targets.own:manual", "--case", "one", "--limit", "nan"], "--limit: expected a finite number"),
+        (["audit_targets.own:manual", "--case", "one", "--degree", "9"], "--degree: expected 0 to 3, got 9"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, says, capsys):
@@ -219,9 +223,23 @@ def test_a_page_whose_packages_cannot_be_fetched_says_so(tmp_path, monkeypatch):
         function_of(audit_targets.OTHERS["spark"].place)
 
 
-def test_a_program_that_writes_no_picture_says_so():
-    with pytest.raises(RuntimeError, match="wrote no picture"):
-        shown_by("true {out}")
+def test_a_browser_that_cannot_be_started_is_told_each_time(monkeypatch):
+    """What playwright says of a second start of its own would hide that."""
+    starts = [SimpleNamespace(chromium=SimpleNamespace())]  # without launch
+    fake = SimpleNamespace(sync_playwright=lambda: SimpleNamespace(start=starts.pop))
+    monkeypatch.setitem(sys.modules, "playwright.sync_api", fake)
+    monkeypatch.setattr(program, "_playwright", functools.cache(program._playwright.__wrapped__))
+    for _ in range(2):
+        with pytest.raises(AttributeError, match="launch"):
+            program._browser.__wrapped__()
+
+
+@pytest.mark.parametrize(
+    ("command", "says"), [("true {out}", "wrote no picture"), ("false {out}", "exit code 1: no reason given$")]
+)
+def test_a_program_that_writes_no_picture_says_so(command, says):
+    with pytest.raises(RuntimeError, match=says):
+        shown_by(command)
 
 
 def test_tiny_rotations_are_not_lost_in_gsplats_function():

@@ -93,6 +93,8 @@ def test_a_merge_of_one_model_by_blocks_is_that_model(trained, tmp_path, capsys)
     assert len(cameras[0]) == len(cameras[1]) == len(list((SCENE / "images").iterdir()))
     assert main(["render", "-m", str(tmp_path), "--skip_train"]) == 0
     assert "Holding out every 8th image by name" in capsys.readouterr().out
+    spoil('"view_000.png"', "0", "cameras.json")(tmp_path)
+    assert main(["merge", str(tmp_path)]) == 0  # a number is a name as well
 
 
 def spoil(old, new, name=BLOCK):

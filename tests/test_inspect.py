@@ -64,6 +64,9 @@ def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys
     photos = shutil.copytree(SCENE / "images", tmp_path / "photos")
     names = sorted(photos.iterdir())
     count = len(names)
+    (photos / "output" / "mine" / "test").mkdir(parents=True)
+    (photos / "output" / "mine" / "cfg_args").touch()
+    shutil.copy(names[0], photos / "output" / "mine" / "test")  # a picture of a model, no photograph
     for done, said in (
         (lambda: None, True),
         (lambda: monkeypatch.setattr(stages, "opened", no_room), False),

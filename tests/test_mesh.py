@@ -131,6 +131,12 @@ def test_the_command(model, tmp_path, capsys, ending):
     assert "triangles" in capsys.readouterr().out
 
 
+def test_fewer_triangles_than_there_can_be(model, tmp_path, capsys):
+    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", "assets/still_life", "--voxel", "0.1"]
+    assert main(["mesh", *arguments, "--triangles", "1"]) == 0
+    assert "triangles, the fewest that simplifying comes to" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_convex_pieces(model, tmp_path):
     pytest.importorskip("vhacdx", reason="no vhacdx: pip install 'warp-splat[mesh]'")

@@ -129,6 +129,20 @@ def test_a_stopped_run_goes_on_and_finds_the_same(photos, scene, tmp_path, numbe
     assert model_bytes(tmp_path / "scene") == model_bytes(scene)
 
 
+def test_ctrl_c_ends_a_trial_at_once_and_leaves_nothing(tmp_path):
+    (tmp_path / "trial").mkdir()
+    done = python("-c", TRIAL.format(str(tmp_path / "trial")), check=False)
+    assert done.returncode == 130 and not list(tmp_path.iterdir()), done.stderr
+
+
+TRIAL = """
+import os, signal, threading, time
+from warp_splat.sfm.stages import run_watched
+threading.Timer(1, os.kill, (os.getpid(), signal.SIGINT)).start()
+run_watched("", 1, lambda: time.sleep(300), int, True, False, {!r})
+"""
+
+
 def test_photographs_that_cannot_be_read_are_left_out(photos, tmp_path, capsys):
     folder = tmp_path / "photos"
     for index, name in enumerate(photos[1]):

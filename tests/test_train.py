@@ -215,6 +215,13 @@ def test_a_full_disk_does_not_lose_the_model(tmp_path, monkeypatch, capsys):
     assert str(saved) in capsys.readouterr().err.splitlines()[-1] and len(load_ply(saved).splats.means) == 4500
 
 
+def test_what_is_written_is_told_if_the_disk_is_full_at_the_end(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("warp_splat.training.record.show_views", no_space)
+    assert train(tmp_path, "--iterations", "5") == 1
+    told = capsys.readouterr().out
+    assert f"numbers   {tmp_path / 'results.json'}" in told and "contact_sheet.png" not in told
+
+
 def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("warp_splat.training.loop.save_png", no_space)
     warm_up = lambda self: (tmp_path / "point_cloud").write_text("in the way")  # noqa: E731

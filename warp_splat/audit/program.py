@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import camera_entry
 from warp_splat.formats.png import load_png
@@ -69,7 +69,8 @@ def draw_by_program(command: str):
             places["background"] = ",".join(f"{value:g}" for value in background.tolist())
             done = subprocess.run([part.format(**places) for part in shlex.split(command)], capture_output=True)  # noqa: PLW1510
             if done.returncode:
-                raise RuntimeError(f"exit code {done.returncode}: {done.stderr.decode(errors='replace')[-200:]}")
+                said = reason_of(done.stderr.decode(errors="replace")[-200:])
+                raise RuntimeError(f"exit code {done.returncode}: {said}")
             if places["out"].exists():
                 return load_png(places["out"])
             if not places["exr"].exists():
@@ -105,18 +106,24 @@ class _Handler(SimpleHTTPRequestHandler):
 
 
 @functools.cache
-def _browser():
-    """A page of playwright's, the folder that is served, and its address."""
+def _playwright():
+    """Started once: after a browser that could not be started, a second start would raise something else."""
     try:
         from playwright.sync_api import sync_playwright  # noqa: PLC0415 - seldom there
     except ImportError as error:
         raise InputError("playwright: it drives the browser, and is not there; pip install playwright.") from error
-    folder = Path(tempfile.mkdtemp())
+    return sync_playwright().start()
+
+
+@functools.cache
+def _browser():
+    """A page of playwright's, the folder that is served, and its address."""
+    started, folder = _playwright(), Path(tempfile.mkdtemp())
     (folder / "node_modules").symlink_to(CACHE / "node_modules")
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     found = os.environ.get("WARP_SPLAT_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
-    browser = sync_playwright().start().chromium.launch(executable_path=found, args=FLAGS)
+    browser = started.chromium.launch(executable_path=found, args=FLAGS)
     return browser.new_page(), folder, f"http://127.0.0.1:{server.server_port}"
 
 

@@ -13,7 +13,7 @@ import torch
 from warp_splat.audit.program import draw_by_page, draw_by_program
 from warp_splat.compare.truth import PARAMETERS
 from warp_splat.compare.workloads import Workload
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, reason_of
 
 START_LIMIT = 300.0  # s for its imports, of which some compile
 
@@ -135,7 +135,7 @@ def _serve(connection, place: str) -> None:
 
 
 def _phrase(error: Exception) -> str:
-    return f"refuses: {type(error).__name__}: {' '.join(str(error).split())[:300]}"
+    return f"refuses: {type(error).__name__}: {reason_of(error)}"
 
 
 def _bits(run) -> bytes:

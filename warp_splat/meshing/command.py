@@ -68,7 +68,8 @@ def mesh(config: MeshConfig) -> int:
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)
     write_surface(output, surface)
-    print(f"{output}: {len(surface.faces)} of {found} triangles, voxels of {voxel:.4g}")
+    least = ", the fewest that simplifying comes to" if 0 < config.triangles < 0.9 * len(surface.faces) else ""
+    print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
     if config.collision:
         pieces = convex_pieces(surface, config.collision)
         place = output.with_name(f"{output.stem}_collision{output.suffix}")

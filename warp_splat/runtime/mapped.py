@@ -26,7 +26,7 @@ def zeros_in_file(folder: Path, shape: Sequence[int], dtype: torch.dtype) -> tor
             content = np.memmap(file, np.uint8, "r+" if os.fstat(file.fileno()).st_size else "w+", shape=max(size, 1))
     except OSError as error:
         raise InputError(
-            f"{folder}: expected {size / 2**30:.1f} GiB more on its disk for --out_of_core ({error.strerror}); free "
+            f"{folder}: expected {size / 2**20:.0f} MiB more on its disk for --out_of_core ({error.strerror}); free "
             "some, or choose another folder with -m."
         ) from error
     return torch.from_numpy(content)[:size].view(dtype).view(*shape)

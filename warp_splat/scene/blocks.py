@@ -141,7 +141,7 @@ def merge_blocks(config: MergeConfig) -> int:
         with reading(place / CAMERAS, "cameras as training writes them"):
             found = json.loads((place / CAMERAS).read_text(encoding="utf-8"))
             try:
-                cameras |= {entry["img_name"]: entry for entry in found}
+                cameras |= {str(entry["img_name"]): entry for entry in found}
             except (KeyError, TypeError) as error:
                 raise Unexpected("other JSON") from error
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)))

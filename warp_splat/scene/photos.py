@@ -23,13 +23,13 @@ def photo_root(source: Path) -> Path:
 def find_files(root: Path, endings: tuple[str, ...], without: Path | None = None) -> list[str]:
     """Names of the files below ``root``, relative to it and sorted, whose ending is one of ``endings``.
 
-    Hidden files and folders are left out, and all that lies in the folder ``without``.
+    Hidden files and folders are left out, and all that lies in trained models and in the folder ``without``.
     """
-    outside = (lambda path: without.resolve() not in path.resolve().parents) if without else Path.is_file
+    others = {path.parent.resolve() for path in root.rglob("*/cfg_args")} | ({without.resolve()} if without else set())
     names = (
         path.relative_to(root)
         for path in root.rglob("*")
-        if path.suffix.lower() in endings and path.is_file() and outside(path)
+        if path.suffix.lower() in endings and path.is_file() and others.isdisjoint(path.resolve().parents)
     )
     return sorted(name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
 

@@ -52,7 +52,7 @@ def _measured(root: Path, tried: list[str], config: SfmConfig) -> tuple[float, f
     """Seconds of all threads for a photograph, its features, and seconds for a pair, as means of those ``tried``."""
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
-        extraction = _seconds(lambda: stages.extract(database, root, [tried], config))
+        extraction = _seconds(lambda: stages.extract(database, root, [tried], config, folder))
         with stages.opened(database) as connection:
             features = connection.num_keypoints()
         matching = _seconds(lambda: match(database, config, print))

@@ -28,11 +28,11 @@ BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{rem
 
 
 def run_watched(
-    title: str, total: int, work: Callable, count: Callable[[], int], quiet: bool, stops: bool = True
+    title: str, total: int, work: Callable, count: Callable[[], int], quiet: bool, stops: bool = True, trial: str = ""
 ) -> None:
     """Run ``work`` in a thread and show a bar until it ends; Ctrl-C lets it end at the next image, then raises.
 
-    What does not stop, Ctrl-C ends with the whole process.
+    What does not stop, Ctrl-C ends with the whole process, and the folder of a ``trial`` with it.
     """
     token = {"cancellation_token": pycolmap.CancellationToken()} if stops else {}
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
@@ -43,6 +43,7 @@ def run_watched(
             wait([running], POLL)
             bar.update(min(count(), total) - bar.n)
             if interrupted and not stops:
+                shutil.rmtree(trial, ignore_errors=True)
                 leave("warp-splat: interrupted; what was saved before stays.")
             if interrupted:
                 token["cancellation_token"].cancel()
@@ -69,8 +70,8 @@ def rename(database: Path, old: str, new: str) -> None:
                 connection.update_image(image)
 
 
-def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig) -> None:
-    """Find SIFT features in the photographs below ``root``; those of a group share a lens."""
+def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig, trial: str = "") -> None:
+    """Find SIFT features in the photographs below ``root``; those of a group share a lens. ``trial``: run_watched's."""
     rename(database, SPACE, " ")  # of a run that was killed while it matched
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = LENS
@@ -88,7 +89,7 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
     with opened(database) as connection:
         numbers = [image.image_id for image in connection.read_all_images()]
         found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
-        run_watched("features", len(numbers), work, found, config.quiet)
+        run_watched("features", len(numbers), work, found, config.quiet, not trial, trial)
 
 
 def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, config: SfmConfig) -> None:

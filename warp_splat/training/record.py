@@ -195,25 +195,26 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     views, where = trainer.refined(views), trainer.where_taken()
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
     state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
+    names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
+    names |= {"profile": "profile.png"} if run.stages else {}
     try:
         show_views(compared, run.folder, split, run.iteration, say)
-    finally:  # what was measured is told, even if the disk is full
+        if run.stages:
+            report.plot_profile(run.folder / names["profile"], run.stages)
+    finally:  # what was measured and written is told, even if the disk is full
         print(
             f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
             f"{split} {metrics_line(means)}, {run.gaussians} Gaussians"
         )
+        for what, name in names.items():
+            if (path := run.folder / name).exists():
+                print(f"  {what:9s} {path}")
     run.events.write((run.iteration, f"{split}/{name}", value) for name, value in means.items())
     run.events.close()
-    names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
-    lines = [(what, run.folder / name) for what, name in names.items() if run.history or name != plot.name]
     if run.stages:
-        report.plot_profile(run.folder / "profile.png", run.stages)
-        lines += [("profile", run.folder / "profile.png")]
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    for name, where in lines:
-        print(f"  {name:9s} {where}")
     if trainer.config.learn.settle_from_iter:  # a clock may have said so
         print(f"  flags     {as_flags(trainer.config)}")
         print(f"  time      {run.spent:.1f} s from the first step to the last")
