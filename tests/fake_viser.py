@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warp_splat.camera import Camera
-from warp_splat.formats.splats import SplatArrays
 from warp_splat.scene.types import Decoded, Scene, View
 from warp_splat.viewer import watcher
 
@@ -92,17 +91,6 @@ class FakeServer:
 
     def stop(self):
         self.stopped = True
-
-
-def some_gaussians(count, coefficients=1):
-    random = np.random.default_rng(5)
-    return SplatArrays(
-        random.uniform(-1, 1, (count, 3)).astype(np.float32),
-        random.normal(0, 0.5, (count, coefficients, 3)).astype(np.float32),
-        np.full(count, 3.0, np.float32),
-        np.full((count, 3), -2.0, np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
-    )
 
 
 def some_scene():

@@ -31,6 +31,12 @@ def some_splats(count=50, coefficients=16, seed=0):
     )
 
 
+def small_splats(count, coefficients=1, seed=5):
+    """Those in a ball of about 1."""
+    splats = some_splats(count, coefficients, seed)
+    return splats._replace(means=splats.means / 5, scales=splats.scales / 5 - 1.8, sh=splats.sh / 2)
+
+
 def some_file(count=50, coefficients=16, seed=0, antialiased=False):
     return SplatFile(some_splats(count, coefficients, seed), antialiased)
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 from commands import SCENE, train
-from fake_viser import at_rest, drawn, entered, some_gaussians, some_scene
+from fake_viser import at_rest, drawn, entered, some_scene
 from make_faults import make_faulty
+from splat_files import small_splats
 from trainings import begin, stepped, steps
 
 from warp_splat.camera import Camera
@@ -301,7 +302,7 @@ def test_damaged_exposures_are_one_sentence(changes, trained, fails):
 
 def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
     at_rest(monkeypatch)
-    model, frames = GaussianModel.from_splats(some_gaussians(50)), []
+    model, frames = GaussianModel.from_splats(small_splats(50)), []
     draw = make_renderer(model)
     for factor in (1.0, 0.25):
         exposed = lambda image, view, factor=factor: image * factor  # noqa: E731

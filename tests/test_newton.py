@@ -13,7 +13,7 @@ import warp as wp
 from exact_cameras import exact_render
 from scenes import C0
 from scipy.spatial.transform import Rotation
-from splat_files import some_splats
+from splat_files import small_splats
 
 from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import sh_basis
@@ -33,16 +33,10 @@ BODIES = [(0.2, 0.1, 0.4, *Rotation.from_rotvec([0.4, -0.3, 1.2]).as_quat()), (-
 CAMERAS = [(0.1, 0.2, 5.0, *Rotation.from_rotvec([0.05, 0.1, 0.2]).as_quat()), (0.3, 0.0, 4.5, 0, 0, 0, 1)]
 
 
-def small(count, coefficients, seed):
-    """Gaussians in a ball of about 1."""
-    splats = some_splats(count, coefficients, seed)
-    return splats._replace(means=splats.means / 5, scales=splats.scales / 5 - 1.8, sh=splats.sh / 2)
-
-
 @pytest.fixture(scope="module")
 def simulation(tmp_path_factory):
     """Two worlds, each with a body of Gaussians of degree 3; others of degree 1 stand in both."""
-    folder, parts = tmp_path_factory.mktemp("files"), (small(30, 4, 1), small(25, 16, 2))
+    folder, parts = tmp_path_factory.mktemp("files"), (small_splats(30, 4, 1), small_splats(25, 16, 2))
     for number, splats in enumerate(parts):
         save_gaussians(folder / f"{number}.ply", SplatFile(splats))
     world, scene = newton.ModelBuilder(), newton.ModelBuilder()

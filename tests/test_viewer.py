@@ -7,8 +7,9 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 import torch
-from fake_viser import PHOTO, FakeClient, at_rest, drawn, entered, some_gaussians, some_scene, wxyz
+from fake_viser import PHOTO, FakeClient, at_rest, drawn, entered, some_scene, wxyz
 from scene_files import write_colmap
+from splat_files import small_splats
 
 from warp_splat.color import to_srgb
 from warp_splat.config import RasterOptions, ViewConfig
@@ -24,7 +25,7 @@ from warp_splat.viewer.watcher import MOST
 
 @pytest.fixture
 def viewer(fake_viser):
-    model, scene = GaussianModel.from_splats(some_gaussians(50)), some_scene()
+    model, scene = GaussianModel.from_splats(small_splats(50)), some_scene()
     draw = make_renderer(model)
     with server.Viewer(draw, lambda: model.parameters["means"], scene, 8080) as viewer:
         yield viewer
@@ -176,7 +177,7 @@ def test_windows_of_strange_sizes(viewer, monkeypatch, size):
 @pytest.mark.parametrize("coefficients", [1, 16])
 def test_small_models(fake_viser, count, coefficients):
     """Also an empty one, and one without spherical harmonics."""
-    model = GaussianModel.from_splats(some_gaussians(count, coefficients))
+    model = GaussianModel.from_splats(small_splats(count, coefficients))
     draw = make_renderer(model)
     with server.Viewer(draw, lambda: model.parameters["means"], None, 8080) as viewer:
         client = entered(viewer)
@@ -204,7 +205,7 @@ def test_what_cannot_be_viewed(config, message):
 def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, source, tolerance):
     """A file does not say what light it was trained in; its scene does."""
     root = write_colmap(tmp_path / "scene", ["a.exr", "b.exr"], np.full((32, 48, 3), 0.2, np.float32))
-    save_gaussians(tmp_path / "a.ply", SplatFile(some_gaussians(50)))
+    save_gaussians(tmp_path / "a.ply", SplatFile(small_splats(200)))
     client, served = FakeClient(1, PHOTO), []
 
     @contextmanager
@@ -220,7 +221,7 @@ def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, so
     at_rest(monkeypatch)
     assert view_model(ViewConfig(str(tmp_path / "a.ply"), str(root) if source else "", tolerance=tolerance)) == 0
     options = RasterOptions(tolerance=tolerance or None, of="trained")
-    draw = make_renderer(GaussianModel.from_splats(some_gaussians(50)).arranged(), None, options)
+    draw = make_renderer(GaussianModel.from_splats(small_splats(200)).arranged(), None, options)
     plain = draw(served[0], False).image.clamp(0, 1)
     assert plain.std() > 0.1
     shown = to_srgb(plain, torch.where) if source else plain
