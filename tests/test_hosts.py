@@ -43,14 +43,19 @@ def shell(*lines):
         subprocess.run(line.split(), check=True, capture_output=True)
 
 
+def cable_of(number):
+    """The device of a host; at most 15 letters."""
+    return f"cable{os.getpid()}{number}"
+
+
 class Host:
     """A namespace with an address, where torchrun starts two processes that know the first host."""
 
     def __init__(self, number):
-        self.number, self.name = number, f"splat{os.getpid()}{number}"
+        self.number, self.name, self.cable = number, f"splat{os.getpid()}{number}", cable_of(number)
 
     def connect(self, rate):
-        name, cable = self.name, f"cable{self.number}"
+        name, cable = self.name, self.cable
         shell(
             f"ip link set {cable} netns {name}",
             f"ip -n {name} link set lo up",
@@ -64,7 +69,7 @@ class Host:
         words += ["--nnodes", "2", "--nproc-per-node", "2", "--local-addr", f"10.77.0.{self.number}"]
         words += ["--rdzv-conf", f"is_host={self.number == 1}"]  # its name is that of both
         words += ["--rdzv-backend", "c10d", "--rdzv-endpoint", "10.77.0.1:29400", str(ROOT / "train.py"), "--shard"]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOO_SOCKET_IFNAME": f"cable{self.number}"}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOO_SOCKET_IFNAME": self.cable}
         self.log = folder.with_name(f"host{self.number}.txt")
         with self.log.open("w") as log:
             pipes = {"stdout": log, "stderr": log, "env": environment}
@@ -90,14 +95,14 @@ def trains(process):
 
 @contextmanager
 def cable(delay):
-    """The devices cable1 and cable2: what one sends, the other receives ``delay`` seconds later."""
+    """Two devices: what one sends, the other receives ``delay`` seconds later."""
     if not delay:
-        shell("ip link add cable1 type veth peer name cable2")
+        shell(f"ip link add {cable_of(1)} type veth peer name {cable_of(2)}")
         yield
         return
     ends, ended = [os.open("/dev/net/tun", os.O_RDWR) for _ in range(2)], threading.Event()
     for number, end in enumerate(ends, 1):
-        fcntl.ioctl(end, TUNSETIFF, struct.pack("16sH22x", f"cable{number}".encode(), IFF_TUN | IFF_NO_PI))
+        fcntl.ioctl(end, TUNSETIFF, struct.pack("16sH22x", cable_of(number).encode(), IFF_TUN | IFF_NO_PI))
     threads = [threading.Thread(target=carry, args=(*pair, delay, ended)) for pair in (ends, ends[::-1])]
     for thread in threads:
         thread.start()
@@ -126,6 +131,8 @@ def carry(source, target, delay, ended):
 def hosts(request):
     pair = [Host(1), Host(2)]
     rate, delay = getattr(request, "param", NEAR)
+    if delay and not os.path.exists("/dev/net/tun"):
+        pytest.skip("expected /dev/net/tun")
     one, other = (host.name for host in pair)
     try:
         try:
@@ -152,7 +159,7 @@ def test_two_hosts_make_the_model_of_one_machine(hosts, tmp_path):
     options = f"-s {SCENE} {SCHEDULE} --iterations 80 {GROWTHS['budget']}"
     for host in hosts:
         host.start(tmp_path / "hosts", options)
-    assert [host.agent.wait(250) for host in hosts] == [0, 0], hosts[0].log.read_text()
+    assert [host.agent.wait(500) for host in hosts] == [0, 0], hosts[0].log.read_text()
     (model,) = (tmp_path / "hosts").glob("point_cloud/*/point_cloud.ply")
     assert model.read_bytes() == train(tmp_path / "one", 1, options)
 
@@ -172,7 +179,10 @@ FAILURES = {
     "dies": (signaled("host", signal.SIGKILL), r"no sign of process [23]"),
     "hangs": (signaled("host", signal.SIGSTOP), r"no sign of process 2, 3"),
     "one process hangs": (signaled("process", signal.SIGSTOP), r"no sign of process 3"),
-    "is cut off": (lambda hosts: shell(f"ip -n {hosts[1].name} link set cable2 down"), r"no sign of process 2, 3"),
+    "is cut off": (
+        lambda hosts: shell(f"ip -n {hosts[1].name} link set {hosts[1].cable} down"),
+        r"no sign of process 2, 3",
+    ),
     "Ctrl-C": (signaled("agent", signal.SIGINT), r"To continue after iteration"),
 }
 
@@ -201,12 +211,25 @@ def test_when_a_host_fails_all_end_and_fewer_go_on(failure, hosts, tmp_path):
     goes_on(tmp_path / "hosts")
 
 
+def test_all_that_stand_still_for_a_while_go_on(hosts, tmp_path):
+    """As after Ctrl-Z and fg: none takes the others for hung."""
+    for host in hosts:
+        host.start(tmp_path / "hosts", ENDLESS)
+    until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
+    for sent in (signal.SIGSTOP, signal.SIGCONT):
+        for process in [process for host in hosts for process in host.processes()]:
+            process.send_signal(sent)
+        time.sleep(25)
+    before = iteration(tmp_path / "hosts")
+    until(lambda: iteration(tmp_path / "hosts") > before, 150, hosts)
+
+
 def test_a_full_disk_on_one_host_costs_a_checkpoint(hosts, tmp_path):
-    """The first checkpoint fits, the later ones, with moments, do not: training goes on, and the first one stays."""
+    """Those with moments of harmonics, from iteration 30 on, do not fit: training goes on, and the one before stays."""
     hosts[0].start(tmp_path / "hosts", ENDLESS)
     hosts[1].start(tmp_path / "hosts", ENDLESS, before=["prlimit", "--fsize=500000"])
     until(lambda: "process 2 could not write its block" in hosts[0].log.read_text(), 150, hosts)
-    assert iteration(tmp_path / "hosts") == 0
+    assert 0 <= iteration(tmp_path / "hosts") < 30
     assert all(process.is_running() for host in hosts for process in host.processes())
     for host in hosts:
         host.end()

@@ -205,11 +205,13 @@ def test_a_process_without_signs_is_named(monkeypatch):
     for name, sign in {"sign/0": "0", "sign/1": watch.LEFT, "sign/2": "5"}.items():
         store.set(name, sign)
     one = watch.Watch(0, 3, store, math.inf)
-    thread = threading.Thread(target=one.look, daemon=True)
-    thread.start()
+    threads = [threading.Thread(target=run, daemon=True) for run in (one.look, one.judge)]
+    for thread in threads:
+        thread.start()
     assert one.silent() == [2]
     one.stopped.set()
-    thread.join(5)
+    for thread in threads:
+        thread.join(5)
 
 
 def test_an_error_of_all_processes_of_a_machine_is_told_once(monkeypatch, capsys):

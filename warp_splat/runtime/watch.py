@@ -24,38 +24,40 @@ class Watch:
     def __init__(self, rank: int, count: int, store: Any, patience: float):
         self.rank, self.store, self.patience, self.stopped = rank, store, patience, threading.Event()
         self.names = [f"sign/{other}" for other in range(count)]
-        self.signs, self.changed = [b""] * count, [time.monotonic()] * count
+        self.signs, self.changed = [b""] * count, [0] * count
+        self.seconds = 0  # in which this process ran: one that was stopped for a while (Ctrl-Z) blames nobody
 
     def gone(self, seconds: float) -> list[int]:
-        """Processes that have left no sign for so long."""
-        now, signs = time.monotonic(), zip(self.signs, self.changed, strict=True)
-        return [rank for rank, (sign, then) in enumerate(signs) if now - then > seconds and sign != LEFT.encode()]
+        """Other processes that have left no sign for so long."""
+        named = enumerate(zip(self.signs, self.changed, strict=True))
+        silent = [rank for rank, (sign, then) in named if self.seconds - then > seconds and sign != LEFT.encode()]
+        return [rank for rank in silent if rank != self.rank]
 
     def silent(self) -> list[int]:
         """Those that have gone by now, which takes a moment to tell."""
         time.sleep(GONE + 2.0)  # a second until their last sign is seen, another until it is looked at again
-        return [rank for rank in self.gone(GONE) if rank != self.rank]
+        return self.gone(GONE)
 
     def look(self) -> None:
         """Leave a sign and look at those of others, until the process that keeps them has gone."""
-        beat = 0
         while not self.stopped.wait(1.0):
-            beat += 1
             try:
-                self.store.set(self.names[self.rank], f"{os.getpid()} {beat}")
-                signs, now = self.store.multi_get(self.names), time.monotonic()
+                self.store.set(self.names[self.rank], f"{os.getpid()} {self.seconds}")
+                signs = self.store.multi_get(self.names)
             except RuntimeError:
                 return
             for rank, sign in enumerate(signs):
                 if sign != self.signs[rank]:
-                    self.changed[rank] = now
+                    self.changed[rank] = self.seconds
             self.signs = signs
 
     def judge(self) -> None:
         """Wait until one of the others hangs: then this process can only end."""
         while not self.stopped.wait(1.0):
-            if hung := [rank for rank in self.gone(self.patience) if rank != self.rank]:
-                words = f"Process {self.rank}: no sign of process {', '.join(map(str, hung))} for {HUNG:.0f} s"
+            self.seconds += 1
+            if self.gone(self.patience):
+                hung = self.gone(self.patience / 2)  # two that are cut off have not left their last signs at once
+                words = f"Process {self.rank}: no sign of process {', '.join(map(str, hung))} for {HUNG / 2:.0f} s"
                 os.write(2, f"warp-splat: error: {words}; the last checkpoint is whole.\n".encode())
                 for rank in hung:
                     self.kill(rank)
