@@ -13,6 +13,7 @@ from warp_splat.runtime.distributed import Processes
 from warp_splat.runtime.timers import stage
 
 LEAST, MOST = -(2**61), 2**61  # of what is sorted
+WAYS = 64  # into which a search divides what is left: each takes an exchange, which far away costs more than numbers
 AT_ONCE = 2**20  # random numbers that are drawn for others
 
 
@@ -126,15 +127,17 @@ class Shards(Processes):
 
     def _at(self, columns: Sequence[torch.Tensor], ranks: Sequence[int]) -> torch.Tensor:
         """The numbers at these places of sorted columns [k], of which each process has a part; MOST beyond the last."""
-        low, high = (torch.full((len(ranks),), end) for end in (LEAST, MOST))
+        low, high = (torch.full((len(ranks), 1), end) for end in (LEAST, MOST))
         while bool((low < high).any()):
-            middle = low + (high - low) // 2
-            counts = [torch.searchsorted(part, at, right=True) for part, at in zip(columns, middle, strict=True)]
+            steps = torch.arange(WAYS) * ((high - low) // WAYS).clamp(1)
+            tried = torch.minimum(low + steps, high - 1)
+            counts = [torch.searchsorted(part, at, right=True) for part, at in zip(columns, tried, strict=True)]
             reached = torch.stack(counts)
             self.sum(reached)
-            over = reached > torch.tensor(ranks)
-            low, high = torch.where(over, low, middle + 1), torch.where(over, middle, high)
-        return low
+            short = (reached <= torch.tensor(ranks)[:, None]).sum(1, keepdim=True)
+            ends = torch.cat([low - 1, tried, high], 1)
+            low, high = ends.gather(1, short) + 1, ends.gather(1, short + 1)
+        return low[:, 0]
 
 
 def _ordered(values: torch.Tensor) -> torch.Tensor:
