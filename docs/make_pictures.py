@@ -15,17 +15,23 @@ from pathlib import Path
 
 import numpy as np
 import renderer_pictures
+import torch
+import trimesh
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
-sys.path.insert(0, str(DOCS.parent / "tests"))
+sys.path[:0] = [str(DOCS.parent / folder) for folder in ("tests", "assets")]
 
 from browser import browser_page  # noqa: E402
+from scene_geometry import Patch  # noqa: E402
+from scene_trace import Measure  # noqa: E402
 
 from warp_splat.cli import main  # noqa: E402
 from warp_splat.evaluation.report import new_figure, plot_training, save_figure  # noqa: E402
 from warp_splat.formats.model_folder import find_iteration  # noqa: E402
 from warp_splat.formats.png import load_png  # noqa: E402
+from warp_splat.meshing.fusion import rays  # noqa: E402
+from warp_splat.rendering.finished import Finished  # noqa: E402
 
 PATIENCE = 180_000  # ms, on a machine without a GPU that is busy
 SHOWN = 6  # frames of each video
@@ -105,6 +111,24 @@ def capture(plain: str, better: str) -> Path:
     return _save(np.concatenate(pictures, axis=1), "capture.jpg")
 
 
+def surface(model: str) -> Path:
+    """A held-out photograph, and the surface of ``warp-splat mesh`` from its camera: bright where it faces it."""
+    view = Finished(model).load_scene("", lambda _: None).evaluated[1][VIEW]
+    with tempfile.TemporaryDirectory() as folder:
+        assert main(["mesh", model, str(Path(folder) / "surface.ply")]) == 0
+        found = trimesh.load(Path(folder) / "surface.ply", process=False)
+    along = rays(view.camera, torch.device("cpu")).double().numpy()
+    along /= np.linalg.norm(along, axis=2, keepdims=True)
+    origins = np.broadcast_to(view.camera.center, along.shape).reshape(-1, 3)
+    measure = Measure(Patch(found.vertices, found.vertex_normals, None, found.faces, None))
+    distance = measure(origins, along.reshape(-1, 3)).reshape(along.shape[:2])
+    points = np.where(distance > 0, distance, np.nan)[..., None] * along
+    normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    facing = np.abs((normals * along).sum(2)) / np.linalg.norm(normals, axis=2)
+    shaded = np.rint(255 * np.nan_to_num(facing, nan=1.0)).astype(np.uint8)
+    return _save(np.concatenate([view.picture, shaded[..., None].repeat(3, 2)], axis=1), "surface.jpg")
+
+
 def _save(picture: np.ndarray, name: str) -> Path:
     """As a JPEG file of about the width of a page."""
     height, width, _ = picture.shape
@@ -122,6 +146,7 @@ PICTURES = {
     "page": page,
     "viewer": viewer,
     "capture": capture,
+    "surface": surface,
     "renderer": partial(renderer_pictures.draw, images=IMAGES),
 }
 
