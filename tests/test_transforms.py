@@ -22,6 +22,7 @@ from scene_files import (
 )
 
 from warp_splat import Lens
+from warp_splat.cli import main
 from warp_splat.inspect.subject import read_subject
 from warp_splat.inspect.verdicts import check_loading
 
@@ -103,6 +104,9 @@ def test_native_lenses_keep_the_pixels(tmp_path, values, lens):
     assert camera.lens == lens and (camera.width, camera.height) == (width, height)
     np.testing.assert_array_equal(scene.train[0].image, pixels)
     assert lines[0].startswith(f"Keeping 1 of 1 images as their lenses show them (models: {lens.model})")
+    model = ["-m", str(tmp_path / "model")]
+    assert main(["train", "-s", str(tmp_path), *model, "--lens", "native", "--iterations", "2", "--quiet"]) == 0
+    assert main(["render", *model]) == 0
 
 
 def test_a_photograph_with_two_frames_counts_once(tmp_path):

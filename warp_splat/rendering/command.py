@@ -114,7 +114,7 @@ def render_model(config: RenderConfig) -> int:
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):
         picture = finished.picture(model.to(device), scene, options)
-        draw, activated = finished.renderer(model, replace(options, bound=True)), model.activated()
+        draw, activated = finished.renderer(model, replace(options, bound=config.bound)), model.activated()
         maps = {
             "bound": lambda camera: draw(camera).bound,
             "popping": lambda camera: popping_of(activated, camera, options),

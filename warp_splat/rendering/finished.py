@@ -135,9 +135,14 @@ def make_renderer(
     """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients.
 
     ``background``: a color [3], black unless given; or harmonics [16, 3].
+
+    Raises:
+        InputError: if a bound is asked for, and there are harmonics.
     """
     behind = torch.zeros(3, device=model.device) if background is None else background
     options = options or RasterOptions()
+    if behind.ndim > 1 and (options.bound or options.tolerance is not None):
+        raise InputError("--tolerance, --bound: expected one color behind the Gaussians, found a sky; leave them out.")
     with torch.no_grad():
         gaussians = model.activated()
 

@@ -210,7 +210,7 @@ class Trainer:
         """Compile and load every kernel of a step, changing nothing."""
         view = self.scene.train[0]
         step = Step(0, view)
-        camera = self._through("camera", view.camera.resized(TILE, TILE), step)
+        camera = self._through("camera", view.camera.resized(2 * TILE, TILE), step)  # 2:1, as a panorama has to be
         options = self._through("asks", self.options, step)
         out = self._render(camera, self.behind, options, rows=self._shown(camera, options))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
