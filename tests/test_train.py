@@ -153,6 +153,21 @@ def test_ctrl_c_saves_the_model_and_says_how_to_continue(tmp_path):
     assert f"Done after {int(reached) + 5} iterations" in done.stdout
 
 
+def test_first_step_loads_only_what_it_needs():
+    code = (
+        "import sys, warp_splat.training.command\n"
+        "from warp_splat.scene import load_scene\n"
+        "from warp_splat.scene.embedded import embedded_scene\n"
+        "from warp_splat.training.options import TrainConfig\n"
+        "from warp_splat.training.trainer import Trainer\n"
+        "trainer = Trainer(load_scene(embedded_scene(), resolution=8), TrainConfig(device='cpu'))\n"
+        "trainer.warm_up()\n"
+        "trainer.differentiate(1)\n"
+        "assert not {'matplotlib', 'sympy', 'scipy.optimize', 'viser'} & set(sys.modules)"
+    )
+    python("-c", code)
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

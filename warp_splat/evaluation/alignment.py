@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch.nn.functional import avg_pool2d
 
 from warp_splat.camera import Camera
@@ -48,6 +47,8 @@ def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, exte
         errors = torch.stack([avg_pool2d(difference, level).square().mean() for level in levels]).sum()
         errors.backward()
         return errors.item(), twist.grad.numpy()
+
+    from scipy.optimize import minimize  # noqa: PLC0415 - slow to load, and most trainings do without
 
     near = [(-FARTHEST, FARTHEST)] * 6
     found = minimize(loss, np.zeros(6), jac=True, method="L-BFGS-B", bounds=near, options={"maxfun": STEPS})

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from warp_splat.flags import flags_of
 from warp_splat.scene.types import Scene
@@ -46,6 +45,8 @@ class Cost:
     @classmethod
     def of(cls, measured: Sequence[StepTime]) -> Cost:
         """The costs, none negative, with the least squared error relative to each measurement."""
+        from scipy.optimize import nnls  # noqa: PLC0415 - slow to load, and only --minutes needs it
+
         rows = np.array([(1.0, m.gaussians, m.pixels, m.seconds) for m in measured], dtype=np.float64)
         size = rows[:, :3].max(0)  # so that the columns are of one order
         weighted = rows / rows[:, 3:]

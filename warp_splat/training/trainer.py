@@ -103,7 +103,6 @@ class Trainer:
         with_alpha = any(having(self.parts, "reads_alpha"))
         self.photographs = Photographs(config, scene, self.device, with_alpha)
         self.room = Room()  # for tile instances
-        self._one = torch.ones((), device=self.device)
         self._radii = self.model.parameters["means"].new_zeros(len(self.model), dtype=torch.int32)  # in the last step
 
     def _folder(self) -> Path:
@@ -160,7 +159,7 @@ class Trainer:
         loss = self._through("loss", loss, out, step)
         for price in [] if splats else self.prices(out.gaussians):
             loss = loss + price.to(loss.dtype)
-        loss.backward(self._one)
+        loss.backward()  # given a gradient, torch would load sympy, for over a second
         if not splats:
             self.see(out if rows is None else Observed.of_all(out, rows, len(self.model)), step)
         dropped = (out.dropped.pixel_count, out.dropped.gaussian_count, out.invalid_count)
