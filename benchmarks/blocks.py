@@ -5,7 +5,7 @@ of the photographs trains a third of the steps. A pixel belongs to the cell in w
 A view looks across a border if a tenth of its pixels belong to other cells than most do; pixels within 3 of another
 cell's are those of a seam.
 
-    python benchmarks/blocks.py --models output/blocks [-s SCENE] [--blocks 4] [--out docs/benchmarks]
+    python benchmarks/blocks.py --models output/blocks [-s SCENE] [--blocks 4] [--seeds 0 1] [--out docs/benchmarks]
 """
 
 from pathlib import Path
@@ -28,20 +28,20 @@ from warp_splat.training.options import TrainConfig, schedule_of
 
 ACROSS, SEAM = 0.1, 3
 COLUMNS = {
-    **{"scene": "{scene}", "model": "{model}", "Gaussians": "{file}", "across": "{across:.2f}"},
+    **{"scene": "{scene}", "seed": "{seed}", "model": "{model}", "Gaussians": "{file}", "across": "{across:.2f}"},
     **{"within": "{within:.2f}", "seams": "{seams:.2f}", "elsewhere": "{rest:.2f}"},
     **{"starts from": "{largest}", "views": "{views}", "MB": "{mb:.0f}", "steps": "{steps}"},
 }
 
 
-def flags_of(source: Path, share: float, iterations: int, width: int) -> list:
+def flags_of(source: Path, seed: int, share: float, iterations: int, width: int) -> list:
     """Of a training with a share of all views, its schedule as much shorter."""
     fast = schedule_of(TrainConfig(**PRESETS["fast"]))
     scale = share * iterations / fast["iterations"]
     schedule = [word for name, steps in fast.items() for word in (f"--{name}", round(steps * scale))]
     flags = ["-s", source, "-r", width, "--eval", "--preset", "fast", "--growth", "reference", "--device", "cpu"]
     flags += ["--densify_grad_threshold", 0.001]  # of small pictures
-    return [*flags, *schedule, "--threads", 1]
+    return [*flags, *schedule, "--threads", 1, "--seed", seed]
 
 
 def cells_in(camera: Camera, depth: np.ndarray, block: Block) -> np.ndarray:
@@ -70,16 +70,16 @@ def decibels(errors: list) -> float:
     return float(np.mean([-10 * np.log10(error.mean()) for error in errors])) if errors else float("nan")
 
 
-def compare(name: str, source: Path, models: Path, count: int, iterations: int, width: int) -> list[dict]:
+def compare(name: str, source: Path, seed: int, models: Path, count: int, iterations: int, width: int) -> list[dict]:
     """Rows of the table: trained as one, and as ``count`` blocks."""
-    whole, folder, trained = models / name / "whole", models / name / "blocks", []
+    whole, folder, trained = models / name / f"{seed}" / "whole", models / name / f"{seed}" / "blocks", []
     load = lambda block: load_scene(source, eval=True, resolution=width, block=block, report=str)  # noqa: E731
     scene, names = load(""), [f"{number + 1}/{count}" for number in range(count)]
-    result = run_training(whole, flags_of(source, 1.0, iterations, width))
+    result = run_training(whole, flags_of(source, seed, 1.0, iterations, width))
     records = [{"model": "one training", "largest": len(scene.points), "views": len(scene.train), "results": [result]}]
     blocks = [load(block) for block in names]
     for block, part in zip(names, blocks, strict=True):
-        flags = flags_of(source, len(part.train) / len(scene.train), iterations, width)
+        flags = flags_of(source, seed, len(part.train) / len(scene.train), iterations, width)
         trained.append(run_training(folder / block.replace("/", "_"), [*flags, "--block", block]))
     merge_blocks(MergeConfig(str(folder)))
     largest = max(blocks, key=lambda part: len(part.points))
@@ -90,7 +90,7 @@ def compare(name: str, source: Path, models: Path, count: int, iterations: int, 
     across = [(found != np.bincount(found.ravel()).argmax()).mean() > ACROSS for found in cells]
     seams = [maximum_filter(found, 2 * SEAM + 1) != minimum_filter(found, 2 * SEAM + 1) for found in cells]
     for place, errors, record in zip((whole, folder), (of_whole, of_blocks), records, strict=True):
-        record["scene"] = f"{name}: {sum(across)} of {len(across)} across"
+        record["scene"], record["seed"] = f"{name}: {sum(across)} of {len(across)} across", seed
         record["file"] = len(Finished(place).file.splats.means)
         for of_views, of_pixels, chosen in (("across", "seams", True), ("within", "rest", False)):
             views = [error for error, beyond in zip(errors, across, strict=True) if beyond == chosen]
@@ -107,6 +107,7 @@ def main() -> None:
         MODELS,
         SCENE,
         option("--blocks", type=int, default=4),
+        option("--seeds", type=int, nargs="+", default=[0], help="of the street's trainings; the first of others"),
         option("--iterations", type=int, default=800, help="of the undivided training"),
         option("-r", "--resolution", type=int, default=160, help="width of the pictures [px]"),
     )
@@ -115,7 +116,9 @@ def main() -> None:
     if arguments.scene:
         scenes[arguments.scene.name] = arguments.scene
     rest = (arguments.models, arguments.blocks, arguments.iterations, arguments.resolution)
-    records = [row for name, source in scenes.items() for row in compare(name, source.resolve(), *rest)]
+    seeds = {"street": arguments.seeds}
+    runs = [(name, at.resolve(), seed) for name, at in scenes.items() for seed in seeds.get(name, arguments.seeds[:1])]
+    records = [row for run in runs for row in compare(*run, *rest)]
     note = (
         f"PSNR [dB] of held-out views, {arguments.resolution} px wide, after {arguments.iterations} steps by --preset "
         "fast and --growth reference with --densify_grad_threshold 0.001, a block fewer in proportion to its "

@@ -118,7 +118,8 @@ TABLES = {
 
 
 def _scaling() -> list[tuple]:
-    street, street_blocks, ring, ring_blocks = f.data("blocks")["records"]
+    street, street_blocks, again, again_blocks, ring, ring_blocks = f.data("blocks")["records"]
+    behind = lambda whole, blocks: [f.one(whole[place] - blocks[place]) for place in ("rest", "seams")]  # noqa: E731
     on_eight, largest = (
         row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
     )
@@ -132,12 +133,12 @@ def _scaling() -> list[tuple]:
             f"{on_eight['image']:.0f}",
         ),
         (
-            "The street's blocks are {} dB behind away from the borders, and {} dB at them:",
-            *(f.one(street[place] - street_blocks[place]) for place in ("rest", "seams")),
+            "street's blocks are {} dB behind away from the borders, and {} dB at them, with another seed {} and {}:",
+            *(*behind(street, street_blocks), *behind(again, again_blocks)),
         ),
         (
             "On fox they are {} and {} dB behind",
-            *(f.one(ring[place] - ring_blocks[place]) for place in ("rest", "seams")),
+            *behind(ring, ring_blocks),
         ),
         ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
     ]
