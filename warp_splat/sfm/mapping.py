@@ -127,6 +127,7 @@ def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, sta
     options.mapper.random_seed = options.triangulation.random_seed = config.seed
     if start:
         options.multiple_models = False
+        options.fix_existing_frames = True  # they are adjusted; again, thousands take longer than all before
         for name, value in RELAXED.items():
             setattr(options.mapper, name, value)
     registered = [1] * (pycolmap.Reconstruction(start).num_reg_images() if start else 0)

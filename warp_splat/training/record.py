@@ -195,8 +195,8 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     views, where = trainer.refined(views), trainer.where_taken()
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
     state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
-    names = {"pictures": "contact_sheet.png", "views": "per_view.md", "curves": plot.name, "numbers": "results.json"}
-    names |= {"profile": "profile.png"} if run.stages else {}
+    names = {"pictures": "contact_sheet.png", "views": "per_view.md"} | ({"curves": plot.name} if run.history else {})
+    names |= {"numbers": "results.json"} | ({"profile": "profile.png"} if run.stages else {})
     try:
         show_views(compared, run.folder, split, run.iteration, say)
         if run.stages:
