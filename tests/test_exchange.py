@@ -61,7 +61,10 @@ def test_a_crop_keeps_what_is_in_the_box(tmp_path, fails):
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--crop", *box]) == 0
     assert 0 < sum(kept) < len(kept)
     np.testing.assert_array_equal(load_gaussians(tmp_path / "b.ply").splats.means, before.means[kept])
+    open_below = ["-1e9", "-9.5E+8", "-inf", *box[3:]]
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--crop", *open_below]) == 0
     for wrong, said in (
+        ([], "expected six numbers"),
         (box[:5], "expected six numbers"),
         (box[3:] + box[:3], "the smallest"),
         ([9] * 3 + [10] * 3, "none"),

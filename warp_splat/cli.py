@@ -4,6 +4,7 @@ import argparse
 import difflib
 import importlib
 import os
+import re
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -56,6 +57,7 @@ NEVER_EMPTY = (
     *("source_path", "model_path", "start_checkpoint", "start_ply", "config", "lpips_weights", "verify"),
     *("video_output", "out"),
 )
+UNUSUAL = re.compile(r"-(inf|[\d.]+e[-+]?\d+)", re.IGNORECASE)  # numbers that argparse takes for flags, without a space
 
 
 def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
@@ -108,7 +110,8 @@ def parse(arguments: list[str]) -> Any:
         name = argument.split("=")[0]
         if name in FOREIGN_FLAGS:
             raise InputError(f"{name}: {FOREIGN_FLAGS[name]}; leave this flag out.")
-    known, unknown = make_parser().parse_known_args(arguments)
+    spaced = [f" {word}" if UNUSUAL.fullmatch(word) else word for word in arguments]
+    known, unknown = make_parser().parse_known_args(spaced)
     config_type = COMMANDS[known.command][0]
     if unknown:
         flags = [f"--{item.name}" for item in flags_of(config_type)]
@@ -120,6 +123,8 @@ def parse(arguments: list[str]) -> Any:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
+    if values.get("crop") == []:
+        raise InputError("--crop: expected six numbers, got none; leave the flag out or name a box.")
     if config_type is TrainConfig and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
         values = _restarted(values)
     given = values
