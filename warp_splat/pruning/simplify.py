@@ -38,6 +38,8 @@ def simplify(config: SimplifyConfig) -> int:
     if is_file_of_gaussians(config.model) and not config.source_path:
         return _unseen(config, output)
     opened = Opened(config)
+    if config.tolerance and opened.harmonics is not None:
+        raise InputError("--tolerance: expected one color behind the Gaussians, found a sky; choose with --max_loss.")
     thinning, file = Thinning(opened.file.splats, opened.setting), opened.file
     _curve(opened, thinning, output)
 
