@@ -232,6 +232,7 @@ def test_a_full_disk_does_not_lose_the_model(tmp_path, monkeypatch, capsys):
 
 def test_what_is_written_is_told_if_the_disk_is_full_at_the_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("warp_splat.training.record.show_views", no_space)
+    (tmp_path / "contact_sheet.png").write_bytes(b"of an older training")
     assert train(tmp_path, "--iterations", "5") == 1
     told = capsys.readouterr().out
     assert f"numbers   {tmp_path / 'results.json'}" in told and "contact_sheet.png" not in told

@@ -195,20 +195,20 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     views, where = trainer.refined(views), trainer.where_taken()
     means, compared = evaluate_views(trainer.picture, views, run.folder, split, run.iteration, extra, metrics, where)
     state = "Interrupted" if run.iteration < trainer.config.learn.end else "Done"
-    names = {"pictures": "contact_sheet.png", "views": "per_view.md"} | ({"curves": plot.name} if run.history else {})
-    names |= {"numbers": "results.json"} | ({"profile": "profile.png"} if run.stages else {})
+    names = ({"curves": plot.name} if run.history else {}) | {"numbers": "results.json"}
     try:
         show_views(compared, run.folder, split, run.iteration, say)
+        names = {"pictures": "contact_sheet.png", "views": "per_view.md"} | names
         if run.stages:
-            report.plot_profile(run.folder / names["profile"], run.stages)
+            report.plot_profile(run.folder / "profile.png", run.stages)
+            names["profile"] = "profile.png"
     finally:  # what was measured and written is told, even if the disk is full
         print(
             f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
             f"{split} {metrics_line(means)}, {run.gaussians} Gaussians"
         )
         for what, name in names.items():
-            if (path := run.folder / name).exists():
-                print(f"  {what:9s} {path}")
+            print(f"  {what:9s} {run.folder / name}")
     run.events.write((run.iteration, f"{split}/{name}", value) for name, value in means.items())
     run.events.close()
     if run.stages:
