@@ -24,9 +24,9 @@ from warp_splat.formats.files import write_text
 from warp_splat.formats.stored import SH_C0
 from warp_splat.text import table_of
 
-#: Who reads a format, who shows the PLY file for comparison, and what the loader may leave to the viewer: axes turned.
-SPARK = ("spark.html", "spark.html", (1, -1, -1))
-FORMATS = {**dict.fromkeys(("ply", "spz", "splat", "sog"), SPARK), "glb": ("gltf.html", "babylon.html", (-1, -1, 1))}
+#: Who reads a format, and what the loader may leave to the viewer: axes turned.
+SPARK = ("spark.html", (1, -1, -1))
+FORMATS = {**dict.fromkeys(("ply", "spz", "splat", "sog"), SPARK), "glb": ("babylon.html", (-1, -1, 1))}
 COLUMNS = {
     "format": "{format}",
     "the format's own error": "{format_error:.1e}",
@@ -54,10 +54,10 @@ def measured(suffix: str, folder: Path, workload, file) -> dict:
 
     write(folder)
     ours = numbers(load_gaussians(folder / f"scene.{suffix}").splats)
-    page, usual, turned = FORMATS[suffix]
+    page, turned = FORMATS[suffix]
     picture, read = screenshot(FOLDER / page, workload.camera, write, f"scene.{suffix}")
     given = lambda served: save_gaussians(served / "same.ply", file)  # noqa: E731
-    of_ply, _ = screenshot(FOLDER / usual, workload.camera, given, "same.ply")
+    of_ply, _ = screenshot(FOLDER / page, workload.camera, given, "same.ply")
     theirs = np.array(read)[:, [0, 1, 2, 7, 8, 9, 10, 11, 12, 13]]
     return {
         "format": suffix,
@@ -78,7 +78,7 @@ def main() -> None:
     file = stored(*geometry, torch.cat([dc, rest], 1))
     with tempfile.TemporaryDirectory() as name:
         rows = [measured(suffix, Path(name), workload, file) for suffix in FORMATS]
-    note = f"Measured by `benchmarks/audit_formats.py` on {machine()}, with Spark 2.2.0; glb with Babylon.js 9.28.0."
+    note = f"Measured by `benchmarks/audit_formats.py` on {machine()}, with Spark 2.2.0; glb with Babylon.js 9.35.0."
     write_text(arguments.out / "audit_formats.md", f"{table_of(rows, COLUMNS)}\n\n{note}\n")
     print(table_of(rows, COLUMNS))
 
