@@ -1,7 +1,7 @@
 """What pages repeat, from where it stands: ``python docs/make_pages.py``.
 
 - docs/flags.md, docs/flags_train.md and docs/presets.md, from the configurations.
-- Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote, a table of docs/sentences.py, or, for
+- Between ``<!-- NAME -->`` and ``<!-- end -->``: what benchmarks/NAME.py wrote, a table of docs/page_tables.py, or, for
   ``imports``, the package's imports.
 - Figures in running text: see docs/sentences.py.
 - docs/images/architecture.svg, from the imports.
@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import make_architecture
+import page_tables
 import sentences
 
 from warp_splat.cli import COMMANDS
@@ -46,7 +47,7 @@ def filled(page: Path) -> str:
 
     def table(found: re.Match) -> str:
         name, written = found[1], DOCS / "benchmarks" / f"{found[1]}.md"
-        make = {**sentences.TABLES, "imports": make_architecture.table}.get(name, written.read_text)
+        make = {**page_tables.TABLES, "imports": make_architecture.table}.get(name, written.read_text)
         lines = [line if line.startswith("|") else textwrap.fill(line, 120) for line in make().strip().split("\n")]
         return "\n".join([f"<!-- {name} -->", *lines, "<!-- end -->"])
 
