@@ -116,6 +116,10 @@ WRONG = {
     "expected the number of blocks of": ((0, 1), spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], ')),
     "expected the cells of": ((0, 1), spoil("3.4", "3.1")),
     "expected the antialiasing of": ((0, 1), spoil("antialiasing=False", "antialiasing=True", "cfg_args")),
+    "cfg_args: could not be read (No such file or directory)": (
+        (0, 1),
+        lambda folder: (folder / "1" / "cfg_args").unlink(),
+    ),
     "expected a block as training writes it": ((0, 1), spoil('"number"', '"numbers"')),
     "expected cameras as training writes them": ((0, 1), spoil('"img_name"', '"image"', "cameras.json")),
 }

@@ -72,6 +72,25 @@ def test_a_crop_keeps_what_is_in_the_box(tmp_path, fails):
         assert said in fails("convert", tmp_path / "a.ply", tmp_path / "c.ply", "--crop", *wrong)
 
 
+def test_what_lies_far_away_does_not_hide_what_is_lost(tmp_path, capsys):
+    """A far Gaussian stretches the steps in which a format keeps the others' positions."""
+    before = some_splats()
+    before.means[0] = 1e30
+    save_gaussians(tmp_path / "a.ply", SplatFile(before), silent)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.compressed.ply")]) == 0
+    old, new = (np.sort(load_gaussians(tmp_path / name).splats.means[:, 0]) for name in ("a.ply", "b.compressed.ply"))
+    assert np.abs(old - new)[:-1].max() > 0.1 and "lost: position up to" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("count", [0, 1])
+@pytest.mark.parametrize("options", [["--bound"], ["--crop", *"-9e9 -9e9 -9e9 9e9 9e9 9e9".split()]])
+def test_none_or_one_are_converted(tmp_path, count, options, capsys):
+    before = some_splats(1).take(np.arange(count))
+    save_gaussians(tmp_path / "a.ply", SplatFile(before), silent)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.spz"), *options]) == 0
+    assert ("measured" in capsys.readouterr().out) == (options == ["--bound"])
+
+
 @pytest.mark.parametrize("axes", MIRRORS)
 def test_half_turns_and_back_give_the_same_bytes(axes):
     before = some_splats()

@@ -76,7 +76,7 @@ def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys
         done()
         assert main(["inspect", str(photos)]) == 1
         told = capsys.readouterr()
-        assert "photographs alone" in told.err
+        assert "photographs alone" in told.err and "`warp-splat sfm" in told.err
         assert (f"Cameras of {count} photographs will take about " in told.out) == said
         assert (f"{count * (count - 1) // 2} pairs" in told.out) == said
 
@@ -167,6 +167,8 @@ def two_of_one_stem(path):
         (in_poses(lambda pose: FLIP * pose), ("error", "axes"), "with OpenGL axes"),
         (in_poses(lambda pose: pose.inverse()), ("error", "axes"), "with camera-to-world the"),
         (in_points(9, (1e6, 0, 0)), ("warning", "points"), "9 of 4500"),
+        (in_points(9, (1e38, 0, 0)), ("warning", "points"), "9 of 4500"),  # squares do not fit into 32 bits
+        (in_points(9, (1e300, 0, 0)), ("warning", "points"), "9 of 4500 are not finite in 32 bits"),
         (in_points(900, (0, 0, 40)), ("warning", "unseen points"), "20.0 %"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -253,6 +255,7 @@ def test_no_file_but_a_page_is_written_over(tmp_path, fails):
     photo = tmp_path / "photo.jpg"
     photo.write_text("a photograph")
     assert "ends in .html" in fails("inspect", SCENE, "-o", photo) and photo.read_text() == "a photograph"
+    assert "photo.jpg is a file" in fails("inspect", SCENE, "-o", photo / "page.html")
 
 
 def test_text_of_the_scene_is_not_html(tmp_path, capsys):

@@ -153,6 +153,7 @@ def test_convex_pieces(model, tmp_path):
     ("arguments", "said"),
     [
         (["ball.stl"], "expected a name that ends in .ply, .glb, .obj"),
+        (["pyproject.toml/ball.ply"], "expected a folder that can be written"),
         (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
         (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
         (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen so finely"),

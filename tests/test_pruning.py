@@ -211,6 +211,22 @@ def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, capsys):
     assert loss > -0.51 and len(load_gaussians(tmp_path / "b.ply").splats.means) < len(splats.means)
 
 
+def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, capsys):
+    """Otherwise what lies around the box is missing in all pictures: figures are far lower."""
+    folder, splats = folder
+    low, high = (np.quantile(splats.means, share, axis=0) for share in (0.2, 0.8))
+    found = {}
+    for name, crop in {"whole": (), "box": ("--crop", *map(str, (*low, *high)))}.items():
+        arguments = ["clean", str(folder), "-o", str(tmp_path / "a.ply"), "--device", "cpu", *crop]
+        assert main(arguments) == 0
+        out = capsys.readouterr().out
+        found[name] = [float(line.split("PSNR")[1].split()[0]) for line in out.splitlines() if " PSNR " in line]
+    assert "of 43 views" in out and found["box"] == pytest.approx(found["whole"], abs=2)
+    one = splats.means[0]
+    assert main([*arguments[:-6], *map(str, (*(one - 1e-3), *(one + 1e-3)))]) == 1
+    assert "cover pixels of photographs" in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_simplify_within_a_tolerance(folder, tmp_path, capsys):
     folder, splats = folder
@@ -252,6 +268,7 @@ def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys):
         ("--keep 0.5 --steps -1", "--steps: expected"),
         ("--keep 0.5 -o b.obj", "b.obj: expected a name that ends in"),
         ("--keep 0.5 -o a.ply", "a.ply: expected another file than the model"),
+        ("--keep 0.5 -o a.ply/b.ply", "a.ply: expected a folder that can be written"),
     ],
 )
 def test_simplify_refuses_in_one_sentence(tmp_path, fails, monkeypatch, options, sentence):

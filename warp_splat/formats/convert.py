@@ -12,7 +12,7 @@ from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, pl
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 
-ROUNDING = 1e-6  # smaller changes, as a share of the largest value, are those of float32
+ROUNDING = 1e-6  # smaller changes, as a share of a Gaussian's own size, are those of float32
 
 
 def convert(config: ConvertConfig) -> int:
@@ -53,25 +53,26 @@ def losses(before: SplatFile, after: SplatFile) -> list[str]:
         notes.append("where they are in the world (coordinates.json)")
     if len(old.means) != len(new.means):
         return [*notes, f"{len(old.means) - len(new.means)} of {len(old.means)} Gaussians"]
-    for name, unit, largest, change in _changes(old, new):
-        if change.size and change.max() > ROUNDING * largest:
+    for name, unit, size, change in _changes(old, new):
+        if (change > ROUNDING * size).any():
             notes.append(f"{name} up to {change.max():.2g}{unit} (RMS {np.sqrt(np.mean(change**2)):.2g})")
     return notes
 
 
-def _changes(old: SplatArrays, new: SplatArrays) -> list[tuple[str, str, float, np.ndarray]]:
-    """By quantity: its name, its unit, its largest size, and by how much each number changed."""
+def _changes(old: SplatArrays, new: SplatArrays) -> list[tuple[str, str, float | np.ndarray, np.ndarray]]:
+    """By quantity: its name, its unit, its size (of each Gaussian, [N, 1]), and by how much each number changed."""
     shared = min(old.sh.shape[1], new.sh.shape[1])
-    largest = lambda array: float(np.abs(array).max(initial=0))  # noqa: E731
+    size = lambda array: np.abs(array).max(axis=1, keepdims=True)  # noqa: E731
+    sh, others_sh = (splats.sh[:, :shared].astype(np.float64) for splats in (old, new))
     scales = [np.exp(np.clip(splats.scales.astype(np.float64), *LOG_SCALES)) for splats in (old, new)]
     quats, others = unit_quats(old.quats).astype(np.float64), unit_quats(new.quats).astype(np.float64)
     others = np.where((quats * others).sum(axis=1, keepdims=True) < 0, -others, others)
     halves = np.linalg.norm(quats - others, axis=1), np.linalg.norm(quats + others, axis=1)
     return [
-        ("position", "", largest(old.means), np.abs(old.means.astype(np.float64) - new.means)),
-        ("scale", "", largest(scales[0]), np.abs(scales[0] - scales[1])),
+        ("position", "", size(old.means), np.abs(old.means.astype(np.float64) - new.means)),
+        ("scale", "", size(scales[0]), np.abs(scales[0] - scales[1])),
         ("opacity", "", 1.0, np.abs(sigmoid(old.opacities) - sigmoid(new.opacities))),
-        ("color", "", 1.0, SH_C0 * np.abs(old.sh[:, 0] - new.sh[:, 0])),
-        ("harmonics", "", 1.0, np.abs(old.sh[:, 1:shared] - new.sh[:, 1:shared])),
+        ("color", "", 1.0, SH_C0 * np.abs(sh[:, 0] - others_sh[:, 0])),
+        ("harmonics", "", 1.0, np.abs(sh[:, 1:] - others_sh[:, 1:])),
         ("rotation", " degrees", 360.0, np.degrees(4 * np.arctan2(*halves))),
     ]

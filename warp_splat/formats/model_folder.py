@@ -50,6 +50,17 @@ def check_place(folder: Path) -> None:
         raise InputError(f"{folder}: expected a folder that can be written ({place} {reason}); choose another.")
 
 
+def check_output(path: Path) -> None:
+    """Refuse a file that could not be written, as far as one sees without trying: before the work.
+
+    Raises:
+        InputError: if a folder has its name, or as :func:`check_place` of its folder.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: expected the name of a file to write, found a folder; name a file in it.")
+    check_place(path.parent)
+
+
 def prepare_folder(folder: str | Path) -> Path:
     """Create the model folder and prove that it can be written, before hours of training.
 
@@ -174,7 +185,8 @@ def read_cfg_args(folder: str | Path) -> dict[str, object]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: could not be read ({error}); is {folder} a model folder?") from error
+        reason = getattr(error, "strerror", error)
+        raise InputError(f"{path}: could not be read ({reason}); is {folder} a model folder?") from error
     return _parse_namespace(text, path)
 
 

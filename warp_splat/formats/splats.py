@@ -70,7 +70,7 @@ def cropped(splats: SplatArrays, box: Sequence[float]) -> SplatArrays:
     Raises:
         InputError: if that is no box, or there are none.
     """
-    if not box:
+    if not box or not len(splats.means):
         return splats
     if len(box) != 6 or not np.less(box[:3], box[3:]).all():
         found = " ".join(f"{value:g}" for value in box)

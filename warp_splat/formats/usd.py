@@ -28,6 +28,7 @@ COLORS = "radiance:sphericalHarmonicsCoefficients"
 DEGREE = "radiance:sphericalHarmonicsDegree"
 HINTS = {"projectionModeHint": "perspective", "sortingModeHint": "zDepth"}  # what this renderer does
 MOST_DEGREE = 10  # of harmonics that are read, of which the first 3 are kept
+FINITE = float(np.finfo(np.float32).max)
 REACH = 3  # standard deviations within the extent
 
 
@@ -167,7 +168,7 @@ def _extent(means: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndar
 
     axes = Rotation.from_quat(unit_quats(quats), scalar_first=True).as_matrix() * scales[:, None]
     reach = REACH * np.linalg.norm(axes, axis=2)
-    return np.stack([(means - reach).min(0), (means + reach).max(0)])
+    return np.stack([(means - reach).min(0), (means + reach).max(0)]).clip(-FINITE, FINITE)
 
 
 @contextmanager

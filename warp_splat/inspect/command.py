@@ -7,6 +7,7 @@ from pathlib import Path
 
 from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
+from warp_splat.formats.model_folder import check_output
 from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.page import draw_pictures, write_page
 from warp_splat.inspect.subject import Finding, read_subject
@@ -28,6 +29,7 @@ def inspect(config: InspectConfig) -> int:
     page = Path(config.out or Path("output") / "inspect" / f"{source.resolve().name}.html")
     if page.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"--out {page}: expected the name of a page, which ends in .html; found {page.suffix!r}.")
+    check_output(page)
     if not has_cameras(source):
         if source.is_dir() and not (source / "point_cloud").is_dir():
             time_of_cameras(source, print)

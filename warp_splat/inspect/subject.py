@@ -69,7 +69,8 @@ def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     else:
         subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []
         try:
-            train, test, subject.points, _ = transforms.read_transforms(source, lambda line: None)
+            train, test, points, _ = transforms.read_transforms(source, lambda line: None)
+            subject.points = points.astype(np.float64)
             subject.photos = train + test
         except InputError as error:
             findings.append(Finding("transforms", "error", str(error)))
@@ -101,10 +102,10 @@ def _read_colmap(subject: Subject) -> Iterator[Finding]:
         yield Finding("sub-models", "ok", f"one model, {largest}, with {counts[largest]} registered images.")
     subject.model = models[largest]
     xyz = np.array([point.xyz for point in subject.model.points3D.values()], np.float64).reshape(-1, 3)
-    subject.points = xyz[np.isfinite(xyz).all(axis=1)]
+    subject.points = xyz[(np.abs(xyz) <= np.finfo(np.float32).max).all(axis=1)]
     odd = len(xyz) - len(subject.points)
     if odd:
-        yield Finding("points", "warning", f"{odd} of {len(xyz)} are not finite; training leaves them out.")
+        yield Finding("points", "warning", f"{odd} of {len(xyz)} are not finite in 32 bits; training leaves them out.")
     yield from _match_files(subject)
 
 

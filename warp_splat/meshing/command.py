@@ -17,6 +17,7 @@ from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError
 from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
+from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
 from warp_splat.meshing.fusion import (
     BYTES,
@@ -53,6 +54,7 @@ def mesh(config: MeshConfig) -> int:
     output = Path(config.output)
     if output.suffix.lower() not in ENDINGS:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
+    check_output(output)
     for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):
         if wanted:
             needed(package)

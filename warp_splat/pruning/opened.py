@@ -2,22 +2,27 @@
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from warp_splat.config import FinishedModel
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
-from warp_splat.formats.model_folder import is_file_of_gaussians
+from warp_splat.formats.model_folder import check_output, is_file_of_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
-from warp_splat.scene.types import View
+from warp_splat.scene.types import Decoded, Stored, View
+
+COVERED = 0.9  # of a pixel's light, from which on Gaussians of a crop explain it
 
 
 class Opened(Finished):
@@ -38,7 +43,23 @@ class Opened(Finished):
         self.scene = self.refined(self.load_scene(config.source_path, print))
         if self.harmonics is not None:
             print(f"What {self.path} has learned behind its Gaussians stays. A file of Gaussians does not have it.")
+        if config.crop:
+            train, test = (self._within(views, used) for views in (self.scene.train, self.scene.test))
+            if not train:
+                raise InputError("--crop: expected Gaussians that cover pixels of photographs, found none; enlarge it.")
+            print(f"Only what the Gaussians in the box cover counts, in {len(train)} of {len(self.scene.train)} views.")
+            self.scene = replace(self.scene, train=train, test=test)
         self.setting = ViewSetting(self.scene.train, self.options, self.background(used))
+
+    def _within(self, views: list[View], device: torch.device) -> list[View]:
+        """The views, of which only counts what Gaussians cover: photographs show what a crop left out, too."""
+        draw, found = self.renderer(GaussianModel.from_splats(self.file.splats).to(device)), []
+        for view in views:
+            cover = (draw(view.camera).alpha > COVERED).cpu().numpy()
+            if _masked(view, cover).mask.any():
+                read = partial(_masked, view, cover)
+                found.append(replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True)))
+        return found
 
     def picture_of(self, splats: SplatArrays) -> Callable[..., np.ndarray]:
         """A function from a camera, and whose photograph's exposure it has, to what ``splats`` look like: uint8."""
@@ -55,6 +76,12 @@ class Opened(Finished):
         return {name: self.psnr(splats, some) for name, some in views.items() if some}
 
 
+def _masked(view: View, cover: np.ndarray) -> Decoded:
+    """A photograph that counts only where ``cover`` [H, W] says so."""
+    pixels = view.pixels
+    return pixels._replace(mask=(cover if pixels.mask is None else cover & (pixels.mask > 0)).astype(np.uint8))
+
+
 def require_some(finished: Finished) -> None:
     """Raise InputError if there are no Gaussians in a model."""
     if not len(finished.file.splats.means):
@@ -65,13 +92,14 @@ def output_of(model: str, output: str, name: str) -> Path:
     """The file to write: ``output``, or one called ``name`` in the model's folder.
 
     Raises:
-        InputError: if its ending is unknown, or it is the model itself.
+        InputError: if its ending is unknown, it is the model itself, or it could not be written.
     """
     source = Path(model)
     path = Path(output) if output else (source.parent if is_file_of_gaussians(source) else source) / name
     format_of(path)
     if path.exists() and source.exists() and path.samefile(source):
         raise InputError(f"{path}: expected another file than the model; name a new one with -o.")
+    check_output(path)
     return path
 
 

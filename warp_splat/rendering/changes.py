@@ -49,9 +49,10 @@ def convert_and_compare(config: ConvertConfig) -> int:
         launch.prepare("cpu", 0)
         finished = Finished(config.source, crop=config.crop)
         splats = (finished.file.splats, load_gaussians(config.target).splats)
-        means = np.asarray(splats[0].means, np.float64)
+        means = np.asarray(splats[0].means if len(splats[0].means) else [[0, 0, 0]], np.float64)
         middle = np.median(means, axis=0)
-        radius = DISTANCE * np.quantile(np.linalg.norm(means - middle, axis=1), 0.75) + 1e-6
+        reach = np.quantile(np.linalg.norm(means - middle, axis=1), 0.75)
+        radius = DISTANCE * reach + 1e-6 * (1 + np.abs(middle).max())
         start, up = middle - [0.0, 0.0, radius], np.array([0.0, -1.0, 0.0])
         cameras = orbit_cameras(
             middle, up, start, AROUND, ORBIT_LENS.resized(ORBIT_LENS.width // 3, ORBIT_LENS.height // 3)

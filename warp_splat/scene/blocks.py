@@ -18,7 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates, write_coordinates
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.files import Unexpected, reading, whole_number, write_json
-from warp_splat.formats.model_folder import CAMERAS, open_model, ply_path, write_cfg_args
+from warp_splat.formats.model_folder import CAMERAS, open_model, ply_path, read_cfg_args, write_cfg_args
 from warp_splat.formats.ply import load_points, save_points
 from warp_splat.formats.splats import concatenated
 from warp_splat.scene.types import visible
@@ -117,9 +117,9 @@ def merge_blocks(config: MergeConfig) -> int:
     if (folder / LAST).exists() or not places:
         found = "a training" if places else "none"
         raise InputError(f"{folder}: expected only folders of ended trainings by --block, found {found}.")
-    blocks, models = [_read_block(place / BLOCK) for place in places], [open_model(place) for place in places]
-    kinds = []
-    for block, (_, _, options) in zip(blocks, models, strict=True):
+    blocks, models = [_read_block(place / BLOCK) for place in places], [open_model(place)[:2] for place in places]
+    trained, kinds = [read_cfg_args(place) for place in places], []
+    for block, options in zip(blocks, trained, strict=True):
         cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist()}
         kinds.append({**cells, **{name: options.get(name) for name in COMMON}})
     for place, kind in zip(places, kinds, strict=True):
@@ -130,9 +130,9 @@ def merge_blocks(config: MergeConfig) -> int:
     wrong = [f"{numbers.count(n)} of block {n + 1}/{count}" for n in range(count) if numbers.count(n) != 1]
     if wrong:
         raise InputError(f"{folder}: expected one ended training of each block, found {', '.join(wrong)}.")
-    path = ply_path(folder, max(iteration for iteration, _, _ in models))
+    path = ply_path(folder, max(iteration for iteration, _ in models))
     splats, points, colors, cameras = [], [], [], {}
-    for place, block, (_, file, _) in zip(places, blocks, models, strict=True):
+    for place, block, (_, file) in zip(places, blocks, models, strict=True):
         splats.append(file.splats.take(block.holds(file.splats.means)))
         cloud = load_points(place / "input.ply")
         own = block.holds(cloud[0])
@@ -151,6 +151,6 @@ def merge_blocks(config: MergeConfig) -> int:
     save_points(folder / "input.ply", np.concatenate(points), np.concatenate(colors))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))
-    write_cfg_args(folder, {**models[0][2], "block": "", "model_path": str(folder)})
+    write_cfg_args(folder, {**trained[0], "block": "", "model_path": str(folder)})
     print(f"{path}: {len(merged.splats.means)} Gaussians of {count} blocks")
     return 0

@@ -187,7 +187,8 @@ RECORD_ENDS = {
 
 def _points(model: pycolmap.Reconstruction, report: Report) -> tuple[np.ndarray, np.ndarray]:
     records = [point for _, point in sorted(model.points3D.items(), key=lambda item: item[0])]
-    points = np.array([point.xyz for point in records], np.float32).reshape(-1, 3)
+    with np.errstate(over="ignore"):  # becomes infinite, and is dropped
+        points = np.array([point.xyz for point in records], np.float32).reshape(-1, 3)
     colors = np.array([point.color for point in records], np.uint8).reshape(-1, 3)
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():

@@ -48,7 +48,7 @@ def scene_of(source: Path) -> Path:
 def sfm_hint(source: Path) -> str:
     """The end of a sentence on ``source`` without cameras: the command that computes them."""
     command = shlex.join(["warp-splat", "sfm", str(source), str(scene_of(source))])
-    return f"compute the cameras with `{command}` and train on the new folder, or add --sfm, which does both."
+    return f"compute the cameras with `{command}` and train on the new folder; `warp-splat train --sfm` does both."
 
 
 class ImageFinder:
