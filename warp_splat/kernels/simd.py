@@ -21,6 +21,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY, PORTABLE
+from warp_splat.kernels.inline import defined
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -84,7 +85,26 @@ def _vectors(result: str, adjoint: str = ";", kind: str = "float") -> tuple[str,
     return f"{_VECTORS} wp::vec_t<{LANES}, {kind}> r; ({name}&)r = {forward}; return r;", _VECTORS + reverse
 
 
-@wp.func
+def in_lanes(result: str, adjoint: str = ";", kind: str = "float") -> Callable[[Callable], wp.Function]:
+    """A decorator: wp.func of a function of single numbers, with an overload for lanes of all but a ``value``.
+
+    Args:
+        result: that of the overload, in C++: see :func:`_vectors`.
+        adjoint: what its adjoint does.
+        kind: of the numbers that come out: float, int, or a bool for all lanes.
+    """
+    lanes = {"float": "vec16", "int": "vec16i", "bool": "bool"}
+
+    def decorate(function: Callable) -> wp.Function:
+        name, types = function.__name__, {each: number.__name__ for each, number in function.__annotations__.items()}
+        given = [f"{each}: {types[each] if each == 'value' else lanes[types[each]]}" for each in types]
+        source = f"@wp.func_native(*code)\ndef {name}({', '.join(given)}) -> {lanes[kind]}: ..."
+        return defined(name, source, {**globals(), "code": _vectors(result, adjoint, kind), name: wp.func(function)})
+
+    return decorate
+
+
+@in_lanes("V{} + value")
 def fill(value: float, like: float):
     """``value`` in every lane of a variable shaped as ``like``; a constant, without a gradient."""
     return value
@@ -95,11 +115,13 @@ def adj_fill(value: float, like: float, adj_ret: float):
     pass
 
 
-@wp.func_native(*_vectors("V{} + value"))
-def fill(value: float, like: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes(
+    "V{} + value",
+    "V sums = adj_ret * 0.0f == V{} ? adj_ret : V{}; "
+    f"for (int half = {LANES // 2}; half; half /= 2) "
+    "for (int lane = 0; lane < half; lane++) sums[lane] += sums[lane + half]; "
+    "adj_value += sums[0];",
+)
 def everywhere(value: float, like: float):
     """``value`` in every lane, which gets the sum of the lanes' gradients that are finite, in pairs."""
     return value
@@ -110,25 +132,9 @@ def adj_everywhere(value: float, like: float, adj_ret: float):
     wp.adjoint[value] += wp.where(adj_ret * 0.0 == 0.0, adj_ret, 0.0)
 
 
-@wp.func_native(
-    *_vectors(
-        "V{} + value",
-        "V sums = adj_ret * 0.0f == V{} ? adj_ret : V{}; "
-        f"for (int half = {LANES // 2}; half; half /= 2) "
-        "for (int lane = 0; lane < half; lane++) sums[lane] += sums[lane + half]; "
-        "adj_value += sums[0];",
-    )
-)
-def everywhere(value: float, like: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("a * b", "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b);")
 def times(a: float, b: float):
     return a * b
-
-
-@wp.func_native(*_vectors("a * b", "adj_a = fused(b, adj_ret, adj_a); adj_b = fused(a, adj_ret, adj_b);"))
-def times(a: vec16, b: vec16) -> vec16: ...
 
 
 @wp.func
@@ -167,16 +173,12 @@ def negative(x: vec16):
     return -x
 
 
-@wp.func
+@in_lanes("a / b", "V q = adj_ret / b; adj_a += q; adj_b = fused(-(a / b), q, adj_b);")
 def over(a: float, b: float):
     return a / b
 
 
-@wp.func_native(*_vectors("a / b", "V q = adj_ret / b; adj_a += q; adj_b = fused(-(a / b), q, adj_b);"))
-def over(a: vec16, b: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("1.0f / x", "V r = 1.0f / x; adj_x -= adj_ret * r * r;")
 def inverse(x: float):
     """1 / x."""
     return 1.0 / x
@@ -188,11 +190,7 @@ def adj_inverse(x: float, adj_ret: float):
     wp.adjoint[x] -= adj_ret * r * r
 
 
-@wp.func_native(*_vectors("1.0f / x", "V r = 1.0f / x; adj_x -= adj_ret * r * r;"))
-def inverse(x: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("__builtin_elementwise_sqrt(x)", "adj_x += adj_ret / (__builtin_elementwise_sqrt(x) * 2.0f);")
 def root(x: float):
     """Square root."""
     return wp.sqrt(x)
@@ -203,55 +201,31 @@ def adj_root(x: float, adj_ret: float):
     wp.adjoint[x] += adj_ret / (root(x) * 2.0)
 
 
-@wp.func_native(
-    *_vectors("__builtin_elementwise_sqrt(x)", "adj_x += adj_ret / (__builtin_elementwise_sqrt(x) * 2.0f);")
-)
-def root(x: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("a < b ? V{} + 1.0f : V{}")
 def less(a: float, b: float):
     """Mask: a < b."""
     return wp.where(a < b, 1.0, 0.0)
 
 
-@wp.func_native(*_vectors("a < b ? V{} + 1.0f : V{}"))
-def less(a: vec16, b: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("a == b ? V{} + 1.0f : V{}")
 def equal(a: float, b: float):
     """Mask: a == b."""
     return wp.where(a == b, 1.0, 0.0)
 
 
-@wp.func_native(*_vectors("a == b ? V{} + 1.0f : V{}"))
-def equal(a: vec16, b: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("__builtin_reduce_or((I)(mask > 0.0f)) != 0", kind="bool")
 def some(mask: float):
     """Whether a mask is set in any lane."""
     return mask > 0.0
 
 
-@wp.func_native(*_vectors("__builtin_reduce_or((I)(mask > 0.0f)) != 0", kind="bool"))
-def some(mask: vec16) -> bool: ...
-
-
-@wp.func
+@in_lanes("mask > 0.0f ? a : b", "adj_a += mask > 0.0f ? adj_ret : V{}; adj_b += mask > 0.0f ? V{} : adj_ret;")
 def pick(mask: float, a: float, b: float):
     """``a`` where a mask is set, else ``b``."""
     return wp.where(mask > 0.0, a, b)
 
 
-@wp.func_native(
-    *_vectors("mask > 0.0f ? a : b", "adj_a += mask > 0.0f ? adj_ret : V{}; adj_b += mask > 0.0f ? V{} : adj_ret;")
-)
-def pick(mask: vec16, a: vec16, b: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("a < b ? x : y", "adj_x += a < b ? adj_ret : V{}; adj_y += a < b ? V{} : adj_ret;")
 def where_less(a: float, b: float, x: float, y: float):
     """``x`` where ``a < b``, else ``y``: compared and picked at once, for kernels that keep no mask."""
     if a < b:  # not wp.where, which cannot be called from Python
@@ -259,59 +233,35 @@ def where_less(a: float, b: float, x: float, y: float):
     return y
 
 
-@wp.func_native(*_vectors("a < b ? x : y", "adj_x += a < b ? adj_ret : V{}; adj_y += a < b ? V{} : adj_ret;"))
-def where_less(a: vec16, b: vec16, x: vec16, y: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("__builtin_convertvector(x, I)", kind="int")
 def whole(x: float):
     """To an integer, towards 0."""
     return int(x)
 
 
-@wp.func_native(*_vectors("__builtin_convertvector(x, I)", kind="int"))
-def whole(x: vec16) -> vec16i: ...
-
-
-@wp.func
+@in_lanes("__builtin_convertvector(n, V)")
 def real(n: int):
     """From an integer."""
     return float(n)
 
 
-@wp.func_native(*_vectors("__builtin_convertvector(n, V)"))
-def real(n: vec16i) -> vec16: ...
-
-
-@wp.func
+@in_lanes("__builtin_elementwise_ceil(x)")
 def rounded_up(x: float):
     return wp.ceil(x)
 
 
-@wp.func_native(*_vectors("__builtin_elementwise_ceil(x)"))
-def rounded_up(x: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("__builtin_elementwise_floor(x)")
 def rounded_down(x: float):
     return wp.floor(x)
 
 
-@wp.func_native(*_vectors("__builtin_elementwise_floor(x)"))
-def rounded_down(x: vec16) -> vec16: ...
-
-
-@wp.func
+@in_lanes("x - __builtin_convertvector(n, V)", "adj_x += adj_ret;")
 def fraction(x: float, n: int):
     """``x`` without its whole part ``n``."""
     return x - float(n)
 
 
-@wp.func_native(*_vectors("x - __builtin_convertvector(n, V)", "adj_x += adj_ret;"))
-def fraction(x: vec16, n: vec16i) -> vec16: ...
-
-
-@wp.func
+@in_lanes("(V)((I)x - (n << 23))", "adj_x += adj_ret * (V)((127 - n) << 23);")
 def halved(x: float, n: int):
     """``x`` times 2^-n by the exponent's bits; neither x nor the result may be denormal."""
     return wp.cast(wp.cast(x, int) - (n << 23), float)
@@ -320,10 +270,6 @@ def halved(x: float, n: int):
 @wp.func_grad(halved)
 def adj_halved(x: float, n: int, adj_ret: float):
     wp.adjoint[x] += adj_ret * halved(1.0, n)
-
-
-@wp.func_native(*_vectors("(V)((I)x - (n << 23))", "adj_x += adj_ret * (V)((127 - n) << 23);"))
-def halved(x: vec16, n: vec16i) -> vec16: ...
 
 
 @wp.func
