@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.files import Unexpected, reading, write_json
+from warp_splat.formats.files import Unexpected, read_json, write_json
 
 FILE = "coordinates.json"
 KEPT = ("origin", "axes", "reference")  # of it, in files of Gaussians
@@ -27,10 +27,7 @@ def read_coordinates(folder: str | Path) -> dict | None:
         InputError: if it has no origin of three finite numbers.
     """
     path = Path(folder) / FILE
-    if not path.is_file():
-        return None
-    with reading(path, "coordinates as `warp-splat sfm` writes them"):
-        return checked(json.loads(path.read_text(encoding="utf-8")))
+    return read_json(path, "coordinates as `warp-splat sfm` writes them", checked) if path.is_file() else None
 
 
 def write_coordinates(folder: str | Path, coordinates: dict | None) -> None:

@@ -8,15 +8,16 @@ import errno
 import json
 import os
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from warp_splat.errors import InputError
 
+T = TypeVar("T")
 FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -133,6 +134,19 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
     except (ValueError, OverflowError, RecursionError) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else f"{error!s:.200}"
         raise InputError(f"{path}: the file is damaged or cut short ({reason}); copy or save it again.") from error
+
+
+def read_json(path: Path, expected: str, parse: Callable[[Any], T]) -> T:
+    """What ``parse`` makes of the JSON of a file.
+
+    Raises:
+        InputError: if there is no such file, it is damaged, or ``parse`` finds something else than ``expected``.
+    """
+    with reading(path, expected):
+        try:
+            return parse(json.loads(path.read_text(encoding="utf-8")))
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise Unexpected(f"other JSON ({error!s:.100})") from error
 
 
 def check_expansion(count: int, bytes_each: int, file_bytes: int) -> None:

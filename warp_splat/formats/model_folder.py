@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import FORMATS, load_gaussians
-from warp_splat.formats.files import Unexpected, reading, write_text
+from warp_splat.formats.files import T, Unexpected, read_json, write_text
 from warp_splat.formats.splats import SplatFile, cropped
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter
@@ -28,7 +28,6 @@ from warp_splat.lenses.shutter import Shutter
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
 
-T = TypeVar("T")
 CAMERAS = "cameras.json"
 ENVIRONMENT = "environment.json"
 
@@ -247,7 +246,8 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
         except InputError as error:
             raise Unexpected(f"a camera with other values ({error!s:.200})") from error
 
-    return _read_json(Path(folder) / CAMERAS, "a list of cameras as training writes it", parse) or []
+    path = Path(folder) / CAMERAS
+    return read_json(path, "a list of cameras as training writes it", parse) if path.exists() else []
 
 
 def read_refined(folder: str | Path, iteration: int) -> dict[str, Camera]:
@@ -302,18 +302,8 @@ def read_beside(path: str | Path, iteration: int, name: str, expected: str, pars
     Raises:
         InputError: if the file is damaged, or another than ``expected``.
     """
-    beside = Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
-    return _read_json(beside.parent / name, expected, parse)
-
-
-def _read_json(path: Path, expected: str, parse: Callable[[Any], T]) -> T | None:
-    if not path.exists():
-        return None
-    with reading(path, expected):
-        try:
-            return parse(json.loads(path.read_text(encoding="utf-8")))
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise Unexpected(f"other JSON ({error!s:.100})") from error
+    beside = (Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)).parent / name
+    return read_json(beside, expected, parse) if beside.exists() else None
 
 
 def _camera(entry: dict) -> Camera:

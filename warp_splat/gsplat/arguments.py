@@ -9,8 +9,8 @@ import torch
 
 from warp_splat.config import CHANNELS_MOST
 from warp_splat.errors import InputError
-from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_opacities, is_one_of
-from warp_splat.raster.drivers import DRIVERS, driver_of
+from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_opacities, check_tensor, is_one_of
+from warp_splat.raster.drivers import driver_of
 
 CHOICES = {
     "render_mode": ("RGB", "D", "ED", "RGB+D", "RGB+ED"),
@@ -152,12 +152,7 @@ def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device:
     if not isinstance(tensor, torch.Tensor) or (shape is not None and tuple(tensor.shape) != shape):
         wanted = "a tensor" if shape is None else f"a tensor {list(shape)}"
         raise InputError(f"{name}: expected {wanted}, got {_found(tensor)}.")
-    if tensor.layout != torch.strided:
-        raise InputError(f"{name}: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
-    if tensor.dtype != torch.float32:
-        raise InputError(f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}.")
-    if tensor.device != device or device.type not in DRIVERS:
-        raise InputError(f"{name}: expected a tensor on one CPU or NVIDIA GPU with the means, got {tensor.device}.")
+    check_tensor(name, tensor, tuple(tensor.shape), device)
     if not bool(tensor.detach().isfinite().all()):
         raise InputError(f"{name}: expected finite numbers, got some that are not.")
 

@@ -100,7 +100,7 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
 def check_hidden_from(options: RasterOptions, camera: Camera, device: torch.device) -> None:
     """Raise InputError if the surface that hides is not one depth for each pixel of ``camera``, or beside a bound."""
     if options.hidden_from is not None:
-        _check_tensor("options.hidden_from", options.hidden_from, (camera.height, camera.width), device)
+        check_tensor("options.hidden_from", options.hidden_from, (camera.height, camera.width), device)
         if options.bound or options.tolerance is not None:
             raise InputError("options.hidden_from: expected neither bound nor tolerance beside it; leave one out.")
 
@@ -127,17 +127,17 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
     Raises:
         InputError: naming the first argument whose type, shape, dtype, device or range is not as it should be.
     """
-    _check_tensor("means", means, ("N", 3), None)
+    check_tensor("means", means, ("N", 3), None)
     count, device = means.shape[0], means.device
-    _check_tensor("quats", quats, (count, 4), device)
-    _check_tensor("scales", scales, (count, 3), device)
-    _check_tensor("opacities", opacities, (count,), device)
+    check_tensor("quats", quats, (count, 4), device)
+    check_tensor("scales", scales, (count, 3), device)
+    check_tensor("opacities", opacities, (count,), device)
     if isinstance(sh, (tuple, list)) and len(sh) == 2:
         sh_dc, sh_rest = sh
-        _check_tensor("sh[0]", sh_dc, (count, 1, 3), device)
-        _check_tensor("sh[1]", sh_rest, (count, "K - 1", 3), device)
+        check_tensor("sh[0]", sh_dc, (count, 1, 3), device)
+        check_tensor("sh[1]", sh_rest, (count, "K - 1", 3), device)
     else:
-        _check_tensor("sh", sh, (count, "K", 3), device)
+        check_tensor("sh", sh, (count, "K", 3), device)
         sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
     if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
         raise InputError(
@@ -153,13 +153,14 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
 
 def check_features(features: torch.Tensor, means: torch.Tensor) -> None:
     """Raise InputError if ``features`` are not a number of finite channels for each of ``means``."""
-    _check_tensor("features", features, (means.shape[0], "C"), means.device)
+    check_tensor("features", features, (means.shape[0], "C"), means.device)
     if not 1 <= features.shape[1] <= config.CHANNELS_MOST:
         raise InputError(f"features: expected 1 to {config.CHANNELS_MOST} channels, got {features.shape[1]}.")
     _check_finite("features", features.detach())
 
 
-def _check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.device | None) -> None:
+def check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.device | None) -> None:
+    """Raise InputError if ``tensor`` is no dense float32 of a shape and device; None: of any with a driver."""
     wanted = f"[{', '.join(map(str, shape))}]"
     if not isinstance(tensor, torch.Tensor):
         raise InputError(f"{name}: expected a float32 torch tensor {wanted}, got {type(tensor).__name__}.")

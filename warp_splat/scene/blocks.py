@@ -5,7 +5,6 @@ photographs that show its cell. It starts from points beyond, too: what they sho
 where it is, not by floaters before it.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from warp_splat.config import MergeConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates, write_coordinates
 from warp_splat.formats.exchange import save_gaussians
-from warp_splat.formats.files import Unexpected, reading, whole_number, write_json
+from warp_splat.formats.files import read_json, whole_number, write_json
 from warp_splat.formats.model_folder import CAMERAS, open_model, ply_path, read_cfg_args, write_cfg_args
 from warp_splat.formats.ply import load_points, save_points
 from warp_splat.formats.splats import concatenated
@@ -91,14 +90,9 @@ def write_block(folder: Path, block: Block) -> None:
     write_json(folder / BLOCK, {"number": block.number, "cells": block.cells.tolist()})
 
 
-def _read_block(path: Path) -> Block:
-    with reading(path, "a block as training writes it"):
-        try:
-            facts = json.loads(path.read_text(encoding="utf-8"))
-            cells = np.array(facts["cells"], np.float64).reshape(-1, 2, 3)
-            return Block(whole_number(facts["number"], "block", len(cells) - 1), cells)
-        except (KeyError, TypeError) as error:
-            raise Unexpected("other JSON") from error
+def _block_of_json(facts: dict) -> Block:
+    cells = np.array(facts["cells"], np.float64).reshape(-1, 2, 3)
+    return Block(whole_number(facts["number"], "block", len(cells) - 1), cells)
 
 
 def merge_blocks(config: MergeConfig) -> int:
@@ -117,7 +111,8 @@ def merge_blocks(config: MergeConfig) -> int:
     if (folder / LAST).exists() or not places:
         found = "a training" if places else "none"
         raise InputError(f"{folder}: expected only folders of ended trainings by --block, found {found}.")
-    blocks, models = [_read_block(place / BLOCK) for place in places], [open_model(place)[:2] for place in places]
+    blocks = [read_json(place / BLOCK, "a block as training writes it", _block_of_json) for place in places]
+    models = [open_model(place)[:2] for place in places]
     trained, kinds = [read_cfg_args(place) for place in places], []
     for block, options in zip(blocks, trained, strict=True):
         cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist()}
@@ -138,12 +133,8 @@ def merge_blocks(config: MergeConfig) -> int:
         own = block.holds(cloud[0])
         points.append(cloud[0][own])
         colors.append(cloud[1][own])
-        with reading(place / CAMERAS, "cameras as training writes them"):
-            found = json.loads((place / CAMERAS).read_text(encoding="utf-8"))
-            try:
-                cameras |= {str(entry["img_name"]): entry for entry in found}
-            except (KeyError, TypeError) as error:
-                raise Unexpected("other JSON") from error
+        named = lambda entries: {str(entry["img_name"]): entry for entry in entries}  # noqa: E731
+        cameras |= read_json(place / CAMERAS, "cameras as training writes them", named)
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)))
     save_gaussians(path, merged)
     for old in {*folder.glob("point_cloud/*/point_cloud.ply")} - {path}:  # merged before, from blocks of other lengths

@@ -9,19 +9,8 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.bound import (
-    BoundView,
-    Since,
-    all_cuts,
-    all_rounding,
-    light_behind,
-    next_map,
-    outside_of,
-    own_light,
-    rounding_of,
-    watch,
-    with_rest,
-)
+from warp_splat.kernels import bound as bounds
+from warp_splat.kernels.bound import BoundView, Since
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import LANES, fma, times, vec16, where_less
 from warp_splat.kernels.splat import Splat2D
@@ -67,10 +56,12 @@ def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
                 gained = wp.max(gained, now - s[SEEN + channel * BLOCKS + block])
                 light = wp.max(light, now)
                 s[SEEN + channel * BLOCKS + block] = now
-            s[TAKEN + block] = light_behind(s[TOTAL + block], gained, s[TAKEN + block])
-            s[ROUNDING + block] = s[ROUNDING + block] + rounding_of(s[BEFORE + block], t, light, since, bound.brightest)
-            outside = vec16(outside_of(bound, begin, end, tile, tiles_x, block))
-            s[ADDED + block] = own_light(t, outside, bound.usual, s[ADDED + block])
+            s[TAKEN + block] = bounds.light_behind(s[TOTAL + block], gained, s[TAKEN + block])
+            s[ROUNDING + block] = s[ROUNDING + block] + bounds.rounding_of(
+                s[BEFORE + block], t, light, since, bound.brightest
+            )
+            outside = vec16(bounds.outside_of(bound, begin, end, tile, tiles_x, block))
+            s[ADDED + block] = bounds.own_light(t, outside, bound.usual, s[ADDED + block])
             s[TOTAL + block] = s[TOTAL + block] + outside
             s[BEFORE + block] = t
             block += 1
@@ -93,10 +84,10 @@ def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
             return
         count = wp.min(ahead, start + length - k)
         since = memory(s)
-        end = next_map(bound, since[0].map, near[count - 1].depth)
+        end = bounds.next_map(bound, since[0].map, near[count - 1].depth)
         if end > since[0].map:
             since[0] = settle(s, bound, since[0], tile, bins.tiles_x, end)
-        since[0] = watch(bound, since[0], bins, k, count)
+        since[0] = bounds.watch(bound, since[0], bins, k, count)
 
     @wp.func
     def conclude(
@@ -115,14 +106,14 @@ def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
             through = t - wp.max(s[block], -s[block])
             stopped = where_less(s[block], vec16(0.0), t, times(t, wp.where(cut, 1.0, 0.0)))
             last = wp.max(times(stopped, bound.brightest), times(t, bound.behind))
-            taken = light_behind(s[TOTAL + block], last, s[TAKEN + block])
+            taken = bounds.light_behind(s[TOTAL + block], last, s[TAKEN + block])
             cuts = vec16(0.0)
             for channel in range(3):
                 row = channel * BLOCKS + block
                 change = fma(through, background[channel], s[LIGHT + row] - s[rgb + row])
-                cuts = all_cuts(change, taken, s[ADDED + block], cuts)
-            rounding = all_rounding(s[ROUNDING + block], bound)
-            found = with_rest(cuts, stopped, bound) + rounding
+                cuts = bounds.all_cuts(change, taken, s[ADDED + block], cuts)
+            rounding = bounds.all_rounding(s[ROUNDING + block], bound)
+            found = bounds.with_rest(cuts, stopped, bound) + rounding
             for lane in range(LANES):
                 y = top + 4 * (block >> 2) + lane // 4
                 x = left + 4 * (block & 3) + lane % 4

@@ -3,22 +3,8 @@
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.bound import (
-    BoundView,
-    Since,
-    all_cuts,
-    all_rounding,
-    brightness,
-    light_behind,
-    next_map,
-    outside_of,
-    own_light,
-    rounding_of,
-    sure,
-    unsure,
-    watch,
-    with_rest,
-)
+from warp_splat.kernels import bound as bounds
+from warp_splat.kernels.bound import BoundView, Since
 from warp_splat.kernels.cuda.warps import across_of, down_of
 from warp_splat.kernels.simd import where_less
 from warp_splat.kernels.structs import BinsView
@@ -41,10 +27,10 @@ def settle(m: mat_settled, p: int, bound: BoundView, since: Since, end: int, til
         gained = wp.max(gained, now - m[SEEN + channel, p])
         light = wp.max(light, now)
         m[SEEN + channel, p] = now
-    m[TAKEN, p] = light_behind(m[TOTAL, p], gained, m[TAKEN, p])
-    m[ROUNDING, p] = m[ROUNDING, p] + rounding_of(m[BEFORE, p], t, light, since, bound.brightest)
-    outside = outside_of(bound, since.map, end, tile, tiles_x, block)
-    m[ADDED, p] = own_light(t, outside, bound.usual, m[ADDED, p])
+    m[TAKEN, p] = bounds.light_behind(m[TOTAL, p], gained, m[TAKEN, p])
+    m[ROUNDING, p] = m[ROUNDING, p] + bounds.rounding_of(m[BEFORE, p], t, light, since, bound.brightest)
+    outside = bounds.outside_of(bound, since.map, end, tile, tiles_x, block)
+    m[ADDED, p] = bounds.own_light(t, outside, bound.usual, m[ADDED, p])
     m[TOTAL, p] = m[TOTAL, p] + outside
     m[BEFORE, p] = t
     return m
@@ -71,24 +57,24 @@ def expect(
     m: mat_settled, bound: BoundView, since: Since, bins: BinsView, tile: int, lane: int, half: int, k: int, count: int
 ):  # fmt: skip
     """Before ``count`` entries from ``k`` on: the sums, and what there is since they were settled."""
-    end = next_map(bound, since.map, bins.splats[bins.instances[k + count - 1]].depth)
+    end = bounds.next_map(bound, since.map, bins.splats[bins.instances[k + count - 1]].depth)
     if end > since.map:
         for p in range(EACH):
             m = settle(m, p, bound, since, end, tile, bins.tiles_x, block_at(lane, half + p))
         since = Since()
         since.map = end
-    return m, watch(bound, since, bins, k, count)
+    return m, bounds.watch(bound, since, bins, k, count)
 
 
 @wp.func
 def blend_ideal(m: mat_settled, p: int, raw: float, alphas: wp.vec2, color: wp.vec3, bound: BoundView):
     """With one more Gaussian of the ideal."""
-    weight = sure(raw, alphas, bound) * m[T, p]
+    weight = bounds.sure(raw, alphas, bound) * m[T, p]
     for channel in range(3):
         m[LIGHT + channel, p] += weight * color[channel]
-    may = unsure(raw, bound)
+    may = bounds.unsure(raw, bound)
     m[TOTAL, p] += may
-    m[ADDED, p] = own_light(m[T, p], may * brightness(color, bound.usual), bound.usual, m[ADDED, p])
+    m[ADDED, p] = bounds.own_light(m[T, p], may * bounds.brightness(color, bound.usual), bound.usual, m[ADDED, p])
     m[T, p] -= weight
     return m
 
@@ -102,14 +88,14 @@ def conclude(
     m = settle(m, p, bound, since, bound.begins.shape[0], tile, bins.tiles_x, block_at(lane, half + p))
     t = m[T, p]
     stopped = where_less(final, 0.0, t, wp.where(bins.ranges[tile][1] - bins.ranges[tile][0] > length, t, 0.0))
-    taken = light_behind(m[TOTAL, p], wp.max(stopped * bound.brightest, t * bound.behind), m[TAKEN, p])
+    taken = bounds.light_behind(m[TOTAL, p], wp.max(stopped * bound.brightest, t * bound.behind), m[TAKEN, p])
     cuts = float(0.0)
     for channel in range(3):
         change = (t - wp.abs(final)) * background[channel] + m[LIGHT + channel, p] - sums[channel]
-        cuts = all_cuts(change, taken, m[ADDED, p], cuts)
-    rounding = all_rounding(m[ROUNDING, p], bound)
+        cuts = bounds.all_cuts(change, taken, m[ADDED, p], cuts)
+    rounding = bounds.all_rounding(m[ROUNDING, p], bound)
     y = (tile // bins.tiles_x) * TILE + down_of(lane, half + p)
     x = (tile % bins.tiles_x) * TILE + across_of(lane, half + p)
     if y < bound.bound_out.shape[0] and x < bound.bound_out.shape[1]:
-        bound.bound_out[y, x] = with_rest(cuts, stopped, bound) + rounding
+        bound.bound_out[y, x] = bounds.with_rest(cuts, stopped, bound) + rounding
         bound.rounding_out[y, x] = rounding
