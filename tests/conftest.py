@@ -23,6 +23,7 @@ from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.sh_colors import make_adj_shade
 from warp_splat.kernels.simd import LANES
 from warp_splat.raster.data import falloff_of, variant_of
+from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import projection_of
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
@@ -68,12 +69,34 @@ def device(request) -> str:
     return request.param
 
 
+@pytest.fixture(params=[CPU, CUDA], ids=["lanes", "fibers"])
+def driver(request):
+    """That of the CPU, then that of a GPU, whose kernels run in fibers: what renders meanwhile."""
+    with using(request.param):
+        yield request.param
+
+
 @pytest.fixture
 def threads():
     """Sets the number of threads; afterwards it is as before."""
     before = get_threads()
     yield set_threads
     set_threads(before)
+
+
+@pytest.fixture
+def same_by_threads(threads):
+    """Checks that a function returns the same bits on one, two and three threads; and what that is."""
+
+    def check(run):
+        found = []
+        for count in (1, 2, 3):
+            threads(count)
+            found.append([torch.as_tensor(array) for array in run()])
+        assert all(map(torch.equal, found[0], found[1])) and all(map(torch.equal, found[0], found[2]))
+        return found[0]
+
+    return check
 
 
 @pytest.fixture

@@ -45,12 +45,12 @@ def one_sentence(error, path, most=600):
     return message
 
 
-def refusal(run, *words):
-    """The sentence of the InputError that ``run`` raises, in which there are these words."""
-    with pytest.raises(InputError) as caught:
+def refusal(run, *words, match=None):
+    """The sentence of the InputError that ``run`` raises, in which there are these words, and one that matches."""
+    with pytest.raises(InputError, match=match) as caught:
         run()
     message = str(caught.value)
-    assert message.endswith(".") and "\n" not in message and all(word in message for word in words), message
+    assert message.endswith((".", "?")) and "\n" not in message and all(word in message for word in words), message
     return message
 
 

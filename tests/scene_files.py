@@ -22,9 +22,9 @@ def pose(index):
     return Rotation.from_euler("xyz", (0.1, 0.25 * index, -0.05)).as_matrix(), np.array((0.1, -0.1, 5.0 + 0.1 * index))
 
 
-def write_image(path, pixels, attributes=()):
+def write_image(path, pixels, attributes=(), kind=""):
     path.parent.mkdir(parents=True, exist_ok=True)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], str(pixels.dtype))
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind or str(pixels.dtype))
     if pixels.shape[2] in (2, 4):
         spec.channelnames = "YA" if pixels.shape[2] == 2 else "RGBA"
         spec.alpha_channel = pixels.shape[2] - 1
@@ -40,13 +40,8 @@ def texture(width=WIDTH, height=HEIGHT, channels=3, dtype=np.uint8):
     return noise.astype(dtype)
 
 
-def radial(x, y, k1, k2=0.0, p1=0.0, p2=0.0):
-    """COLMAP's (and OpenCV's) radial and tangential distortion of normalized coordinates."""
-    return full_radial(x, y, k1, k2, p1, p2)
-
-
-def full_radial(x, y, k1, k2, p1, p2, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
-    """OpenCV's rational model."""
+def radial(x, y, k1, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
+    """COLMAP's (and OpenCV's) radial and tangential distortion of normalized coordinates; OpenCV's rational model."""
     r2 = x * x + y * y
     factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return (
@@ -66,7 +61,7 @@ def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0):
 def thin_prism(x, y, k1, k2, p1, p2, k3, k4, s1, s2):
     """Weng et al. 1992 on the angles of a fisheye, in COLMAP's order of the parameters."""
     x, y = fisheye(x, y)
-    dx, dy = full_radial(x, y, k1, k2, p1, p2, k3)
+    dx, dy = radial(x, y, k1, k2, p1, p2, k3)
     r2 = x * x + y * y
     return dx + x * k4 * r2**4 + s1 * r2, dy + y * k4 * r2**4 + s2 * r2
 
@@ -198,7 +193,4 @@ def write_transforms(root, names=("images/a.png", "images/b.png"), pixels=None, 
 
 
 def write_floats(path, pixels, kind="half"):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(pixels.astype(np.float32)) and output.close()
+    write_image(path, pixels.astype(np.float32), kind=kind)

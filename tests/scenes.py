@@ -15,6 +15,7 @@ from warp_splat.compare import oracle
 from warp_splat.compare.scenes import at_pixels, distinct_depths, make_camera, to_world
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS
+from warp_splat.raster.data import Gaussians
 
 FAINTEST = 1e-37  # about the least normal number of float32, the cut where there is none
 C0 = 0.28209479177387814  # color = C0 * sh[0] + 0.5 at degree 0
@@ -48,6 +49,11 @@ class Scene:
     def parameters(self):
         """The five inputs in the order of the renderer's arguments."""
         return [getattr(self, name) for name in PARAMETERS]
+
+    def gaussians(self):
+        """The same as the renderer's kernels take them."""
+        *shapes, sh = self.parameters()
+        return Gaussians(*shapes, sh[:, :1], sh[:, 1:])
 
 
 def pack(means, scales, opacities, sh, camera, rng, quats=None, background=(0.2, 0.4, 0.7)):

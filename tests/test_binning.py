@@ -1,11 +1,13 @@
 """Tile lists against a loop over every pixel of every tile."""
 
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from hostile import refusal
 
 from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.raster import api, bin
@@ -141,14 +143,10 @@ def test_depths_are_sorted_in_bands(monkeypatch, threads):
         assert (depths == before).all()
 
 
-def test_the_number_of_threads_changes_nothing(monkeypatch, threads):
+def test_the_number_of_threads_changes_nothing(monkeypatch, same_by_threads):
     monkeypatch.setattr(bin, "SMALLEST_BAND", 1000)
-    (camera, projected), results = project(5000), []
-    for count in (1, 2, 3):
-        threads(count)
-        bins = CPU.bin(projected, camera, RasterOptions())
-        results.append([bins.instances, bins.places, bins.ranges])
-    assert all(map(torch.equal, results[0], results[1])) and all(map(torch.equal, results[0], results[2]))
+    camera, projected = project(5000)
+    same_by_threads(lambda: attrgetter("instances", "places", "ranges")(CPU.bin(projected, camera, PLAIN)))
 
 
 def counted_and_sorted(camera, projected, options=PLAIN):
@@ -254,11 +252,9 @@ def test_too_many_for_a_list_or_a_tile_are_refused_with_the_sizes(bin_on, monkey
     bin_on(projected, camera, PLAIN)
     monkeypatch.setattr(bin, "MAX_TILE", longest - 1)
     message = f"one tile of 16 x 16 pixels lists {longest} Gaussians, more than the {longest - 1} that fit"
-    with pytest.raises(InputError, match=message):
-        bin_on(projected, camera, PLAIN)
+    refusal(lambda: bin_on(projected, camera, PLAIN), match=message)
     monkeypatch.setattr(bin, "MAX_INSTANCES", 100)
-    with pytest.raises(InputError, match=r"70 x 53 pixels touch tiles \d+ times, more than the 100"):
-        bin_on(projected, camera, PLAIN)
+    refusal(lambda: bin_on(projected, camera, PLAIN), match=r"70 x 53 pixels touch tiles \d+ times, more than the 100")
 
 
 @pytest.mark.parametrize("bin_on", [bin.bin_by_counting, bin.bin_by_sorting])

@@ -108,17 +108,16 @@ def ordinary():
     return made_up(3, 400, (0.5, 6.0), (0.05, 0.9), 0.2, 1.0, camera), camera
 
 
-def test_the_image_is_the_same_and_threads_change_nothing(threads):
-    gaussians, camera = ordinary()
-    black, found = torch.zeros(3), []
-    plain = render(gaussians, camera, black, RasterOptions())
-    for count in (1, 3):
-        threads(count)
-        found.append(render(gaussians, camera, black, RasterOptions(bound=True)))
-    assert torch.equal(found[0].bound, found[1].bound)
-    assert (found[0].image - plain.image).abs().max() < 1e-6
-    assert torch.equal(found[0].image, found[1].image)
-    assert plain.bound is None
+def drawn(**options):
+    """Image, bound, and the part of it that is rounding, of what is ordinary."""
+    out = render(*ordinary(), torch.zeros(3), RasterOptions(**options))
+    return out.image, out.bound, out.rounding
+
+
+def test_the_image_is_the_same_and_threads_change_nothing(same_by_threads):
+    image, *_ = same_by_threads(lambda: drawn(bound=True))
+    plain, bound, _ = drawn()
+    assert (image - plain).abs().max() < 1e-6 and bound is None
 
 
 def test_kernels_of_cuda_find_a_bound_as_well():
@@ -156,16 +155,11 @@ def test_cuts_stay_below_a_tolerance(of, tolerance):
     assert above.double().mean() < (0.02 if of == "trained" else 1e-9)
 
 
-def test_a_tolerance_for_each_pixel_and_any_number_of_threads(threads):
-    gaussians, camera = ordinary()
-    tolerance = torch.full((camera.height, camera.width), 1e-1)
+def test_a_tolerance_for_each_pixel_and_any_number_of_threads(same_by_threads):
+    tolerance = torch.full((50, 70), 1e-1)
     tolerance[10:20, 30:50] = 1e-4
-    found = []
-    for count in (1, 3):
-        threads(count)
-        found.append(render(gaussians, camera, torch.zeros(3), RasterOptions(tolerance=tolerance)))
-    assert torch.equal(found[0].image, found[1].image)
-    assert (found[0].bound - found[0].rounding <= tolerance).all()
+    _, bound, rounding = same_by_threads(lambda: drawn(tolerance=tolerance))
+    assert (bound - rounding <= tolerance).all()
 
 
 def test_gradients_within_a_tolerance():

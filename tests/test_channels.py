@@ -11,18 +11,10 @@ from test_rasterize import GRADIENT, IMAGE_MAX, relative_error
 import warp_splat
 from warp_splat import InputError, RasterOptions, rasterize_views, tape
 from warp_splat.compare import oracle
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CUDA
 
 ALL = RasterOptions(normals=True, median_depth=True, strongest=3)
-DRIVERS = ("lanes", "blocks")
 NARROW = 1e-3  # of a transmittance around 1/2, or of two weights: float32 may decide otherwise
-
-
-@pytest.fixture(params=DRIVERS)
-def driver(request):
-    """The CPU's, then that of a GPU in fibers."""
-    with using(CUDA if request.param == "blocks" else CPU):
-        yield request.param
 
 
 def features_of(scene, channels, seed=0):
@@ -92,14 +84,14 @@ def test_many_channels_are_those_of_one_alone(driver):
     image = render(scene, together).features
     image.backward(upstream)
     summed = torch.zeros_like(scene.means, dtype=torch.float64)
-    for channel in (0, 31, 36) if driver == "blocks" else range(37):
+    for channel in (0, 31, 36) if driver is CUDA else range(37):
         alone = leaves_of(scene, features[:, channel : channel + 1])
         found = render(scene, alone).features
         assert torch.equal(found[..., 0], image[..., channel])
         found.backward(upstream[..., channel : channel + 1])
         assert torch.equal(alone[5].grad[:, 0], together[5].grad[:, channel])
         summed += alone[0].grad
-    assert driver == "blocks" or relative_error(together[0].grad, summed) < 1e-5
+    assert driver is CUDA or relative_error(together[0].grad, summed) < 1e-5
 
 
 def test_color_is_the_same_beside_channels(driver):
@@ -112,16 +104,16 @@ def test_color_is_the_same_beside_channels(driver):
     assert out.features.shape == (*out.alpha.shape, 512) and out.strongest.shape == (*out.alpha.shape, 3)
 
 
-def test_the_same_bits_for_any_number_of_threads(threads):
-    scene, found = cloud(3, 4000, make_camera(200, 150)), []
-    for count in (1, 3):
-        threads(count)
+def test_the_same_bits_for_any_number_of_threads(same_by_threads):
+    scene = cloud(3, 4000, make_camera(200, 150))
+
+    def everything():
         leaves = leaves_of(scene, features_of(scene, 3))
         out = render(scene, leaves, ALL)
         (out.features.sum() + out.normals.sum() + out.median_depth.sum() + out.strongest_weights.sum()).backward()
-        grads = [leaf.grad for leaf in leaves if leaf.grad is not None]
-        found.append([out.features, out.median_depth, out.strongest, *grads])
-    assert all(map(torch.equal, *found))
+        return [out.features, out.median_depth, out.strongest, *(leaf.grad for leaf in leaves if leaf.grad is not None)]
+
+    same_by_threads(everything)
 
 
 def test_pixels_that_are_not_finite_are_dropped(driver):

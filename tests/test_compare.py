@@ -23,7 +23,7 @@ from warp_splat.kernels.cpu.blend import BLOCKS
 from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant
-from warp_splat.raster.data import Gaussians, alphas_of
+from warp_splat.raster.data import alphas_of
 from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, view
@@ -36,9 +36,8 @@ WITHOUT_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is acc
 def workload(name="degree1"):
     """A test scene as the comparison takes it; every pixel is looked at."""
     scene = SCENES[name]()
-    tensors = Gaussians(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh[:, :1], scene.sh[:, 1:])
     pixels = torch.cartesian_prod(torch.arange(scene.camera.height), torch.arange(scene.camera.width))
-    return workloads.Workload(name, tensors, scene.camera, scene.background, PLAIN, pixels)
+    return workloads.Workload(name, scene.gaussians(), scene.camera, scene.background, PLAIN, pixels)
 
 
 @pytest.mark.parametrize("mode", ["reversible", "stored", "generated"])

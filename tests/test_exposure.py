@@ -21,7 +21,6 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.rendering.finished import as_photographed, make_renderer
 from warp_splat.scene import load_scene
 from warp_splat.scene.gains import gains_of
@@ -65,7 +64,6 @@ def exact(kind, numbers, falloff, pivot, image):
     return image + torch.einsum("hwc,hwcd->hwd", image, sliced[..., :9].unflatten(-1, (3, 3))) + sliced[..., 9:] - pivot
 
 
-@pytest.mark.parametrize("driver", [CPU, CUDA], ids=["lanes", "fibers"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_images_and_gradients_are_those_of_float64(kind, driver, scene, tmp_path):
     """Of image, map and vignetting."""
@@ -78,9 +76,8 @@ def test_images_and_gradients_are_those_of_float64(kind, driver, scene, tmp_path
     leaves = [image.requires_grad_(), part.maps, part.falloff]
     wide = [leaf.detach().double().requires_grad_() for leaf in leaves]
     made = exact(kind, wide[1][3], wide[2], part.pivot, wide[0])
-    with using(driver):
-        found = part.image(image, None, SimpleNamespace(view=scene.train[3]))
-        gradients = torch.autograd.grad(found, leaves, upstream)
+    found = part.image(image, None, SimpleNamespace(view=scene.train[3]))
+    gradients = torch.autograd.grad(found, leaves, upstream)
     torch.testing.assert_close(found.double(), made, rtol=0.0, atol=1e-6)
     for gradient, right in zip(gradients, torch.autograd.grad(made, wide, upstream.double()), strict=True):
         assert (gradient - right).norm() < 2e-6 * right.norm()
@@ -162,14 +159,11 @@ def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, fails):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_threads_change_nothing(kind, scene, tmp_path, threads):
-    part, found = part_of(scene, tmp_path, exposure=kind, vignetting=True), []
+def test_threads_change_nothing(kind, scene, tmp_path, same_by_threads):
+    part = part_of(scene, tmp_path, exposure=kind, vignetting=True)
     image = torch.rand(130, 131, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
-    for count in (1, 2, 3):
-        threads(count)
-        made = part.image(image, None, SimpleNamespace(view=scene.train[0]))
-        found.append(torch.autograd.grad(made.square().sum(), [image, part.maps, part.falloff]))
-    assert all(map(torch.equal, found[0], found[1])) and all(map(torch.equal, found[0], found[2]))
+    made = lambda: part.image(image, None, SimpleNamespace(view=scene.train[0])).square().sum()  # noqa: E731
+    same_by_threads(lambda: torch.autograd.grad(made(), [image, part.maps, part.falloff]))
 
 
 def test_gains_are_found_from_the_tracks_and_decide_what_auto_takes(faulty):

@@ -6,14 +6,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from hostile import refusal
 from scenes import SCENES
 from test_rasterize import IMAGE_MAX, relative_error
 
 import warp_splat.gsplat
-from warp_splat import InputError
 from warp_splat.compare import oracle
 from warp_splat.gsplat import rasterization
-from warp_splat.raster.drivers import CPU, CUDA, using
 
 gsplat = pytest.importorskip("gsplat")
 from gsplat.cuda import _torch_impl as theirs  # noqa: E402
@@ -167,20 +166,18 @@ def test_numbers_and_options_that_gsplat_takes():
     assert (image - rasterization(**call)[0]).abs().max() < 1e-4
 
 
-@pytest.mark.parametrize("driver", [CPU, CUDA])
 @pytest.mark.parametrize("name", ["degree2", "near_and_behind", "opaque"])
 def test_pixels_against_the_oracle(name, driver):
     call, scene = call_of(name, cameras=1), SCENES[name]()
     leaves = {key: call[key] for key in ("means", "quats", "scales", "opacities", "colors")}
     exact = {key: leaf.detach().double().requires_grad_() for key, leaf in leaves.items()}
     truth = oracle.exact_render(*exact.values(), scene.camera, background=(0.1, 0.2, 0.3), **CONSTANTS)
-    with using(driver):
-        image, alpha, _ = rasterization(**call, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]))
-        assert (image[0] - truth.image)[~truth.fragile].abs().max() < IMAGE_MAX
-        assert (alpha[0, ..., 0] - truth.alpha)[~truth.fragile].abs().max() < IMAGE_MAX
-        upstream = torch.randn(image.shape[1:], generator=torch.Generator().manual_seed(0))
-        upstream[truth.fragile] = 0
-        found = torch.autograd.grad(image[0], list(leaves.values()), upstream)
+    image, alpha, _ = rasterization(**call, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]))
+    assert (image[0] - truth.image)[~truth.fragile].abs().max() < IMAGE_MAX
+    assert (alpha[0, ..., 0] - truth.alpha)[~truth.fragile].abs().max() < IMAGE_MAX
+    upstream = torch.randn(image.shape[1:], generator=torch.Generator().manual_seed(0))
+    upstream[truth.fragile] = 0
+    found = torch.autograd.grad(image[0], list(leaves.values()), upstream)
     wanted = torch.autograd.grad(truth.image, list(exact.values()), upstream.double())
     for key, one, other in zip(leaves, found, wanted, strict=True):
         assert relative_error(one, other) < 1e-4, key
@@ -240,7 +237,6 @@ def test_gradients_of_what_meta_shows_and_sparse_ones():
     assert (clipped["radii"] > 8).any(-1).all() and len(clipped["radii"]) > 0
 
 
-@pytest.mark.parametrize("driver", [CPU, CUDA])
 @pytest.mark.parametrize(("mode", "channels"), [pytest.param("RGB", 3, marks=pytest.mark.long), ("RGB+ED", 5)])
 def test_sums_of_magnitudes(mode, channels, driver):
     """Each pixel's own gradient of the 2D means, by float64."""
@@ -249,10 +245,9 @@ def test_sums_of_magnitudes(mode, channels, driver):
     call["colors"] = torch.rand(len(call["means"]), channels, generator=generator)
     behind = torch.rand(2, channels, generator=generator)
     weights = torch.randn(2, call["height"], call["width"], channels + ("D" in mode) + 1, generator=generator)
-    with using(driver):
-        image, alpha, meta = rasterization(**call, backgrounds=behind)
-        assert not meta["means2d"].absgrad.any()
-        (torch.cat([image, alpha], -1) * weights).sum().backward()
+    image, alpha, meta = rasterization(**call, backgrounds=behind)
+    assert not meta["means2d"].absgrad.any()
+    (torch.cat([image, alpha], -1) * weights).sum().backward()
     pixels = torch.cartesian_prod(torch.arange(call["height"]), torch.arange(call["width"])).flip(1) + 0.5
     for view in range(2):
         mine = meta["camera_ids"] == view
@@ -312,28 +307,6 @@ def test_its_strategies_grow_a_model(name, packed, steps, monkeypatch):
     assert len(params["means"]) > (1.5 if name == "default" else 1.04) * before and losses[-1] < 0.5 * losses[0]
 
 
-def test_an_image_is_fitted():
-    """As gsplat's example does: raw scales, which cross zero, and the photograph's size of NumPy's numbers."""
-    rows = np.arange(24)
-    photo = torch.zeros(len(rows), 32, 3)
-    photo[:12, :16], photo[12:, 16:] = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, 1.0])
-    raw = {"means": 4 * torch.rand(100, 3) - 2, "quats": torch.randn(100, 4), "scales": torch.rand(100, 3)}
-    raw |= {"opacities": torch.ones(100), "colors": torch.rand(100, 3)}
-    raw = {name: tensor.requires_grad_() for name, tensor in raw.items()}
-    optimizer, losses = torch.optim.Adam(raw.values(), 0.05), []
-    viewmats, Ks = torch.eye(4)[None].clone(), torch.tensor([[[16.0, 0, 16], [0, 16, 12], [0, 0, 1]]])
-    viewmats[:, 2, 3] = 8.0
-    size = {"width": np.int64(32), "height": rows.max() + 1}
-    for _ in range(100):
-        shown = raw | {name: raw[name].sigmoid() for name in ("opacities", "colors")}
-        image = rasterization(**shown, viewmats=viewmats, Ks=Ks, **size, packed=False)[0][0]
-        losses.append((image - photo).square().mean())
-        optimizer.zero_grad()
-        losses[-1].backward()
-        optimizer.step()
-    assert (raw["scales"] < 0).any() and losses[-1] < 0.3 * losses[0]
-
-
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
@@ -374,5 +347,4 @@ def test_an_image_is_fitted():
     ],
 )
 def test_bad_input(changes, found):
-    with pytest.raises(InputError, match=found):
-        rasterization(**call_of() | changes)
+    refusal(lambda: rasterization(**call_of() | changes), match=found)

@@ -11,7 +11,6 @@ import warp_splat
 from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.compare.oracle import exact_render
 from warp_splat.config import ADJOINTS
-from warp_splat.raster.drivers import CPU, CUDA, using
 
 CAMERA = Camera(40, 24, 30.0, 30.0, 20.0, 12.0, np.eye(3), np.zeros(3))
 DEPTHS, OPACITIES = (2.0, 3.0, 5.0), (0.5, 0.6, 0.9)
@@ -26,14 +25,12 @@ def three():
     return means, torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), scales, torch.tensor(OPACITIES), sh
 
 
-@pytest.mark.parametrize("driver", [CPU, CUDA])
 def test_a_plane_and_three_splats(driver):
     """A slanted plane, nearer on the right; no plane in the first columns."""
     surface = np.linspace(6.0, 1.0, CAMERA.width, dtype=np.float32)[None].repeat(CAMERA.height, 0)
     surface[:, :3], surface[:, 3:5] = 0.0, np.nan
     options = RasterOptions(depth=True, strongest=1, hidden_from=torch.from_numpy(surface))
-    with using(driver):
-        out = warp_splat.rasterize(*three(), CAMERA, options=options)
+    out = warp_splat.rasterize(*three(), CAMERA, options=options)
     for x in range(CAMERA.width):
         color, light, sum_z, strongest = np.zeros(3), 1.0, 0.0, (0.0, -1)
         for number, (z, opacity) in enumerate(zip(DEPTHS, OPACITIES, strict=True)):
@@ -55,7 +52,6 @@ def half_hidden():
     return scene, torch.full((scene.camera.height, scene.camera.width), limit), depths < limit
 
 
-@pytest.mark.parametrize("driver", [CPU, CUDA])
 @pytest.mark.parametrize("mode", ADJOINTS)
 def test_one_depth_for_all_is_a_scene_without_what_is_behind(mode, driver):
     """Image and gradients, by any adjoint, are those of the Gaussians in front alone."""
@@ -65,10 +61,9 @@ def test_one_depth_for_all_is_a_scene_without_what_is_behind(mode, driver):
         (RasterOptions(depth=True), front),
     ):
         leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
-        with using(driver):
-            out = warp_splat.rasterize(*(leaf[kept] for leaf in leaves), scene.camera, scene.background, mode, options)
-            weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image)
-            ((out.image * weights).sum() + out.alpha.sum() + out.depth.mean()).backward()
+        out = warp_splat.rasterize(*(leaf[kept] for leaf in leaves), scene.camera, scene.background, mode, options)
+        weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image)
+        ((out.image * weights).sum() + out.alpha.sum() + out.depth.mean()).backward()
         found.append([out.image.detach(), out.alpha.detach(), *(leaf.grad for leaf in leaves)])
     assert 0.1 < out.alpha.mean() < 0.99
     for one, other in zip(*found, strict=True):

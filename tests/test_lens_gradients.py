@@ -14,7 +14,6 @@ from warp_splat import CameraParameters, Lens, RasterOptions
 from warp_splat.compare import truth
 from warp_splat.config import ADJOINTS
 from warp_splat.lenses.formulas import MODELS
-from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 
 EVERY_LENS = pytest.mark.parametrize(
@@ -82,9 +81,8 @@ def test_image(scene, projection):
 def test_splats(scene, projection):
     """Means, conics and opacities that are drawn, against float64 differences by the coefficients."""
     options, numbers = RasterOptions(projection=projection, antialiasing=True), learned(scene.camera)
-    coefficients, (*shapes, sh) = numbers["coefficients"], scene.parameters()
-    gaussians = Gaussians(*shapes, sh[:, :1], sh[:, 1:])
-    splats = project(gaussians, CameraParameters(scene.camera, coefficients=coefficients), options)
+    coefficients = numbers["coefficients"]
+    splats = project(scene.gaussians(), CameraParameters(scene.camera, coefficients=coefficients), options)
     drawn, exact = splats.radii > 0, scene.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(3)
     weights = [torch.randn(part.shape, generator=generator) for part in (splats.means2d, splats.conics)]

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from hostile import refusal
 from scenes import make_camera
 from test_losses import oracle
 
@@ -127,8 +128,7 @@ def test_png_errors(tmp_path):
     for name, sentence in (("none.png", "could not be read"), ("b.png", r"b\.png")):
         with pytest.raises(InputError, match=sentence):
             load_png(tmp_path / name)
-    with pytest.raises(InputError, match=r"ending in \.png"):
-        save_png(tmp_path / "a.xyz", image)
+    refusal(lambda: save_png(tmp_path / "a.xyz", image), "ending in .png")
 
 
 def test_views_have_the_metrics_of_the_files_that_are_written(tmp_path):
@@ -169,8 +169,7 @@ def test_results_are_json_and_keep_other_methods(tmp_path):
 @pytest.mark.parametrize("text", ["{", "[]", "\xff"])
 def test_results_that_are_not_json_are_left_alone(tmp_path, text):
     (tmp_path / "results.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match=r"results\.json.*move it away"):
-        write_results(tmp_path, 1, {"SSIM": 1.0, "PSNR": 2.0}, {})
+    refusal(lambda: write_results(tmp_path, 1, {"SSIM": 1.0, "PSNR": 2.0}, {}), match=r"results\.json.*move it away")
     assert (tmp_path / "results.json").read_bytes() == text.encode("latin-1")
 
 
@@ -274,18 +273,15 @@ class Trap:
 
 
 def test_lpips_weights_that_are_none(tmp_path, capsys):
-    with pytest.raises(InputError, match=r"none\.pth: no such file"):
-        choose_metrics(str(tmp_path / "none.pth"))
+    refusal(lambda: choose_metrics(str(tmp_path / "none.pth")), "none.pth: no such file")
     file = tmp_path / "a.pth"
     for value in ({"fc.weight": torch.zeros(2)}, [1, 2], {"features.28.weight": torch.zeros(2)}, Trap(), "text"):
         torch.save(value, file) if value != "text" else file.write_text("not weights")
-        with pytest.raises(InputError, match=r"a\.pth: expected torchvision's weights"):
-            choose_metrics(str(file))
+        refusal(lambda: choose_metrics(str(file)), "a.pth: expected torchvision's weights")
     assert "sprung" not in capsys.readouterr().out
 
 
 def test_lpips_without_its_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lpips", None)
     torch.save({"features.28.weight": torch.zeros(2)}, tmp_path / "a.pth")
-    with pytest.raises(InputError, match="pip install lpips"):
-        choose_metrics(str(tmp_path / "a.pth"))
+    refusal(lambda: choose_metrics(str(tmp_path / "a.pth")), "pip install lpips")

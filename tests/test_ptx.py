@@ -22,7 +22,6 @@ from warp_splat import Camera, CameraParameters, RasterOptions
 from warp_splat.gaussians import Activate
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.behind import put_behind
-from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CUDA, using
 from warp_splat.raster.expose import expose
 from warp_splat.raster.project import project
@@ -61,10 +60,7 @@ def list_many_tiles() -> None:
     """An image of 2^15 tiles, which take more than 16 bits."""
     scene = small()
     camera = replace(scene.camera, width=16, height=2**19)
-    gaussians = Gaussians(
-        scene.means, scene.quats, scene.scales, scene.opacities, *scene.sh.split([1, scene.sh.shape[1] - 1], 1)
-    )
-    CUDA.bin(project(gaussians, camera, RasterOptions()), camera, RasterOptions())
+    CUDA.bin(project(scene.gaussians(), camera, RasterOptions()), camera, RasterOptions())
 
 
 def activate() -> None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, fields
 import pytest
 import torch
 from commands import ROOT, SCENE, train
+from hostile import refusal
 from trainings import Pretended, begin, check_same, resumed, state_of
 
 from warp_splat.cli import main, parse
-from warp_splat.errors import InputError
 from warp_splat.flags import growing, learning
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.training.config_file import load_options, read_config, write_config
@@ -186,8 +186,7 @@ def test_options_of_one_name_are_refused(monkeypatch, fails):
 
     monkeypatch.setitem(GROWTHS, "other", Entry(OtherOptions, f"{__name__}.Faint"))
     message = "--faint_below: expected one kind of options with it, found FaintOptions and OtherOptions; rename one."
-    with pytest.raises(InputError, match=message):
-        TrainConfig()
+    refusal(TrainConfig, message)
     assert message in fails("train")
 
 

@@ -20,7 +20,6 @@ from warp_splat.formats.model_folder import ply_path, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.raster.behind import put_behind
-from warp_splat.raster.drivers import CPU, CUDA, using
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
 from warp_splat.scene.types import Decoded
@@ -156,29 +155,24 @@ def exact(camera, image, alpha, harmonics):
     return image + (seen * (1.0 - alpha))[..., None] * colors, seen
 
 
-@pytest.mark.parametrize("driver", [CPU, CUDA], ids=["lanes", "fibers"])
 @pytest.mark.parametrize(("size", "lens"), [((37, 31), None), ((5, 3), None), ((64, 48), FISHEYE)], ids=str)
 def test_image_and_gradients_are_those_of_float64(size, lens, driver):
     """Some colors are cut to 0; the fisheye leaves corners unseen."""
     camera, leaves, upstream = made(*size, 8.0, lens)
     wide = [leaf.detach().double().requires_grad_() for leaf in leaves]
     expected, seen = exact(camera, *wide)
-    with using(driver):
-        found = put_behind(*leaves, camera)
-        gradients = torch.autograd.grad(found, leaves, upstream)
+    found = put_behind(*leaves, camera)
+    gradients = torch.autograd.grad(found, leaves, upstream)
     assert bool(seen.all()) == (lens is None)
     torch.testing.assert_close(found.double(), expected, rtol=0.0, atol=3e-6)
     for gradient, right in zip(gradients, torch.autograd.grad(expected, wide, upstream.double()), strict=True):
         assert (gradient - right).norm() < 3e-6 * right.norm()
 
 
-def test_threads_change_nothing(threads):
-    (camera, leaves, upstream), found = made(211, 130, 90.0), []
-    for count in (1, 2, 3):
-        threads(count)
-        image = put_behind(*leaves, camera)
-        found.append([image, *torch.autograd.grad(image, leaves, upstream)])
-    assert all(map(torch.equal, found[0], found[1])) and all(map(torch.equal, found[0], found[2]))
+def test_threads_change_nothing(same_by_threads):
+    camera, leaves, upstream = made(211, 130, 90.0)
+    image = lambda: put_behind(*leaves, camera)  # noqa: E731
+    same_by_threads(lambda: [image(), *torch.autograd.grad(image(), leaves, upstream)])
 
 
 def test_a_pixel_that_is_not_finite_spoils_no_coefficient():

@@ -13,7 +13,6 @@ from scene_files import (
     check_ideal,
     distorted_picture,
     fisheye,
-    full_radial,
     load,
     project,
     radial,
@@ -72,7 +71,7 @@ K = ("k1", "k2", "p1", "p2", "k3")
     ("model", "distort", "params", "keys"),
     [
         ("OPENCV", radial, (-0.15, 0.04, 0.002, -0.003), K[:4]),
-        ("OPENCV", full_radial, (-0.1, 0.03, 0.002, 0.001, -0.01), K),
+        ("OPENCV", radial, (-0.1, 0.03, 0.002, 0.001, -0.01), K),
         ("OPENCV_FISHEYE", fisheye, (0.02, -0.01, 0.003, 0.0), ("k1", "k2", "k3", "k4")),
     ],
 )

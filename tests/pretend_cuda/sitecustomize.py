@@ -158,7 +158,7 @@ def dispatch(func, args, kwargs):
     pinned = plain.pop("pin_memory", False)
     check_devices(name, args, there, here)
     note_waits(name, args, kwargs, card)
-    later = copies_later(name, args, kwargs, there)
+    source, target, later = copy_of(name, args, kwargs)
     if name in ("aten::_pin_memory", "aten::is_pinned"):
         if there:
             raise RuntimeError(f"cannot pin 'torch.cuda.FloatTensor': only dense CPU tensors can be pinned ({name})")
@@ -174,9 +174,9 @@ def dispatch(func, args, kwargs):
         found.untyped_storage().fill_(GARBAGE)
     if pinned and not card:
         lock(found)
-    if later:
-        target = args[0] if name == "aten::copy_" else lock(found)
-        coming.append((target, inner(args[1] if name == "aten::copy_" else args[0]).clone()))
+    if later and isinstance(source, Pretended) and comes_later(target, device):
+        target = lock(found) if target is None else target
+        coming.append((target, inner(source).clone()))
         target.untyped_storage().fill_(GARBAGE)
     wrap = lambda x: Pretended(x) if card and isinstance(x, torch.Tensor) and not isinstance(x, Pretended) else x  # noqa: E731
     found = tree_map(wrap, found)
@@ -199,14 +199,12 @@ def note_waits(name, args, kwargs, card) -> None:
     """Of operations that end only when the host knows something, or has handed something over."""
     short = name.removeprefix("aten::")
     if name in COPIES:
-        source, target = (args[1], args[0]) if short == "copy_" else (args[0], None)
+        source, target, later = copy_of(name, args, kwargs)
         to_card = isinstance(target, Pretended) if target is not None else card
-        apart = not (kwargs.get("non_blocking") or (short == "copy_" and len(args) > 2 and args[2]))
         if isinstance(source, Pretended) and not to_card:
-            unlocked = target is not None and not is_locked(target)
-            if apart or unlocked:
+            if not later or (target is not None and not is_locked(target)):
                 wait("copy to the host")
-        elif not isinstance(source, Pretended) and to_card and source.numel() and (apart or not is_locked(source)):
+        elif not isinstance(source, Pretended) and to_card and source.numel() and not (later and is_locked(source)):
             wait("copy from the host")
     elif card or any(isinstance(x, Pretended) for x in args):
         indices = [x for x in tree_leaves(args[1]) if isinstance(x, torch.Tensor)] if short.startswith("index") else []
@@ -215,16 +213,16 @@ def note_waits(name, args, kwargs, card) -> None:
             wait(short)
 
 
-def copies_later(name, args, kwargs, there) -> bool:
-    """Whether that is a copy to page-locked memory of the host which nobody waits for."""
-    if not there or name not in COPIES:
-        return False
+def copy_of(name, args, kwargs):
+    """Source and target of a copy, none if it makes one, and whether nobody waits for it; of no copy nothing."""
     if name == "aten::copy_":
-        return not isinstance(args[0], Pretended) and is_locked(args[0]) and bool(
-            kwargs.get("non_blocking") or (len(args) > 2 and args[2])
-        )  # fmt: skip
-    device = kwargs.get("device")
-    return device is not None and not on_card(device) and bool(kwargs.get("non_blocking"))
+        return args[1], args[0], bool(kwargs.get("non_blocking") or (len(args) > 2 and args[2]))
+    return (args[0], None, bool(kwargs.get("non_blocking"))) if name in COPIES else (None, None, False)
+
+
+def comes_later(target, device) -> bool:
+    """Whether a copy goes to page-locked memory of the host."""
+    return not on_card(device or CARD) if target is None else is_locked(target)
 
 
 class Generator(torch.Generator):
