@@ -64,9 +64,10 @@ class FakeClient:
             add_dropdown=lambda label, options, **_: Control(options[0]),
             add_slider=lambda label, low, high, step, value, **_: Control(value),
             add_button_group=lambda label, options: Control(),
+            add_checkbox=lambda label, value, **_: Control(value),
             add_markdown=lambda text: SimpleNamespace(content=text),
         )
-        self.scene = SimpleNamespace(set_background_image=self.receive)
+        self.scene = MagicMock(set_background_image=self.receive)
         self.atomic, self.flush = MagicMock(), lambda: None
 
     def receive(self, frame, format, jpeg_quality):

@@ -132,7 +132,7 @@ class Finished:
 def make_renderer(
     model: GaussianModel, background: torch.Tensor | None = None, options: RasterOptions | None = None
 ) -> Callable[..., RenderOutput]:
-    """A function from a camera, and whether depth is wanted, to what the model looks like, without gradients.
+    """A function from a camera, and which depths are wanted, to what the model looks like, without gradients.
 
     ``background``: a color [3], black unless given; or harmonics [16, 3].
 
@@ -147,8 +147,8 @@ def make_renderer(
         gaussians = model.activated()
 
     @torch.no_grad()
-    def draw(camera: Camera, depth: bool = False) -> RenderOutput:
-        return render_gaussians(gaussians, camera, behind, replace(options, depth=depth))
+    def draw(camera: Camera, depth: bool = False, median: bool = False) -> RenderOutput:
+        return render_gaussians(gaussians, camera, behind, replace(options, depth=depth, median_depth=median))
 
     return draw
 

@@ -303,10 +303,10 @@ class Trainer:
         """What pictures have behind the Gaussians: a color [3], or harmonics [16, 3]."""
         return self._through("behind", self.background)
 
-    def look(self, camera: Camera, depth: bool = False) -> RenderOutput:
+    def look(self, camera: Camera, depth: bool = False, median: bool = False) -> RenderOutput:
         """The present model seen by ``camera``, without gradients; nothing of the training changes."""
         with torch.no_grad():
-            options = replace(self.options, depth=depth, sh_degree=self.degree)
+            options = replace(self.options, depth=depth, median_depth=median, sh_degree=self.degree)
             splats = self.blocks.ask("show", camera, options) if self.blocks else None
             return self._render(camera, self.behind, options, splats=splats, rows=self._shown(camera, options))
 

@@ -36,7 +36,7 @@ PORTS = 100  # that are tried, from the one asked for
 DESERTED = 10.0  # seconds after the last browser has left; one that loads the page again takes less
 MOVING_QUALITY, SHARP_QUALITY = 75, 95  # of JPEG
 
-Draw = Callable[[Camera, bool], RenderOutput]
+Draw = Callable[..., RenderOutput]
 Exposed = Callable[[torch.Tensor, View], torch.Tensor]  # an image [H, W, 3] as the camera of a photograph took it
 
 
@@ -44,7 +44,7 @@ class Viewer:
     """Serves the page, and draws what its browsers ask for.
 
     Args:
-        draw: renders a camera, with or without depth.
+        draw: renders a camera, with or without depth; with ``median=True``, with the median depth.
         means: where the Gaussians are at present, [N, 3].
         scene: its photographs can be jumped to; None if there are none.
         port: where to serve; if it is busy, the next free one.
@@ -65,6 +65,7 @@ class Viewer:
         exposed: Exposed = lambda image, view: image,
     ):
         self.draw_camera, self.means, self.linear, self.exposed = draw, means, linear, exposed
+        self.unit = " m" if scene and scene.coordinates else ""
         self.views: dict[str, View] = {}
         if scene:
             self.views = {view.name: view for view in (*scene.train, *scene.test)}
@@ -95,6 +96,7 @@ class Viewer:
         camera = Camera(TILE, TILE, TILE, TILE, 0.5 * TILE, 0.5 * TILE, np.eye(3), np.zeros(3))
         for kind in KINDS:
             paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
+        self.draw_camera(camera, median=True)
 
     def __enter__(self) -> Viewer:
         return self
@@ -111,7 +113,7 @@ class Viewer:
         return f"{len(self.means()):,} Gaussians"
 
     async def _enter(self, client: viser.ClientHandle) -> None:
-        self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.wake)
+        self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.unit, self.wake)
 
     async def _leave(self, client: viser.ClientHandle) -> None:
         self.watchers.pop(client.client_id, None)
@@ -157,6 +159,7 @@ class Viewer:
             camera, view, box = watcher.camera(watcher.pace.pixels if moving else MOST)
         except InputError:  # a window that was folded up; it will send another camera when it opens
             return
+        watcher.ruler.answer(self.draw_camera, camera)
         kind = watcher.kind.value
         out = self.draw_camera(camera, kind == "depth")
         if view is not None:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from warp_splat.camera import Camera
 from warp_splat.scene.types import View
 from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, pivot, sized
+from warp_splat.viewer.measure import Ruler
 from warp_splat.viewer.picture import KINDS
 
 if TYPE_CHECKING:
@@ -49,11 +50,17 @@ class Watcher:
         client: viser's handle.
         views: the photographs that it can jump to, by name.
         subject: what they show, [3], world.
+        unit: of the world, " m" or nothing.
         wake: called whenever something has changed.
     """
 
     def __init__(
-        self, client: viser.ClientHandle, views: Mapping[str, View], subject: np.ndarray, wake: Callable[[], None]
+        self,
+        client: viser.ClientHandle,
+        views: Mapping[str, View],
+        subject: np.ndarray,
+        unit: str,
+        wake: Callable[[], None],
     ):
         self.client, self.views, self.subject, self.wake = client, views, subject, wake
         self.pace = Pace()
@@ -69,6 +76,7 @@ class Watcher:
             self.view.on_update(self._jump)
             self.opacity.on_update(self._touched)
             self.steps.on_click(self._step)
+        self.ruler = Ruler(client, subject, unit, self._touched)
         self.note = gui.add_markdown("")
         client.camera.on_update(self._touched)
         self._touched()
