@@ -4,7 +4,7 @@ python benchmarks/show_kernel.py              # their names
 python benchmarks/show_kernel.py project      # the source of those whose names hold this
 """
 
-import sys
+import argparse
 from dataclasses import replace
 
 from warp._src.context import user_modules
@@ -35,7 +35,9 @@ def sources() -> dict[str, str]:
 
 
 def main() -> None:
-    wanted, found = sys.argv[1] if len(sys.argv) > 1 else "", sources()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", nargs="?", default="", help="of kernels and functions, or a part of it")
+    wanted, found = parser.parse_args().name, sources()
     for name in sorted(found):
         if wanted in name.split()[1]:
             print(f"# {name}\n{found[name]}\n" if wanted else name)

@@ -7,6 +7,7 @@
 - docs/images/architecture.svg, from the imports.
 """
 
+import argparse
 import re
 import textwrap
 from collections.abc import Iterable
@@ -108,6 +109,7 @@ GENERATED = {
 }
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     PICTURE.write_text(make_architecture.picture())
     for page in PAGES:
         page.write_text(filled(page))

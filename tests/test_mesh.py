@@ -154,6 +154,7 @@ def test_convex_pieces(model, tmp_path):
     [
         (["ball.stl"], "expected a name that ends in .ply, .glb, .obj"),
         (["pyproject.toml/ball.ply"], "expected a folder that can be written"),
+        (["ball.ply", "--collision", "9999999999999999999"], "--collision: expected 0 to 1000000"),
         (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
         (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
         (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen so finely"),

@@ -132,6 +132,7 @@ def test_what_is_hidden_goes_first():
     fewer = thinning.to(20)
     assert len(fewer.means) == 20 and {tuple(m) for m in fewer.means} <= {tuple(m) for m in kept.means}
     np.testing.assert_array_equal(thinning.to(32).means, kept.means)
+    assert [len(thinning.to(count).means) for count in (5, 1)] == [5, 1]  # four fifths of four are four: it ends
 
 
 def test_harmonics_that_do_not_show_become_zeros():

@@ -273,3 +273,10 @@ def test_png_files_can_be_written_after_pycolmap_was_loaded(tmp_path):
         "save_png(sys.argv[1], np.zeros((8, 8, 3), np.uint8))"
     )
     python("-c", code, tmp_path / "a.png")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+def test_kill_prints_no_stack_of_a_library():
+    words = "import os, signal, warp_splat.scene.colmap_library; os.kill(os.getpid(), signal.SIGTERM)"
+    done = python("-c", words, check=False)
+    assert done.returncode == -signal.SIGTERM and done.stderr == ""

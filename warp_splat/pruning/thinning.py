@@ -50,7 +50,11 @@ class Thinning:
         rows = self._kept[min(known for known in self._kept if known >= count)]
         while len(rows) > count:
             model = model_of(self.splats.take(rows), self.setting)
-            rows = rows[_costliest(model, self.setting, max(count, math.ceil(AT_ONCE * len(rows)))).cpu().numpy()]
+            rows = rows[
+                _costliest(model, self.setting, max(count, min(len(rows) - 1, math.ceil(AT_ONCE * len(rows)))))
+                .cpu()
+                .numpy()
+            ]
             self._kept[len(rows)] = rows
         return self.splats.take(rows)
 

@@ -1,7 +1,13 @@
 """pycolmap where it is installed, else None: it has no wheel for Linux on ARM."""
 
+import signal
+import threading
+
 try:
     import pycolmap
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))  # its own would print a stack of C++
 except ImportError:
     pycolmap = None  # type: ignore
 import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
