@@ -26,11 +26,11 @@ from warp_splat.cli import main
 from warp_splat.compare.scenes import make_camera
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
-from warp_splat.formats.convert import losses
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.changes import losses
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward

@@ -8,10 +8,10 @@ from hostile import refusal
 from scipy.spatial import KDTree
 from splat_files import covariances, sigmoid, silent, sog_bytes, sog_parts, some_file, some_splats, webp_bytes
 
-from warp_splat.formats.convert import losses
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.palettes import codebook, palette
 from warp_splat.formats.splats import SplatFile
+from warp_splat.rendering.changes import losses
 
 
 def sog_rows(path):

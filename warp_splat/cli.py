@@ -40,7 +40,7 @@ COMMANDS = {
     "view": (ViewConfig, "viewer.command.view_model", "look at a trained model in a browser"),
     "convert": (
         ConvertConfig,
-        "rendering.changes.convert_and_compare",
+        "rendering.changes.convert",
         "convert Gaussians between .ply, .splat, .spz, .sog, glTF, USD",
     ),
     "merge": (MergeConfig, "scene.blocks.merge_blocks", "make one model of the blocks of a scene (train --block)"),

@@ -1,9 +1,8 @@
 """``warp-splat audit``: a table, JSON and a page on a renderer, or the smallest scene that shows a finding."""
 
-import base64
-import io
 import sys
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from warp_splat.evaluation.report import machine
 from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_json
 from warp_splat.formats.png import save_png
-from warp_splat.inspect.page import write_page
+from warp_splat.inspect.page import address_of, write_page
 from warp_splat.inspect.subject import Finding
 from warp_splat.text import table_of
 
@@ -84,9 +83,7 @@ def write_audit(out: Path, facts: dict[str, Any], rows: list[SceneRow]) -> None:
     drawn = sorted((row for row in rows if row.pictures), key=lambda row: (-row.own, -row.off, -row.largest))
     pictures = []
     for row in drawn[:SHOWN]:
-        buffer = io.BytesIO()
-        Image.fromarray(side_by_side(*row.pictures)).save(buffer, "png")
-        address = f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+        address = address_of("png", partial(Image.fromarray(side_by_side(*row.pictures)).save, format="png"))
         pictures.append((f"{row.scene}: expected, found, difference (10 times)", address))
     if drawn:
         save_png(out / "worst.png", side_by_side(*drawn[0].pictures))

@@ -3,7 +3,8 @@
 import base64
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -67,10 +68,14 @@ def draw_pictures(subject: Subject) -> Iterable[tuple[str, str]]:
         yield "Exposure of each photograph beside the others, by name", _encode(_exposures(subject))
 
 
+def address_of(kind: str, save: Callable[[io.BytesIO], object]) -> str:
+    """A picture that ``save`` writes, "png" or "jpeg", as an address of data."""
+    save(buffer := io.BytesIO())
+    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
 def _encode(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="jpg", dpi=PAGE_DPI, pil_kwargs={"quality": 85})
-    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    return address_of("jpeg", partial(figure.savefig, format="jpg", dpi=PAGE_DPI, pil_kwargs={"quality": 85}))
 
 
 def _grid(count: int, columns: int, aspect: float) -> tuple[Figure, list]:

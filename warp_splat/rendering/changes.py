@@ -1,5 +1,9 @@
-"""How much pictures change with their Gaussians: measured, and with a bound that holds in real arithmetic."""
+"""From one format of Gaussians to another, and what that cost: in numbers, and how much pictures change.
 
+Both are measured by reading the new file again; of pictures there is a bound, too, that holds in real arithmetic.
+"""
+
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -8,8 +12,12 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.config import ConvertConfig, RasterOptions
-from warp_splat.formats.convert import convert
-from warp_splat.formats.exchange import load_gaussians
+from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import read_coordinates
+from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
+from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_environment
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
+from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
@@ -17,7 +25,54 @@ from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
 
+ROUNDING = 1e-6  # smaller changes, as a share of a Gaussian's own size, are those of float32
 AROUND, DISTANCE = 4, 2.5  # cameras around a model; from its middle, times what holds three quarters of its Gaussians
+
+
+def convert(config: ConvertConfig) -> int:
+    """Convert as ``config`` says, with ``--bound`` compare pictures; returns the process's exit code.
+
+    Raises:
+        InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
+    """
+    format_of(config.target)  # before anything is read
+    iteration, before, trained = open_model(config.source, crop=config.crop)
+    source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, iteration)
+    if os.path.exists(config.target) and os.path.samefile(source, config.target):
+        raise InputError(f"{config.target}: expected another file than the source; name a new one.")
+    where = before.coordinates if is_file_of_gaussians(config.source) else read_coordinates(config.source)
+    before = before._replace(antialiased=bool(trained["antialiasing"]), coordinates=where)
+    notes: list[str] = []
+    before = save_gaussians(config.target, before, notes.append)
+    after = load_gaussians(config.target)
+    degree = COEFFICIENTS.index(after.splats.sh.shape[1])
+    print(f"{config.target}: {len(after.splats.means)} Gaussians, SH degree {degree}")
+    notes = losses(before, after) + notes
+    if read_environment(config.source, iteration) is not None:
+        notes.append("what was learned behind the Gaussians (--parts sky), which no format has")
+    print(f"  lost: {'; '.join(notes)}" if notes else "  nothing lost but rounding of float32")
+    if config.bound:
+        _compare(config)
+    return 0
+
+
+def _compare(config: ConvertConfig) -> None:
+    """Tell how much pictures of source and target differ."""
+    launch.prepare("cpu", 0)
+    finished = Finished(config.source, crop=config.crop)
+    splats = (finished.file.splats, load_gaussians(config.target).splats)
+    means = np.asarray(splats[0].means if len(splats[0].means) else [[0, 0, 0]], np.float64)
+    middle = np.median(means, axis=0)
+    reach = np.quantile(np.linalg.norm(means - middle, axis=1), 0.75)
+    radius = DISTANCE * reach + 1e-6 * (1 + np.abs(middle).max())
+    start, up = middle - [0.0, 0.0, radius], np.array([0.0, -1.0, 0.0])
+    cameras = orbit_cameras(
+        middle, up, start, AROUND, ORBIT_LENS.resized(ORBIT_LENS.width // 3, ORBIT_LENS.height // 3)
+    )
+    with torch.no_grad():
+        before, after = (GaussianModel.from_splats(some).arranged().activated() for some in splats)
+    measured, bound = largest_change(before, after, cameras, torch.zeros(3), finished.options)
+    print(f"  largest change of a pixel, {AROUND} places around: {measured:.2g} measured, {bound:.2g} its bound")
 
 
 @torch.no_grad()
@@ -38,27 +93,39 @@ def largest_change(
     return measured, bound
 
 
-def convert_and_compare(config: ConvertConfig) -> int:
-    """Convert as ``config`` says, and with ``--bound`` compare pictures; returns the process's exit code.
+def losses(before: SplatFile, after: SplatFile) -> list[str]:
+    """What differs, in phrases with numbers: the largest change of any Gaussian and the root mean square."""
+    notes = []
+    old, new = before.splats, after.splats
+    degrees = [COEFFICIENTS.index(splats.sh.shape[1]) for splats in (old, new)]
+    if degrees[0] != degrees[1]:
+        notes.append(f"SH degree {degrees[0]} became {degrees[1]}")
+    if before.antialiased != after.antialiased:
+        notes.append("the mark that the Gaussians are antialiased")
+    if before.coordinates and not after.coordinates:
+        notes.append("where they are in the world (coordinates.json)")
+    if len(old.means) != len(new.means):
+        return [*notes, f"{len(old.means) - len(new.means)} of {len(old.means)} Gaussians"]
+    for name, unit, size, change in _changes(old, new):
+        if (change > ROUNDING * size).any():
+            notes.append(f"{name} up to {change.max():.2g}{unit} (RMS {np.sqrt(np.mean(change**2)):.2g})")
+    return notes
 
-    Raises:
-        InputError: as :func:`convert`.
-    """
-    code = convert(config)
-    if config.bound:
-        launch.prepare("cpu", 0)
-        finished = Finished(config.source, crop=config.crop)
-        splats = (finished.file.splats, load_gaussians(config.target).splats)
-        means = np.asarray(splats[0].means if len(splats[0].means) else [[0, 0, 0]], np.float64)
-        middle = np.median(means, axis=0)
-        reach = np.quantile(np.linalg.norm(means - middle, axis=1), 0.75)
-        radius = DISTANCE * reach + 1e-6 * (1 + np.abs(middle).max())
-        start, up = middle - [0.0, 0.0, radius], np.array([0.0, -1.0, 0.0])
-        cameras = orbit_cameras(
-            middle, up, start, AROUND, ORBIT_LENS.resized(ORBIT_LENS.width // 3, ORBIT_LENS.height // 3)
-        )
-        with torch.no_grad():
-            before, after = (GaussianModel.from_splats(some).arranged().activated() for some in splats)
-        measured, bound = largest_change(before, after, cameras, torch.zeros(3), finished.options)
-        print(f"  largest change of a pixel, {AROUND} places around: {measured:.2g} measured, {bound:.2g} its bound")
-    return code
+
+def _changes(old: SplatArrays, new: SplatArrays) -> list[tuple[str, str, float | np.ndarray, np.ndarray]]:
+    """By quantity: its name, its unit, its size (of each Gaussian, [N, 1]), and by how much each number changed."""
+    shared = min(old.sh.shape[1], new.sh.shape[1])
+    size = lambda array: np.abs(array).max(axis=1, keepdims=True)  # noqa: E731
+    sh, others_sh = (splats.sh[:, :shared].astype(np.float64) for splats in (old, new))
+    scales = [np.exp(np.clip(splats.scales.astype(np.float64), *LOG_SCALES)) for splats in (old, new)]
+    quats, others = unit_quats(old.quats).astype(np.float64), unit_quats(new.quats).astype(np.float64)
+    others = np.where((quats * others).sum(axis=1, keepdims=True) < 0, -others, others)
+    halves = np.linalg.norm(quats - others, axis=1), np.linalg.norm(quats + others, axis=1)
+    return [
+        ("position", "", size(old.means), np.abs(old.means.astype(np.float64) - new.means)),
+        ("scale", "", size(scales[0]), np.abs(scales[0] - scales[1])),
+        ("opacity", "", 1.0, np.abs(sigmoid(old.opacities) - sigmoid(new.opacities))),
+        ("color", "", 1.0, SH_C0 * np.abs(sh[:, 0] - others_sh[:, 0])),
+        ("harmonics", "", 1.0, np.abs(sh[:, 1:] - others_sh[:, 1:])),
+        ("rotation", " degrees", 360.0, np.degrees(4 * np.arctan2(*halves))),
+    ]

@@ -45,20 +45,7 @@ CULLED = wp.constant(0)
 INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
 
 
-@functools.cache
-def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expose: wp.Function | None) -> wp.Kernel:
-    """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU.
-
-    ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`). ``expose``: the camera moves while
-    its rows are read (:mod:`.rolling`).
-
-    Of a projection that is learned, only the adjoint is launched, after the forward pass of the one that is not. Its
-    kernel takes the lens's coefficients behind ``first``, one row for each group, so that no two write into one place.
-    What Warp's adjoint finds for each is summed outside. Tried: a kernel for the coefficients alone, which takes as
-    long again as projection and adjoint.
-    """
-    number, integer, row2, row3, row4 = TYPES[lanes]
-    turns = wp.array2d[row4] if expose else wp.array[row4]
+for number in (float, vec16):
 
     @wp.func
     def largest(a: number, b: number, c: number, d: number):
@@ -79,6 +66,22 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     @wp.func_grad(covers_pixel)
     def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
         pass
+
+
+@functools.cache
+def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expose: wp.Function | None) -> wp.Kernel:
+    """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU.
+
+    ``reach_of`` says where their falloff ends (:mod:`warp_splat.kernels.falloff`). ``expose``: the camera moves while
+    its rows are read (:mod:`.rolling`).
+
+    Of a projection that is learned, only the adjoint is launched, after the forward pass of the one that is not. Its
+    kernel takes the lens's coefficients behind ``first``, one row for each group, so that no two write into one place.
+    What Warp's adjoint finds for each is summed outside. Tried: a kernel for the coefficients alone, which takes as
+    long again as projection and adjoint.
+    """
+    number, integer, row2, row3, row4 = TYPES[lanes]
+    turns = wp.array2d[row4] if expose else wp.array[row4]
 
     @wp.func
     def reaches(opacity: vec16, alpha_min: float):
