@@ -8,6 +8,7 @@ import torch
 import warp as wp
 from commands import ROOT
 from heavy_tails import fall, heavy_tails, reach
+from hostile import refusal
 from scenes import SCENES
 
 from warp_splat import Falloff, InputError, RasterOptions, check_gradients, rasterize
@@ -91,8 +92,7 @@ def drawn(**options):
     ],
 )
 def test_what_is_no_falloff_is_refused(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
+    refusal(make, match=message)
 
 
 @wp.func

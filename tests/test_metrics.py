@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from hostile import refusal
 from scenes import make_camera
 from test_losses import oracle
 
-from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS, cc_psnr, psnr, ssim, write_results
 from warp_splat.evaluation.perceptual import choose_metrics, flip
 from warp_splat.evaluation.views import evaluate_views
@@ -109,8 +109,7 @@ def test_cc_psnr_neither_fits_nor_counts_what_is_masked():
 def test_metrics_check_their_images(metric):
     image, _ = images(4, 5)
     for bad in (image[:3], image.astype(np.float32), image[..., 0]):
-        with pytest.raises(InputError, match="image: expected"):
-            metric(image, bad)
+        refusal(partial(metric, image, bad), "image: expected")
 
 
 def test_png_keeps_every_value_and_gives_equal_bytes(tmp_path):
@@ -125,9 +124,8 @@ def test_png_errors(tmp_path):
     image, _ = images(31, 17)
     save_png(tmp_path / "a.png", image)
     (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:500])
-    for name, sentence in (("none.png", "could not be read"), ("b.png", r"b\.png")):
-        with pytest.raises(InputError, match=sentence):
-            load_png(tmp_path / name)
+    for name, sentence in (("none.png", "could not be read"), ("b.png", "b.png")):
+        refusal(partial(load_png, tmp_path / name), sentence)
     refusal(lambda: save_png(tmp_path / "a.xyz", image), "ending in .png")
 
 

@@ -1,9 +1,9 @@
 """Gaussians in Newton's simulations: pictures against float64, meshes between them, gradients, memory."""
 
 import gc
-import re
 import sys
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +16,7 @@ from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import small_splats
 
-from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
+from warp_splat import Camera, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
@@ -298,16 +298,16 @@ def test_refused_in_one_sentence(simulation):
     refusal(lambda: SensorSplatCamera(empty), "expected a Gaussian shape")
     state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
     camera = camera_of_fov(WIDTH, HEIGHT, FOV)
-    with pytest.raises(InputError, match=r"rgb_image: expected \(2, 32, 40\) of vec3f, got \(3, 32, 40\) of vec3f"):
-        simulation.sensor.update(state, transforms, camera, **images(3, rgb_image=wp.vec3))
-    with pytest.raises(InputError, match=r"color_image: expected .* of uint32, got .* of vec3f"):
-        simulation.sensor.update(state, transforms, camera, **images(2, color_image=wp.vec3))
+    update = partial(simulation.sensor.update, state, transforms, camera)
+    sizes = "rgb_image: expected (2, 32, 40) of vec3f, got (3, 32, 40) of vec3f"
+    refusal(lambda: update(**images(3, rgb_image=wp.vec3)), sizes)
+    refusal(
+        lambda: update(**images(2, color_image=wp.vec3)), match=r"color_image: expected .* of uint32, got .* of vec3f"
+    )
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
-    with pytest.raises(InputError, match="mesh_index: expected mesh_depth beside it"):
-        simulation.sensor.update(state, transforms, camera, shape_index_image=named, mesh_index=named)
+    refusal(partial(update, shape_index_image=named, mesh_index=named), "mesh_index: expected mesh_depth beside it")
     for worlds in ([0, 2], [0.5, 1.0], [0], 1):
-        with pytest.raises(InputError, match=rf"world_indices: expected 2 of 0..1, got {re.escape(str(worlds))}"):
-            simulation.sensor.update(state, transforms, camera, world_indices=worlds)
+        refusal(partial(update, world_indices=worlds), f"world_indices: expected 2 of 0..1, got {worlds}")
     refusal(lambda: camera_of_fov(WIDTH, HEIGHT, 0), "camera_fov: expected radians between 0 and pi, got 0")
 
 

@@ -14,7 +14,6 @@ from hostile import refusal
 from scene_files import change_json, write_floats, write_image
 from trainings import begin, state_of, stepped, steps
 
-from warp_splat.errors import InputError
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.scene.depth_maps import PARAMETERS, read_inverse_depths
 from warp_splat.training.options import TrainConfig
@@ -183,13 +182,13 @@ def test_what_does_not_fit_is_one_sentence(damage, sentence, mapped):
 
 def test_photographs_that_were_undistorted_have_no_maps(mapped):
     scene, _ = mapped
-    with pytest.raises(InputError, match="which is undistorted as it is read"):
-        read_inverse_depths(replace(scene, train=[replace(scene.train[0], undistorted=True)]), "depths")
+    bent = replace(scene, train=[replace(scene.train[0], undistorted=True)])
+    refusal(lambda: read_inverse_depths(bent, "depths"), "which is undistorted as it is read")
 
 
 def test_a_scene_without_depths_is_refused(scene, tmp_path):
-    with pytest.raises(InputError, match="--parts depth: expected a scene that says which points"):
-        begin(replace(scene, find_tracks=dict), tmp_path, **DEPTH)
+    plain = replace(scene, find_tracks=dict)
+    refusal(lambda: begin(plain, tmp_path, **DEPTH), "--parts depth: expected a scene that says which points")
 
 
 def differentiated(scene, folder, **options):

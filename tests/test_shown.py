@@ -4,11 +4,13 @@ import json
 import shutil
 import struct
 import sys
+from functools import partial
 
 import av
 import numpy as np
 import pytest
 from commands import SCENE, full_disk
+from hostile import refusal
 from splat_files import some_file
 
 from warp_splat.cli import main
@@ -119,11 +121,10 @@ def test_nothing_to_draw_is_said(tmp_path):
         (report.plot_training, [{"iteration": 1}]),
         (report.plot_profile, {}),
     ):
-        with pytest.raises(InputError, match="expected"):
-            draw(tmp_path / "a.png", nothing)
+        refusal(partial(draw, tmp_path / "a.png", nothing), "expected")
     name, photo, render, said = view()
-    with pytest.raises(InputError, match="expected a render of shape"):
-        report.contact_sheet(tmp_path / "a.png", {"": [(name, photo, render[1:], said)]})
+    wrong = {"": [(name, photo, render[1:], said)]}
+    refusal(lambda: report.contact_sheet(tmp_path / "a.png", wrong), "expected a render of shape")
     assert not list(tmp_path.iterdir())
 
 
@@ -150,8 +151,7 @@ def test_format_table():
         "| z        |    - |      |",
     ]
     assert format_table(["a"], []).splitlines() == ["| a   |", "| --- |"]
-    with pytest.raises(InputError, match="expected 2 cells"):
-        format_table(["a", "b"], [["only one"]])
+    refusal(lambda: format_table(["a", "b"], [["only one"]]), "expected 2 cells")
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 63), (1, 1)])
@@ -173,8 +173,7 @@ def test_video_plays_everywhere(tmp_path, height, width):
 def test_video_errors_leave_no_file(tmp_path):
     frame = np.zeros((8, 8, 3), np.uint8)
     for frames, sentence in (([], "at least one"), ([frame, frame[:4]], "each, got"), ([frame[0]], "image: expected")):
-        with pytest.raises(InputError, match=sentence):
-            save_video(tmp_path / "a.mp4", frames, fps=10)
+        refusal(partial(save_video, tmp_path / "a.mp4", frames, fps=10), sentence)
     assert not list(tmp_path.iterdir())
 
 
