@@ -4,6 +4,8 @@ import copy
 import struct
 import tracemalloc
 from contextlib import contextmanager
+from functools import reduce
+from operator import getitem
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -54,6 +56,13 @@ def refusal(run, *words, match=None):
     return message
 
 
+def replace(path, old, new):
+    """Change bytes that are in a file."""
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+
+
 def changed(draw, data):
     """``data`` with a few bytes changed, inserted, removed or repeated, or cut."""
     data = bytearray(data)
@@ -84,6 +93,10 @@ def places(value, path=()):
             yield from places(value[key], (*path, key))
 
 
+def value_at(document, way):
+    return reduce(getitem, way, document)
+
+
 def changed_json(draw, document):
     """``document`` with a few values replaced by awkward ones, by others of it, or removed."""
     document = copy.deepcopy(document)
@@ -92,17 +105,12 @@ def changed_json(draw, document):
         if not paths:
             break
         *way, last = draw(st.sampled_from(paths))
-        holder = document
-        for key in way:
-            holder = holder[key]
+        holder = value_at(document, way)
         match draw(st.sampled_from(["number", "number", "other", "remove"])):
             case "number":
                 holder[last] = copy.deepcopy(draw(st.sampled_from(NUMBERS)))
             case "other":
-                value = document
-                for key in draw(st.sampled_from(paths)):
-                    value = value[key]
-                holder[last] = copy.deepcopy(value)
+                holder[last] = copy.deepcopy(value_at(document, draw(st.sampled_from(paths))))
             case "remove":
                 del holder[last]
     return document

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from commands import SCENE, train
-from hostile import refusal
+from hostile import refusal, replace
 from scene_files import LENS, texture, write_image
 
 from warp_splat.camera import Camera
@@ -97,13 +97,7 @@ def test_a_merge_of_one_model_by_blocks_is_that_model(trained, tmp_path, capsys)
 
 
 def spoil(old, new, name=BLOCK):
-    def change(folder):
-        path = folder / "1" / name
-        text = path.read_text()
-        assert old in text
-        path.write_text(text.replace(old, new))
-
-    return change
+    return lambda folder: replace(folder / "1" / name, old.encode(), new.encode())
 
 
 #: What a merge finds: the numbers of the blocks, and what is wrong with them.

@@ -14,7 +14,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hostile import changed, changed_json, little_memory, one_sentence, tried
+from hostile import changed, changed_json, little_memory, one_sentence, tried, value_at
 from hypothesis import strategies as st
 from splat_files import glb_bytes, glb_parts, sog_bytes, some_file, spz2, spz4
 
@@ -221,11 +221,9 @@ def test_gltf_that_asks_for_too_much(tmp_path, valid, way, value, sentence):
     for folder in (tmp_path, path.parent):
         (folder / "data.bin").write_bytes(valid["data.bin"])
     (path.parent / "link.bin").symlink_to(tmp_path / "data.bin")
-    holder = document = json.loads(valid["gltf"])
+    document = json.loads(valid["gltf"])
     *keys, last = (int(key) if key.isdecimal() else key for key in way.split("__"))
-    for key in keys:
-        holder = holder[key]
-    holder[last] = value
+    value_at(document, keys)[last] = value
     path.write_text(json.dumps(document))
     if sentence is None:
         assert len(load_gaussians(path, report=lambda line: None).splats.means) == 0

@@ -8,7 +8,7 @@ import resource
 
 import numpy as np
 import pytest
-from hostile import changed, changed_json, one_sentence, refusal, tried
+from hostile import changed, changed_json, one_sentence, refusal, replace, tried
 from hypothesis import strategies as st
 from scene_files import (
     load,
@@ -157,9 +157,7 @@ def test_lies_about_counts_are_refused_at_once(tmp_path, name, count):
 )
 def test_what_a_library_complains_of_is_cut_to_a_sentence(tmp_path, old, new, sentence):
     (path,) = with_image(tmp_path, "a.exr")
-    data = path.read_bytes()
-    assert old in data
-    path.write_bytes(data.replace(old, new))
+    replace(path, old, new)
     refusal(lambda: load(tmp_path), match=rf"a\.exr: {sentence}")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile import refusal
+from hostile import refusal, replace
 from splat_files import some_splats
 
 from warp_splat.errors import InputError
@@ -190,9 +190,7 @@ def test_every_cut_gives_one_sentence(tmp_path):
 )
 def test_bad_headers(tmp_path, old, new, sentence):
     save_ply(tmp_path / "a.ply", SplatFile(some_splats(3, 4)))
-    data = (tmp_path / "a.ply").read_bytes()
-    assert old in data
-    (tmp_path / "a.ply").write_bytes(data.replace(old, new, 1))
+    replace(tmp_path / "a.ply", old, new)
     refusal(lambda: load_ply(tmp_path / "a.ply"), match=sentence)
 
 
@@ -203,9 +201,8 @@ def test_a_count_that_lies_fails_at_once_in_a_text(tmp_path, count):
 
 
 def test_missing_file_and_folder(tmp_path):
-    for name, sentence in (("none.ply", "no such file"), ("", "could not be read")):
-        with pytest.raises(InputError, match=sentence):
-            load_ply(tmp_path / name)
+    refusal(lambda: load_ply(tmp_path / "none.ply"), "no such file")
+    refusal(lambda: load_ply(tmp_path), "could not be read")
 
 
 @pytest.mark.parametrize(

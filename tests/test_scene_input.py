@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile import refusal
+from hostile import refusal, replace
 from scene_files import (
     HEIGHT,
     WIDTH,
@@ -22,12 +22,6 @@ from scene_files import (
 def cut(path, keep):
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * keep)])
-
-
-def replace(path, old, new):
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new))
 
 
 def colmap_case(change=lambda root: None, options=None, **written):
@@ -154,7 +148,7 @@ BAD = {
     ),
     "garbage-text": (model_case("points3D.txt", lambda path: path.write_text("hello you\n")), ["sparse/0", "pycolmap"]),
     "unknown-model": (
-        model_case("cameras.txt", lambda path: replace(path, "PINHOLE", "WIDE_EYE")),
+        model_case("cameras.txt", lambda path: replace(path, b"PINHOLE", b"WIDE_EYE")),
         ["sparse/0", "Camera model does not exist"],
     ),
     "unknown-model-binary": (

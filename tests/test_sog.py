@@ -4,7 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hostile import refusal
+from hostile import refusal, value_at
 from scipy.spatial import KDTree
 from splat_files import covariances, sigmoid, silent, sog_bytes, sog_parts, some_file, some_splats, webp_bytes
 
@@ -171,10 +171,7 @@ def parts(tmp_path):
 def test_what_meta_json_says_is_checked(tmp_path, way, value, sentence):
     meta, files = parts(tmp_path)
     *keys, last = way.split(".")
-    holder = meta
-    for key in keys:
-        holder = holder[key]
-    holder[last] = value
+    value_at(meta, keys)[last] = value
     (tmp_path / "b.sog").write_bytes(sog_bytes(meta, files))
     refusal(lambda: load_gaussians(tmp_path / "b.sog"), match=sentence)
 
