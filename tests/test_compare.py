@@ -162,6 +162,7 @@ def test_stored_that_does_not_fit_is_a_row(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ("--threads -1", "--threads: expected at least 0, got -1."),
         ("--modes newton", "--modes: expected some of manual, stepwise, reversible, stored, got newton."),
         ("--modes", "got none"),
         ("--scene nowhere", "nowhere"),

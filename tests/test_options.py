@@ -58,7 +58,7 @@ def test_every_option_survives_the_file(tmp_path):
         ("train --opacity_lr nan", "--opacity_lr: expected a finite number, at least 0, got nan."),
         ("train --opacity_lr inf", "--opacity_lr: expected a finite number, at least 0, got inf."),
         ("train --save_iterations 5 0", "--save_iterations: expected numbers of steps, at least 1, got 0."),
-        ("train --iterations 0", "--iterations: expected at least 1, got 0."),
+        ("train --iterations 0", "--iterations: expected 1 to 2147483647, got 0."),
         ("train --viewer --port 70000", "--port: expected 1 to 65535"),
         ("train --disable_viewer", "unless --viewer asks"),
         ("train --minutes 0", "--minutes: expected more than 0, got 0; leave it out to train by --iterations."),

@@ -68,7 +68,8 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
         if title is None:
             parser.add_argument(item.name, metavar=item.name.upper(), help=item.metadata["help"])
             continue
-        note = "" if default in ("", [], False) else f" (default: {default})"
+        shown = " ".join(map(str, default)) if isinstance(default, list) else default
+        note = "" if default in ("", [], False) else f" (default: {shown})"
         options: dict = {"default": argparse.SUPPRESS, "help": item.metadata["help"].replace("%", "%%") + note}
         if isinstance(default, bool):
             options["action"] = argparse.BooleanOptionalAction

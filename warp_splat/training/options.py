@@ -52,7 +52,11 @@ class LearnOptions:
     """How it learns; the reference's names and defaults (its train.py of October 2024) where it has them."""
 
     iterations: int = flag(
-        30_000, "images to train on, one in a step of each process; schedules count images", least=1, schedule=True
+        30_000,
+        "images to train on, one in a step of each process; schedules count images",
+        least=1,
+        most=2**31 - 1,
+        schedule=True,
     )
     views: int = learning(0, "images in a step, shared by all processes; 0: one for each process")
     minutes: float = flag(0.0, "instead of --iterations: plan a training that ends after so long, from its first step")
