@@ -1,7 +1,8 @@
 """Rates in plans that are shorter than `--preset fast`: those of the preset, and higher ones.
 
-Small trainings on one thread: photographs of an eighth of their edges (embedded: half), a budget of 8,000 (12,000), and
-at most half of that, or little more, to begin with. Runs are kept in a folder and not repeated.
+Trainings on one thread: photographs of an eighth of their edges (embedded: half), a budget of 8,000 (12,000), and at
+most half of that, or little more, to begin with; and photographs of half of their edges, with 100,000. Runs are kept
+in a folder and not repeated.
 
     python benchmarks/short_plans.py --runs output/short --fox path/to/fox --church path/to/church [--out folder]
 """
@@ -20,15 +21,16 @@ from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
 from warp_splat.training.options import TrainConfig
-from warp_splat.training.plan import of_length, task_of
+from warp_splat.training.plan import RATES, of_length, task_of
 from warp_splat.training.trainer import Trainer
 
-RATES = ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr")
-SIZES = {"fox": (8, 8000), "church": (8, 8000), "embedded": (2, 12_000)}  # divisor of edges, budget
+SMALL = {"fox": (8, 8000), "church": (8, 8000), "embedded": (2, 12_000)}  # divisor of edges, budget
+SIZES = SMALL | {"fox, half": (2, 100_000), "church, half": (2, 100_000), "fox, full": (1, 100_000)}
 #: Seeds of (scene, share of the preset's steps, times the preset's rates).
-RUNS = {("embedded", 0.5, 1.41): 1, **{(name, 0.25, 2): 3 for name in SIZES}}
+RUNS = {(name, 0.25, 2): 3 for name in SIZES}
+RUNS |= {("embedded", 0.5, 1.41): 1, ("fox, half", 0.5, 1.41): 3, ("church, half", 0.5, 1.41): 3}
 RUNS |= {("embedded", 0.25, 4): 1, ("embedded", 0.125, 2): 1}
-RUNS |= {(name, 0.0625, times): 1 for times in (1.41, 2, 4) for name in SIZES}
+RUNS |= {(name, 0.0625, times): 1 for times in (1.41, 2, 4) for name in SMALL}
 HEADERS = ("scene", "steps", "times the rates", "seeds", "PSNR dB", "gain", "from to", "gain, training views", "SSIM")
 
 
@@ -69,7 +71,8 @@ def main() -> None:
             for rate, runs in found.items():
                 path = arguments.runs / f"{name}_{factor:g}_{rate:g}_{seed}.json"
                 if not path.exists():
-                    scenes[name] = scenes.get(name) or load_scene(places[name], eval=True, resolution=SIZES[name][0])
+                    place = places[name.partition(",")[0]]
+                    scenes[name] = scenes.get(name) or load_scene(place, eval=True, resolution=SIZES[name][0])
                     path.write_text(json.dumps(train(scenes[name], name, factor, rate, seed)))
                 runs.append(json.loads(path.read_text()))
         before, after = ({key: np.array([run[key] for run in runs]) for key in runs[0]} for runs in found.values())
@@ -79,7 +82,7 @@ def main() -> None:
         rows.append((name, f"{factor:g}", f"{times:g}", seeds, *quality, f"{after['ssim'].mean():.4f}"))
     note = (
         "Held-out views, beside the preset's rates with the same seeds. Photographs of an eighth of their edges "
-        "(embedded: half), budgets of 8,000 and 12,000 times the root of the share of steps."
+        "(embedded: half), budgets of 8,000 and 12,000, at half size of 100,000, times the root of the share of steps."
     )
     write_table("short_plans", arguments.out, HEADERS, rows, note)
 

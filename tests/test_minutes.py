@@ -18,6 +18,7 @@ from warp_splat.training.deadline import REACHED, Deadline, plan_training
 from warp_splat.training.options import LearnOptions, TrainConfig, schedule_of
 from warp_splat.training.photographs import shrink_at
 from warp_splat.training.plan import (
+    RATES,
     Cost,
     Reached,
     StepTime,
@@ -65,7 +66,10 @@ def test_plans_take_their_time_and_keep_the_shape(minutes):
     for name, value in before.items():
         assert after[name] == pytest.approx(factor * value, rel=2e-3, abs=1.0), name
     others = {name for name, value in plan.flat().items() if value != FAST.flat()[name]}
-    assert others == {name for name in before if before[name]} | ({"max_gaussians"} if factor < 1 else set())
+    assert others == {name for name in before if before[name]} | ({"max_gaussians", *RATES} if factor < 1 else set())
+    for name in RATES:  # higher by the root of what is left out, at most twice
+        quicker = getattr(plan.learn, name) / getattr(FAST.learn, name)
+        assert quicker == pytest.approx(min(max(factor**-0.5, 1), 2), rel=5e-3), name
 
 
 def test_a_slower_machine_gets_fewer_steps_and_gaussians():

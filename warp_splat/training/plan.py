@@ -2,8 +2,8 @@
 
 The options of a training are the shape of a schedule: a plan stretches or shrinks all its steps by one factor, until
 what they cost adds up to the time. Below the shape's own length there are also fewer Gaussians, by the square root of
-that factor. A clock decides on the end itself (:mod:`warp_splat.training.deadline`), so that a plan has to be good, but
-not exact.
+that factor, and rates are higher by it, up to :data:`QUICKEST` times. A clock decides on the end itself
+(:mod:`warp_splat.training.deadline`), so that a plan has to be good, but not exact.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from warp_splat.training.photographs import shrink_at
 COOLDOWN = 0.2  # share of the steps, where the shape has none: the end needs a beginning
 SHORTEST, LONGEST = 1e-4, 1e4  # times the shape
 SAMPLES = 1000  # steps whose costs are added up
+RATES = ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr")
+QUICKEST = 2.0  # times the rates of the shape; four times lost 1 to 8 dB (benchmarks/short_plans.py)
 LIKE = 1.5  # factor between the steps and between the pixels of two trainings, up to which they are comparable
 
 
@@ -89,8 +91,12 @@ def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
     steps = schedule_of(config)
     steps["cooldown"] = steps["cooldown"] or round(COOLDOWN * steps["iterations"])
     steps = {name: max(round(factor * value), least[name]) if value > 0 else value for name, value in steps.items()}
-    most = max(round(task.most * min(factor, 1.0) ** 0.5), task.start)
-    return config.changed(**steps | {"settle_from_iter": 0}, max_gaussians=most)  # the clock says when to settle
+    shorter = min(factor, 1.0) ** 0.5
+    most = max(round(task.most * shorter), task.start)
+    quicker = min(1.0 / shorter, QUICKEST)
+    rates = {name: float(f"{quicker * getattr(config.learn, name):.3g}") for name in RATES if factor < 1}
+    steps["settle_from_iter"] = 0  # the clock says when to settle
+    return config.changed(**steps, **rates, max_gaussians=most)
 
 
 def plan_for(config: TrainConfig, cost: Cost, seconds: float, task: Task) -> TrainConfig:
@@ -113,7 +119,7 @@ def as_flags(config: TrainConfig) -> str:
     if not config.learn.settle_from_iter:
         idle.add("settle_from_iter")
     shown = {name: value for name, value in schedule_of(config).items() if name not in idle}
-    shown |= {name: getattr(config.learn, name) for name in ("coarse", "coarse_by")}
+    shown |= {name: getattr(config.learn, name) for name in ("coarse", "coarse_by", *RATES)}
     shown |= {"max_gaussians": config.grow.max_gaussians}
     preset = f"--preset {config.data.preset} " if config.data.preset else ""
     return preset + " ".join(f"--{name} {value}" for name, value in shown.items())
