@@ -1,7 +1,8 @@
-"""Between linear light and what a screen shows, and how maps of colors are held. For NumPy and torch alike."""
+"""Between linear light and what a screen shows, maps of colors, and harmonics. For NumPy and torch alike."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -34,3 +35,28 @@ def to_bytes(image: torch.Tensor, linear: bool = False) -> np.ndarray:
 
     image = image.detach().clamp(0.0, 1.0)
     return ((to_srgb(image, torch.where) if linear else image) * 255.0).round().to(torch.uint8).cpu().numpy()
+
+
+def harmonics_at(x: Any, y: Any, z: Any, degree: int) -> list:
+    """Of unit vectors, [(degree + 1)^2]: the recurrences of Sloan (2013), with the signs of the trainers' files.
+
+    The first is the same in all directions, a number; the others are arrays as x. ``even`` and ``odd`` are the cosine
+    and the sine of m times the azimuth, times the m-th power of their radius.
+    """
+    found = {}
+    even, odd, first = x, y, 1.0
+    for m in range(degree + 1):
+        before, here = 0.0, first  # Legendre's functions of the last two degrees
+        for band in range(m, degree + 1):
+            norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
+            if m == 0:
+                found[band, 0] = norm * here
+            else:
+                scaled = math.sqrt(2) * norm * here
+                found[band, m], found[band, -m] = scaled * even, scaled * odd
+            slope, last = (2 * band + 1) / (band - m + 1), (band + m) / (band - m + 1)
+            before, here = here, slope * here * z - last * before
+        if m > 0:
+            even, odd = x * even - y * odd, x * odd + y * even
+        first *= -(2 * m + 1)
+    return [found[band, m] for band in range(degree + 1) for m in range(-band, band + 1)]

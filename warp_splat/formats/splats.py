@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from warp_splat.color import harmonics_at
 from warp_splat.errors import InputError
 from warp_splat.formats.files import Unexpected
 from warp_splat.formats.stored import sigmoid
@@ -161,13 +162,6 @@ def _turn_harmonics(turn: np.ndarray, coefficients: int) -> np.ndarray:
 
 def _harmonics(directions: np.ndarray, coefficients: int) -> np.ndarray:
     """Real spherical harmonics [M, K] along ``directions`` [M, 3] of any length."""
-    from scipy.special import sph_harm_y  # noqa: PLC0415 - as above
-
-    x, y, z = directions.T
-    polar, azimuth = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
-    columns = []
-    for degree in range(COEFFICIENTS.index(coefficients) + 1):
-        for order in range(-degree, degree + 1):
-            value = sph_harm_y(degree, abs(order), polar, azimuth)
-            columns.append(value.real if order == 0 else np.sqrt(2) * (value.imag if order < 0 else value.real))
-    return np.stack(columns, axis=1)
+    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    constant, *others = harmonics_at(x, y, z, COEFFICIENTS.index(coefficients))
+    return np.stack([np.full_like(x, constant), *others], axis=1)

@@ -102,7 +102,7 @@ def rasterization(
     drawn: list[torch.Tensor] = []
     if sparse_grad and packed:
         shapes = ("means", "quats", "scales", "covars")
-        given |= {name: _thin(given[name], drawn) for name in shapes if given[name] is not None}
+        given |= {name: _Thinned.apply(given[name], drawn) for name in shapes if given[name] is not None}
     request = check_request(Request(**given))
     seen = see(request)
     drawn.append(seen.drawn)
@@ -132,7 +132,10 @@ def _show(request: Request, seen: Seen) -> tuple[dict[str, torch.Tensor], Seen]:
 
 
 class _Thinned(torch.autograd.Function):
-    """The same; its gradient is a sparse tensor of what any camera sees."""
+    """The same; its gradient is a sparse tensor of what any camera sees.
+
+    ``drawn`` gets the mask [S, C, N] of that before gradients come.
+    """
 
     @staticmethod
     def forward(ctx, tensor, drawn):
@@ -142,14 +145,8 @@ class _Thinned(torch.autograd.Function):
     @staticmethod
     def backward(ctx, adj):
         seen = ctx.drawn[0].any(1).view(adj.shape[:-1])
-        return torch.sparse_coo_tensor(
-            seen.nonzero().T, adj[seen], adj.shape, is_coalesced=True, check_invariants=True
-        ), None
-
-
-def _thin(tensor: torch.Tensor, drawn: list[torch.Tensor]) -> torch.Tensor:
-    """``tensor`` with sparse gradients; ``drawn`` gets the mask [S, C, N] of those that are seen before they come."""
-    return _Thinned.apply(tensor, drawn)
+        places, values = seen.nonzero().T, adj[seen]
+        return torch.sparse_coo_tensor(places, values, adj.shape, is_coalesced=True, check_invariants=True), None
 
 
 def _tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:

@@ -43,10 +43,7 @@ def see(request: Request) -> Seen:
         u, v, *slopes = _LENSES[request.camera_model](request, *points.unbind(-1))
         places = pixels_at(request, u, v)
         focal = request.Ks[..., (0, 1), (0, 1), None, None, None]  # on the side of the matrix: it has fewer entries
-        rows = [
-            rows_turned(torch.stack(slope, -1), focal[:, :, axis] * turn[:, :, None])
-            for axis, slope in enumerate(slopes)
-        ]
+        rows = [rows_turned(torch.stack(s, -1), focal[:, :, k] * turn[:, :, None]) for k, s in enumerate(slopes)]
         xx, xy, yy, sharp = _variances(request, *rows)
     wide = sharp + request.eps2d * (xx + yy) + request.eps2d**2
     xx, yy = xx + request.eps2d, yy + request.eps2d

@@ -134,6 +134,5 @@ class _Assembly:
         # a target may be an argument: all values come before it changes
         found = [f"{part}_returned{i}" for i in range(len(values))]
         body += [ast.Assign([ast.Name(name, ast.Store())], value) for name, value in zip(found, values, strict=True)]
-        return body + [
-            ast.Assign([place], ast.Name(name, ast.Load())) for place, name in zip(targets, found, strict=True)
-        ]
+        pairs = zip(targets, found, strict=True)
+        return body + [ast.Assign([place], ast.Name(name, ast.Load())) for place, name in pairs]

@@ -16,7 +16,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.slots import CHANNEL
 from warp_splat.raster.blend import Blending
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.data import Bins, Gaussians, Splats2D, alphas_of, variant_of
+from warp_splat.raster.data import LESS, Bins, Gaussians, Splats2D, alphas_of, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
 from warp_splat.runtime.launch import check_memory, view
@@ -79,10 +79,8 @@ def find_strongest(splats: Splats2D, blending: Blending) -> Strongest:
     """The ``options.strongest`` Gaussians of each pixel; weights are differentiable in the splats, the median in z."""
     bins, camera, options = blending.bins, blending.camera, blending.options
     shape, most, device = (camera.height, camera.width), options.strongest, splats.means2d.device
-    ranks, weights = (
-        torch.empty(*shape, most, dtype=torch.int32, device=device),
-        torch.empty(*shape, most, device=device),
-    )
+    ranks = torch.empty(*shape, most, dtype=torch.int32, device=device)
+    weights = torch.empty(*shape, most, device=device)
     median = torch.empty(shape, dtype=torch.int32, device=device)
     _launch(blending, weights, weights.new_empty(0, 0), strongest=(ranks, median))
     gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
@@ -253,7 +251,7 @@ def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
     count, device = len(bins.instances), bins.instances.device
     if (needed := 4 * count * columns) > MANY:
         what = f"rasterize: the gradients of {count} tile instances take"
-        check_memory(what, needed, device, "render a smaller image or fewer, smaller Gaussians")
+        check_memory(what, needed, device, LESS)
     return torch.empty(count, columns, dtype=torch.float32, device=device)
 
 

@@ -15,7 +15,7 @@ from warp_splat.kernels.cpu.lists import DIGITS, count_digits, sort_digits
 from warp_splat.kernels.cuda.lists import make_count_tiles, make_gather_tiles, make_list_tiles
 from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.raster.data import MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
+from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.runtime.launch import check_memory, empty, launch, read_later, view
 from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, get_threads, in_slices, torch_slices
 
@@ -220,13 +220,9 @@ def _last(ends: np.ndarray) -> int:
 def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:
     touch = f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times"
     if count > MAX_INSTANCES:
-        raise InputError(
-            f"{touch}, more than the {MAX_INSTANCES} that fit; render a smaller image or fewer, smaller Gaussians."
-        )
+        raise InputError(f"{touch}, more than the {MAX_INSTANCES} that fit; {LESS}.")
     if count > MANY:
-        check_memory(
-            f"{touch}, which takes", BYTES * count, device, "render a smaller image or fewer, smaller Gaussians"
-        )
+        check_memory(f"{touch}, which takes", BYTES * count, device, LESS)
 
 
 def _check_longest(count: int) -> None:

@@ -139,10 +139,8 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
     else:
         check_tensor("sh", sh, (count, "K", 3), device)
         sh_dc, sh_rest = sh[:, :1], sh[:, 1:]
-    if sh_dc.shape[1] + sh_rest.shape[1] not in (1, 4, 9, 16):
-        raise InputError(
-            f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {sh_dc.shape[1] + sh_rest.shape[1]}."
-        )
+    if (found := sh_dc.shape[1] + sh_rest.shape[1]) not in (1, 4, 9, 16):
+        raise InputError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {found}.")
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh_dc, "sh ": sh_rest}
     for name, tensor in named.items():
         _check_finite(name.strip(), tensor.detach())
@@ -164,10 +162,8 @@ def check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.
     wanted = f"[{', '.join(map(str, shape))}]"
     if not isinstance(tensor, torch.Tensor):
         raise InputError(f"{name}: expected a float32 torch tensor {wanted}, got {type(tensor).__name__}.")
-    fits = tensor.dim() == len(shape) and all(
-        isinstance(a, str) or a == b for a, b in zip(shape, tensor.shape, strict=True)
-    )
-    if not fits:
+    sides = zip(shape, tensor.shape, strict=False)
+    if tensor.dim() != len(shape) or any(a != b for a, b in sides if not isinstance(a, str)):
         raise InputError(f"{name}: expected shape {wanted}, got {list(tensor.shape)}.")
     if tensor.dtype != torch.float32:
         raise InputError(

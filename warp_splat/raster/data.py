@@ -21,6 +21,7 @@ from warp_splat.kernels.structs import BinsView, PixelsView, Splats2DView
 from warp_splat.runtime.launch import pack_struct
 
 MAX_INSTANCES = 2**31 - 1  # kernels index instances with 32 bits
+LESS = "render a smaller image or fewer, smaller Gaussians"  # where there is no room for the instances
 LONG = 1000  # views: a training sees all of its photographs meanwhile, mostly several times
 WIDTHS = (2, 3, 1, 3, 1)  # columns of a slot: mean, conic, opacity, color, and depth where it is asked for
 

@@ -119,9 +119,7 @@ class MovableScene:
         """Of the loss over the pixels ``kept`` [H, W], float64, shaped like the parameter."""
         upstream = self.weights * kept[..., None]
         tensor = self.tensor(name)
-        found = torch.autograd.grad(
-            self.picture, tensor, upstream, retain_graph=True, allow_unused=True, materialize_grads=True
-        )
+        found = torch.autograd.grad(self.picture, tensor, upstream, retain_graph=True, materialize_grads=True)
         return found[0].double()
 
     @torch.no_grad()
@@ -256,13 +254,10 @@ def _extrapolate(scene: MovableScene, rung: int, far: tuple, near: tuple) -> Quo
 
 def try_direction(scene: MovableScene, name: str, step: torch.Tensor, rungs: Sequence[int]) -> Trial:
     """Gradient against differences along ``step``, with the best of ``rungs``, which follow each other."""
-    pairs = (
-        tuple(scene.draw(name, sign * 2.0**rung * step) for sign in (1, -1))
-        for rung in range(rungs[0] - 1, rungs[-1] + 1)
-    )
-    quotients = [
-        _extrapolate(scene, rung, far, near) for rung, (near, far) in zip(rungs, itertools.pairwise(pairs), strict=True)
-    ]
+    sizes = (2.0**rung for rung in range(rungs[0] - 1, rungs[-1] + 1))
+    pairs = (tuple(scene.draw(name, sign * size * step) for sign in (1, -1)) for size in sizes)
+    steps = zip(rungs, itertools.pairwise(pairs), strict=True)
+    quotients = [_extrapolate(scene, rung, far, near) for rung, (near, far) in steps]
     best = min(quotients, key=lambda quotient: quotient.rank)
     gradient = scene.gradient(name, best.kept)
     return Trial(step, best, gradient, float((gradient * step).sum()) / LEAST)

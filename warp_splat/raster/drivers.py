@@ -122,10 +122,8 @@ class Driver:
             adj_pixels: upstream gradients; dense.
         """
         slots = bins.new_slots(options)
-        upstream, adj_background, dropped, steps = self.spread_upstream(
-            bins, options, background, saved, adj_pixels, slots
-        )
-        self.differentiate(mode, bins, options, saved, upstream, steps, slots)
+        up, adj_background, dropped, steps = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
+        self.differentiate(mode, bins, options, saved, up, steps, slots)
         if self.peeks:  # numpy's sum is one after another, whatever the number of torch's threads
             return slots, torch.from_numpy(adj_background.numpy().sum(0)), dropped
         return slots, adj_background.sum(0), dropped
@@ -225,11 +223,8 @@ def gather_by_warp(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | 
     filled = [*tables, *[slots.new_empty(0, 0)] * (len(views.vars) - len(tables))]
     tables_out = pack_struct(views, **dict(zip(views.vars, filled, strict=True)))
     inputs = [bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32), view(slots, wp.float32)]
-    kernel, warps = (
-        blocks_gather.make_gather(tuple(table.shape[1] for table in tables)),
-        -(-len(bins.gaussians) // WARP),
-    )
-    launch_blocks(kernel, warps, inputs, [tables_out], slots.device)
+    kernel = blocks_gather.make_gather(tuple(table.shape[1] for table in tables))
+    launch_blocks(kernel, -(-len(bins.gaussians) // WARP), inputs, [tables_out], slots.device)
     return [grad.squeeze(1) for grad in grads]
 
 

@@ -58,10 +58,8 @@ def _through_grid(image: torch.Tensor, numbers: torch.Tensor, pivot: float) -> t
     brightness = (r + g + b) * (2.0 / 3.0) - (1.0 + 2.0 * pivot)
     # not by linspace, which rounds differently by processor
     rows, columns = ((torch.arange(n, device=image.device) + 0.5) * (2.0 / n) - 1.0 for n in (height, width))
-    places = [columns.expand(height, width), rows[:, None].expand(height, width), brightness]
-    found = functional.grid_sample(
-        numbers[None], torch.stack(places, -1)[None, None], padding_mode="border", align_corners=True
-    )
+    places = torch.stack([columns.expand(height, width), rows[:, None].expand(height, width), brightness], -1)
+    found = functional.grid_sample(numbers[None], places[None, None], padding_mode="border", align_corners=True)
     n = found[0, :, 0]
     changes = [(n[k] * r + n[3 + k] * g) + (n[6 + k] * b + n[9 + k]) for k in range(3)]
     return image + torch.stack(changes, -1)

@@ -80,15 +80,13 @@ class GradientReport:
 
     def _sentence(self) -> str:
         off, unclear = self.named("off"), self.named("unclear")
-        text = f"Adjoint {self.adjoint!r}: "
-        text += (
-            f"off by more than {self.tolerance:g} and the uncertainty: {', '.join(off)}" if off else "nothing is off"
-        )
+        text = f"off by more than {self.tolerance:g} and the uncertainty: {', '.join(off)}" if off else "nothing is off"
         if self.worst:
             worst = self.worst
             text += f" (most in {worst.name}; there, Gaussian {worst.index} alone has {worst.analytic:.5g} instead of "
             text += f"{worst.difference:.5g})"
-        return text + (f"; too uncertain to tell: {', '.join(unclear)}." if unclear else ".")
+        rest = f"; too uncertain to tell: {', '.join(unclear)}" if unclear else ""
+        return f"Adjoint {self.adjoint!r}: {text}{rest}."
 
 
 def check_gradients(

@@ -171,9 +171,7 @@ def launch_in_lanes(
     for size, rows, runs in parts:
         if runs:
             bounds = even_slices(runs, max(SMALLEST_SLICE // (size * run), 1))
-            given, made = (
-                [_in_lanes(table, TYPES[size], count, rows) for table in tables] for tables in (inputs, outputs)
-            )
+            given, made = ([_in_lanes(t, TYPES[size], count, rows) for t in tables] for tables in (inputs, outputs))
             if sums:
                 made.append(view(found[done : done + runs], sums[1]))
             launch(make(size), runs, given, made, bounds=bounds, device=device)

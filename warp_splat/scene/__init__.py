@@ -12,16 +12,7 @@ import numpy as np
 from warp_splat.color import from_srgb
 from warp_splat.config import LENSES
 from warp_splat.errors import InputError
-from warp_splat.scene.photos import (
-    OTHER_PHOTOS,
-    PHOTOS,
-    ImageFinder,
-    find_files,
-    find_mask,
-    is_video,
-    photo_root,
-    sfm_hint,
-)
+from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, ImageFinder, find_files, is_video, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, visible
 from warp_splat.text import Report
 
@@ -120,9 +111,7 @@ def _drop_masked(views: list[View], source: str | Path, report: Report) -> list[
     """The views with a pixel that counts."""
     from warp_splat.scene.decoding import in_turn  # noqa: PLC0415  keeps `import warp_splat` light
 
-    kept = [
-        view for view, loaded in zip(views, in_turn(views), strict=True) if loaded.mask is None or loaded.mask.any()
-    ]
+    kept = [view for view, read in zip(views, in_turn(views), strict=True) if read.mask is None or read.mask.any()]
     require_unmasked(len(views), len(views) - len(kept), source)
     if len(kept) < len(views):
         report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")
@@ -202,7 +191,7 @@ def with_masks(photos: list[Photo], source: Path, report: Report) -> list[Photo]
     """The photos with the masks that lie in the scene's folder, besides those that they have."""
     if photos and (source / MASKS).is_dir():
         masks = ImageFinder(source / MASKS)
-        photos = [photo if photo.mask else replace(photo, mask=find_mask(masks, photo.name)) for photo in photos]
+        photos = [photo if photo.mask else replace(photo, mask=masks.mask_of(photo.name)) for photo in photos]
         without = [photo.name for photo in photos if not photo.mask]
         rest = f"; {without[0]} and {len(without) - 1} others are used whole" if without else ""
         report(f"Masks for {len(photos) - len(without)} of {len(photos)} images{rest}.")

@@ -97,9 +97,12 @@ def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
             f"{path}: expected a map of {file[0]} x {file[1]} pixels as its photograph has, or scaled by one factor, "
             f"got {numbers.shape[1]} x {numbers.shape[0]}; make it from the photograph."
         )
-    rows, columns = (
-        (np.arange(n) * 2 + 1) * size // (2 * n) for n, size in zip((height, width), numbers.shape, strict=True)
-    )
+    rows, columns = nearest_of(height, numbers.shape[0]), nearest_of(width, numbers.shape[1])
     found = np.maximum(numbers[rows[:, None], columns], 0.0) * fit.scale + fit.offset
     known = np.isfinite(found) & (found >= 0.0) & (True if (mask := view.mask) is None else mask > 0)
     return np.where(known, found, -1.0).astype(np.float32)
+
+
+def nearest_of(count: int, size: int) -> np.ndarray:
+    """Of ``size`` pixels along a side, those nearest to each of ``count`` pixels, [count]."""
+    return (np.arange(count) * 2 + 1) * size // (2 * count)

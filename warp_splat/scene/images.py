@@ -278,12 +278,10 @@ def _buffer(array: np.ndarray) -> oiio.ImageBuf:
     return oiio.ImageBuf(np.ascontiguousarray(array, np.float32))  # refuses arrays in Fortran's order
 
 
-def _resampled(
-    operation: Callable[..., oiio.ImageBuf], image: np.ndarray, width: int, height: int, *rest
-) -> np.ndarray:
+def _resampled(change: Callable[..., oiio.ImageBuf], image: np.ndarray, width: int, height: int, *rest) -> np.ndarray:
     """What an operation of OpenImageIO makes of ``image`` [H, W, C]: [height, width, C]."""
     roi = oiio.ROI(0, width, 0, height, 0, 1, 0, image.shape[2])  # without it, of the size of the source
-    found = operation(_buffer(image), *rest, roi=roi, nthreads=1)
+    found = change(_buffer(image), *rest, roi=roi, nthreads=1)
     if found.has_error:
         raise RuntimeError(f"OpenImageIO: {found.geterror()}")
     return np.asarray(found.get_pixels(oiio.FLOAT))

@@ -91,6 +91,14 @@ class ImageFinder:
         """Whether there is a file of exactly this name in the folder."""
         return path.name in self._files(path.parent)
 
+    def mask_of(self, name: str) -> Path | None:
+        """In a folder of masks, that of the photograph ``name``: name.jpg.png or name.png."""
+        path = Path(name)
+        for candidate in (path.with_name(f"{path.name}.png"), path.with_suffix(".png")):
+            if self.has(candidate):
+                return self.root / candidate
+        return None
+
     def find_all(self, names: list[str], what: str, hint: str, report: Report) -> list[Path]:
         """The files of all; says how many were found under other endings.
 
@@ -117,12 +125,3 @@ class ImageFinder:
                 files = frozenset()
             self._folders[folder] = files
         return self._folders[folder]
-
-
-def find_mask(masks: ImageFinder, name: str) -> Path | None:
-    """The mask of the photograph ``name`` in the folder of ``masks``: name.jpg.png or name.png."""
-    path = Path(name)
-    for candidate in (path.with_name(f"{path.name}.png"), path.with_suffix(".png")):
-        if masks.has(candidate):
-            return masks.root / candidate
-    return None

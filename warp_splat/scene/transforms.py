@@ -174,9 +174,8 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
         params = (*focal, k1, k2, k3, k4)
     elif model in PERSPECTIVE and not k4:
         model = "FULL_OPENCV" if k3 else "OPENCV" if k1 or k2 or p1 or p2 else "PINHOLE"
-        params = {"PINHOLE": focal, "OPENCV": (*focal, k1, k2, p1, p2)}.get(
-            model, (*focal, k1, k2, p1, p2, k3, 0, 0, 0)
-        )
+        bent = (*focal, k1, k2, p1, p2)
+        params = {"PINHOLE": focal, "OPENCV": bent}.get(model, (*bent, k3, 0, 0, 0))
     else:
         raise InputError(
             f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2, {FISHEYE} with k1 to k4 or {PANORAMA}, "

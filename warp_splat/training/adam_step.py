@@ -58,10 +58,8 @@ def _launch(tables: list, numbers: list, keyed: list[int], count: int, radii: to
 
 def _addresses(tables: list, widths: list[int], row: int) -> list[list[int]]:
     """Where a row begins in each tensor of each table."""
-    return [
-        [t.data_ptr() + t.element_size() * width * row for t in table]
-        for table, width in zip(tables, widths, strict=True)
-    ]
+    pairs = zip(tables, widths, strict=True)
+    return [[t.data_ptr() + t.element_size() * width * row for t in table] for table, width in pairs]
 
 
 def _launch_numbers(tables: list, numbers: list, keys: list[int], count: int, radii: torch.Tensor | None) -> None:

@@ -93,10 +93,8 @@ def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
     folder, source = Path(config.report.model_path or default), config.data.source_path
     model_folder.check_place(folder)
     if source:
-        place, scene, photographs = (
-            path.resolve() for path in (folder, Path(source), Path(source, config.data.images))
-        )
-        if place == scene or (photographs != scene and place.is_relative_to(photographs)):
+        place, scene, photos = (path.resolve() for path in (folder, Path(source), Path(source, config.data.images)))
+        if place == scene or (photos != scene and place.is_relative_to(photos)):
             raise InputError(f"-m {folder}: expected another folder than the scene's or its images'; choose a new one.")
     refuse_other_training(folder, begun)
     return folder

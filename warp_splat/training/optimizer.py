@@ -2,6 +2,8 @@
 
 import functools
 import math
+import os
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -13,7 +15,6 @@ import torch
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import GaussianModel
-from warp_splat.runtime.mapped import zeros_in_file
 from warp_splat.training.adam_step import HALF, load_adam, move
 from warp_splat.training.options import LearnOptions
 
@@ -35,6 +36,28 @@ def log_linear(start: float, end: float, iteration: int, last: int) -> float:
 @functools.cache
 def _root(base: float, degree: int) -> Decimal:
     return Decimal(base) ** (Decimal(1) / degree)
+
+
+def zeros_in_file(folder: Path, shape: Sequence[int], dtype: torch.dtype) -> torch.Tensor:
+    """Zeros of ``shape`` on the CPU, in a file without a name in ``folder`` that goes when the tensor does.
+
+    The system keeps in memory what of it is in use, and writes the rest back.
+
+    Raises:
+        InputError: if there is no room for it.
+    """
+    size = dtype.itemsize * math.prod(shape)
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            if hasattr(os, "posix_fallocate"):  # a page without room on the disk would end the process
+                os.posix_fallocate(file.fileno(), 0, max(size, 1))
+            content = np.memmap(file, np.uint8, "r+" if os.fstat(file.fileno()).st_size else "w+", shape=max(size, 1))
+    except OSError as error:
+        raise InputError(
+            f"{folder}: expected {size / 2**20:.0f} MiB more on its disk for --out_of_core ({error.strerror}); free "
+            "some, or choose another folder with -m."
+        ) from error
+    return torch.from_numpy(content)[:size].view(dtype).view(*shape)
 
 
 @dataclass

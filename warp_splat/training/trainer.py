@@ -252,10 +252,9 @@ class Trainer:
         Raises:
             InputError: if its training views are not those of the scene, or something in it does not fit.
         """
-        names, extent = [view.name for view in self.scene.train], self.scene.extent
-        if checkpoint.fact("views", list) != names or not math.isclose(
-            checkpoint.fact("extent", float), extent, rel_tol=1e-6
-        ):
+        names, extent = checkpoint.fact("views", list), checkpoint.fact("extent", float)
+        same = names == [view.name for view in self.scene.train]
+        if not (same and math.isclose(extent, self.scene.extent, rel_tol=1e-6)):
             raise InputError(
                 f"{checkpoint.path}: expected training views of the same names and positions as in this checkpoint, "
                 "found other ones in the scene; name the scene that it was trained on (-s, -i, --eval)."

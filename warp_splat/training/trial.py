@@ -129,9 +129,8 @@ def quality(config: TrainConfig, scene: Scene, parts: list[str], steps: int, fol
     held = scene.train[fold::PERIOD]
     kept = [view for place, view in enumerate(scene.train) if place % PERIOD != fold]
     part = replace(scene, train=kept, test=held, find_tracks=lambda: scene.tracks)
-    trainer = Trainer(
-        part, _shortened(config, scene, steps).changed(parts=",".join(parts), seed=config.learn.seed ^ fold)
-    )
+    short = _shortened(config, scene, steps).changed(parts=",".join(parts), seed=config.learn.seed ^ fold)
+    trainer = Trainer(part, short)
     for iteration in range(1, steps + 1):
         if iteration > 1:
             trainer.update(iteration - 1)

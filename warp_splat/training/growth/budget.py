@@ -63,7 +63,8 @@ class Budget(Reference):
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         keep, total = survivors(raw), self.processes.total
         if (kept := total(int(keep.sum()))) >= due:
-            keep &= ~self._faintest(keep, max(round(MOVED * kept), kept - due))
+            faint = torch.where(keep, raw["opacities"], torch.inf)  # the faintest go
+            keep &= ~self.processes.lowest(faint, max(round(MOVED * kept), kept - due))
         kept = total(int(keep.sum()))
         pruned, room = total(len(keep)) - kept, min(max(due - kept, 0), kept)
         if not pruned + room or not kept:  # an empty scene could never recover
@@ -78,10 +79,6 @@ class Budget(Reference):
         self.optimizer.arrange(self.model.arranging(self.processes, sizes))
         self.clear()
         return Change(0, len(split), pruned)
-
-    def _faintest(self, keep: torch.Tensor, count: int) -> torch.Tensor:
-        """The ``count`` Gaussians of the lowest opacity [N]."""
-        return self.processes.lowest(torch.where(keep, self.model.parameters["opacities"].detach(), torch.inf), count)
 
     def state(self) -> dict[str, torch.Tensor]:
         """As the reference's, and how many Gaussians there were at the start."""

@@ -15,7 +15,7 @@ from warp_splat.errors import InputError
 from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.coverage import few_photographs
-from warp_splat.scene.depth_maps import read_inverse_depths
+from warp_splat.scene.depth_maps import nearest_of, read_inverse_depths
 from warp_splat.scene.types import Scene, View, visible
 from warp_splat.training.optimizer import log_linear
 from warp_splat.training.parts import DepthOptions
@@ -49,9 +49,7 @@ class Depth:
         self.options, self.iterations, self.extent = options, setting.iterations, setting.scene.extent
         self.device = setting.model.device
         if options.depth_l1_weight_init and not options.depth_l1_weight_final:
-            raise InputError(
-                "--depth_l1_weight_final: expected a positive number, since the weight falls to it, got 0."
-            )
+            raise InputError("--depth_l1_weight_final: expected a positive number, since weights fall to it, got 0.")
         self.points = {view: points_in(view, setting.scene) for view in setting.scene.train}
         self.maps = read_inverse_depths(setting.scene, options.depths) if options.depths else {}
         if not self.maps and not any(len(known.nearness) for known in self.points.values()):
@@ -112,10 +110,7 @@ class Depth:
         """The numbers nearest to the pixels."""
         if view not in self.maps:
             return None
-        rows, columns = (
-            (np.arange(n) * 2 + 1) * size // (2 * n)
-            for n, size in ((height, view.camera.height), (width, view.camera.width))
-        )
+        rows, columns = nearest_of(height, view.camera.height), nearest_of(width, view.camera.width)
         nearness = np.float32(self.extent) * self.maps[view][rows[:, None], columns]
         return Target(slice(None), torch.from_numpy(nearness.reshape(-1)).to(self.device))
 

@@ -51,13 +51,10 @@ class Exposure:
         """If photographs differ in brightness or tint, as the colors of points in them tell."""
         gains = gains_of(scene)
         if not gains.stops:
-            return Verdict(
-                False, "the scene does not say which points its photographs saw, so exposure is not measured"
-            )
+            return Verdict(False, "the scene does not say which points photographs saw, so exposure is not measured")
         stops = [gain[GREEN] for gain in gains.stops.values()]
-        figure = (
-            f"{gains.unlike:.3f} stops from those that show the same ({min(stops):+.2f} to {max(stops):+.2f} in all)"
-        )
+        span = f"({min(stops):+.2f} to {max(stops):+.2f} in all)"
+        figure = f"{gains.unlike:.3f} stops from those that show the same {span}"
         return Verdict(gains.unlike >= NEEDED, f"photographs differ by {figure}; from {NEEDED} on it is worth it")
 
     def parameters(self) -> list[dict]:
