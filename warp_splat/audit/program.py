@@ -163,7 +163,7 @@ def draw_by_page(page: str):
         InputError: if there is no such page, or no npm to fetch what it asks for.
     """
     if not Path(page).is_file():
-        raise InputError(f"{page}: expected a page with a function window.show(camera, address), found none.")
+        raise InputError(f"{page}: expected a page, found no such file; check the path.")
     if _missing(Path(page)) and not shutil.which("npm"):
         raise InputError(f"{page}: expected npm, which fetches {', '.join(_missing(Path(page)))}; install Node.js.")
 

@@ -4,7 +4,6 @@ import importlib
 import multiprocessing
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -100,8 +99,6 @@ def function_of(place: str):
     if "{" in place:
         return draw_by_program(place)
     if place.endswith(".html"):
-        if not Path(place).is_file():
-            raise InputError(f"{place}: expected a page, found no such file; check the path.")
         return draw_by_page(place)
     module, _, name = place.partition(":")
     try:

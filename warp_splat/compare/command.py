@@ -14,7 +14,8 @@ from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
 from warp_splat.flags import check_numbers
-from warp_splat.formats.files import atomic_write, write_csv, write_json, write_text
+from warp_splat.formats.files import write_csv, write_json, write_text
+from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch, pool
@@ -39,10 +40,7 @@ def run(config: CompareConfig) -> int:
     scenes = {} if config.stability else named_scenes(config.scene, print)
     wanted = "cpu" if config.stability else config.device
     device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
-    out, log = Path(config.out), []
-    with atomic_write(out / ".writable") as path:  # to fail before all measuring, not after
-        path.touch()
-    (out / ".writable").unlink()
+    out, log = prepare_folder(config.out), []  # to fail before all measuring, not after
 
     def say(text: str = "") -> None:
         print(text)

@@ -110,10 +110,9 @@ def differentiate_on_tape(
     workload: Workload, upstream: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The image [H, W, 3], and the gradients by parameter for the upstream gradient [H, W, 3], or for ones."""
-    means, quats, scales, opacities, *sh = workload.gaussians
-    given = dict(
-        zip(PARAMETERS, (means, quats, scales, opacities, torch.cat(sh, 1), workload.background), strict=False)
-    )
+    *geometry, sh_dc, sh_rest = workload.gaussians
+    values = (*geometry, torch.cat([sh_dc, sh_rest], 1), workload.background)
+    given = dict(zip(PARAMETERS, values, strict=False))
     arrays = {name: wp.from_torch(tensor.clone(), requires_grad=True) for name, tensor in given.items()}
     with wp.Tape() as recorded:
         out = tape.rasterize(**arrays, camera=workload.camera, options=workload.options)

@@ -3,7 +3,6 @@
 Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64. CC_PSNR is PSNR after a fit of colors.
 """
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from warp_splat.errors import InputError
-from warp_splat.formats.files import write_json
+from warp_splat.formats.files import read_json, write_json
 from warp_splat.formats.png import check_image
 
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
@@ -132,15 +131,8 @@ def write_results(
 
 
 def _read_object(path: Path) -> dict:
-    if not path.exists():
-        return {}
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: could not be read as JSON ({error}); move it away and run again.") from error
-    if not isinstance(entries, dict):
-        raise InputError(f"{path}: expected a JSON object with entries ours_N; move it away and run again.")
-    return entries
+    expected = "a JSON object with entries ours_N (otherwise move it away and run again)"
+    return read_json(path, expected, lambda found: {**found}) if path.exists() else {}
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

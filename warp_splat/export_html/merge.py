@@ -33,9 +33,8 @@ def merged(splats: SplatArrays, count: int, cameras: Sequence[Camera]) -> tuple[
     bounded = splats._replace(scales=np.clip(splats.scales, *LOG_SCALES))
     alone, rest = np.split(np.argsort(-sizes(bounded), kind="stable"), [count // ALONE])
     rest.sort()
-    order, starts = groups(
-        splats.means[rest].astype(np.float64), importance(bounded, cameras)[rest], count - len(alone)
-    )
+    points, important = splats.means[rest].astype(np.float64), importance(bounded, cameras)[rest]
+    order, starts = groups(points, important, count - len(alone))
     order, starts = np.append(alone, rest[order]), np.append(np.arange(len(alone)), len(alone) + starts)
     return splats.take(order), _matched(bounded.take(order), starts), starts
 

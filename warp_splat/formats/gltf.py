@@ -97,11 +97,8 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
             parts.append(turned(splats, frame(AXES) @ turn, frame(AXES) @ translation, scale))
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    antialiased = all(_render_mode(piece) == "mip" for piece, _ in placed)
-    extras = document.json.get("extras")
-    return SplatFile(
-        concatenated(parts), antialiased, kept(extras.get(COORDINATES)) if isinstance(extras, dict) else None
-    )
+    antialiased = all(_extra(piece["extensions"][NAME], RENDER_MODE) == "mip" for piece, _ in placed)
+    return SplatFile(concatenated(parts), antialiased, kept(_extra(document.json, COORDINATES)))
 
 
 def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:
@@ -161,12 +158,9 @@ def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
 
 
 def _splat_primitives(mesh: dict) -> list[dict]:
-    primitives = mesh.get("primitives")
-    if not isinstance(primitives, list):
-        raise Unexpected("a mesh without primitives")
     return [
         primitive
-        for primitive in primitives
+        for primitive in entries_of(mesh, "primitives")
         if isinstance(primitive, dict)
         and isinstance(primitive.get("extensions"), dict)
         and NAME in primitive["extensions"]
@@ -206,6 +200,7 @@ def _read_primitive(document: Document, primitive: dict, report: Report) -> Spla
     )
 
 
-def _render_mode(primitive: dict) -> object:
-    extras = primitive["extensions"][NAME].get("extras")
-    return extras.get(RENDER_MODE) if isinstance(extras, dict) else None
+def _extra(entry: dict, name: str) -> object:
+    """What an object holds beyond the standard; None without it."""
+    extras = entry.get("extras")
+    return extras.get(name) if isinstance(extras, dict) else None

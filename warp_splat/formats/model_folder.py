@@ -74,7 +74,7 @@ def prepare_folder(folder: str | Path) -> Path:
         probe.unlink()
     except OSError as error:
         raise InputError(
-            f"{folder}: expected a folder that can be written ({error.strerror or error}); choose another model path."
+            f"{folder}: expected a folder that can be written ({error.strerror or error}); choose another."
         ) from error
     return folder
 

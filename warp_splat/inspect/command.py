@@ -14,8 +14,7 @@ from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos
 from warp_splat.sfm.forecast import time_of_cameras
 
-LEVELS = ("error", "warning", "note", "ok")
-COLORS = {"error": 31, "warning": 33, "note": 34, "ok": 32}  # of a terminal
+COLORS = {"error": 31, "warning": 33, "note": 34, "ok": 32}  # of a terminal, the worst first
 
 
 def inspect(config: InspectConfig) -> int:
@@ -46,7 +45,7 @@ def inspect(config: InspectConfig) -> int:
     findings += verdicts.check_masks(subject)
     findings += verdicts.check_loading(subject, config.images)
     findings += verdicts.check_cost(subject)
-    findings.sort(key=lambda finding: LEVELS.index(finding.level))
+    findings.sort(key=lambda finding: list(COLORS).index(finding.level))
     verdict = _verdict(findings)
     write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))
     for finding in findings:

@@ -50,11 +50,8 @@ class Thinning:
         rows = self._kept[min(known for known in self._kept if known >= count)]
         while len(rows) > count:
             model = model_of(self.splats.take(rows), self.setting)
-            rows = rows[
-                _costliest(model, self.setting, max(count, min(len(rows) - 1, math.ceil(AT_ONCE * len(rows)))))
-                .cpu()
-                .numpy()
-            ]
+            kept = max(count, min(len(rows) - 1, math.ceil(AT_ONCE * len(rows))))
+            rows = rows[_costliest(model, self.setting, kept).cpu().numpy()]
             self._kept[len(rows)] = rows
         return self.splats.take(rows)
 
@@ -124,9 +121,8 @@ def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps
         wanted = max(count, round(total * (count / total) ** (min(stage, STAGES) / STAGES)))
         if wanted < len(trainer.model):
             keep = _costliest(trainer.model, setting, wanted)
-            trainer.optimizer.replace(
-                keep, {name: rows.detach()[:0] for name, rows in trainer.model.parameters.items()}
-            )
+            nothing = {name: rows.detach()[:0] for name, rows in trainer.model.parameters.items()}
+            trainer.optimizer.replace(keep, nothing)
             trainer.growth.clear()
         trainer.differentiate(degree + number)
         trainer.update(degree + number)

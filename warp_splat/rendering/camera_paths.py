@@ -60,9 +60,8 @@ def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     """The point nearest to all optical axes (least squares), the scene's up, the cameras' mean distance from it."""
     cameras = [view.camera for view in scene.train]
     across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
-    center = np.linalg.lstsq(
-        sum(across), sum(a @ camera.center for a, camera in zip(across, cameras, strict=True)), rcond=None
-    )[0]
+    wanted = sum(a @ camera.center for a, camera in zip(across, cameras, strict=True))
+    center = np.linalg.lstsq(sum(across), wanted, rcond=None)[0]
     distance = float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
     return center, scene.up, distance
 

@@ -66,9 +66,8 @@ def _compare(config: ConvertConfig) -> None:
     reach = np.quantile(np.linalg.norm(means - middle, axis=1), 0.75)
     radius = DISTANCE * reach + 1e-6 * (1 + np.abs(middle).max())
     start, up = middle - [0.0, 0.0, radius], np.array([0.0, -1.0, 0.0])
-    cameras = orbit_cameras(
-        middle, up, start, AROUND, ORBIT_LENS.resized(ORBIT_LENS.width // 3, ORBIT_LENS.height // 3)
-    )
+    lens = ORBIT_LENS.resized(ORBIT_LENS.width // 3, ORBIT_LENS.height // 3)
+    cameras = orbit_cameras(middle, up, start, AROUND, lens)
     with torch.no_grad():
         before, after = (GaussianModel.from_splats(some).arranged().activated() for some in splats)
     measured, bound = largest_change(before, after, cameras, torch.zeros(3), finished.options)

@@ -50,7 +50,6 @@ def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[Vi
     largest = 0.0
     for index, view in enumerate(views):
         values = find(view.camera).cpu().numpy()
-        (folder / name).mkdir(parents=True, exist_ok=True)
         largest = max(largest, float(values.max()))
         save_scaled(folder / name / f"{index:05d}.png", values)
         save_exr(folder / name / f"{index:05d}.exr", values)

@@ -60,7 +60,12 @@ def sfm(config: SfmConfig) -> int:
     say = (lambda *_: None) if config.quiet else tqdm.write
     require_pycolmap("warp-splat sfm")
     check_numbers(config)
-    _check_source(source)
+    if not (source.is_dir() or is_video(source)):
+        found = f"a file ending in {source.suffix!r}" if source.is_file() else "nothing"
+        endings = ", ".join(VIDEOS)
+        raise InputError(
+            f"{source}: expected a folder of photographs or a video ({endings}), found {found}; check the path."
+        )
     work = _claim(source, scene, config)
     config = replace(config, threads=min(config.threads or CORES, CORES))
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its progress is ours to tell
@@ -109,15 +114,6 @@ def _explained(work: Path) -> Iterator[None]:
             f"{work}: pycolmap cannot go on there ({reason_of(error)}); free some space if the disk is full and run "
             "again, or remove this folder to start anew."
         ) from error
-
-
-def _check_source(source: Path) -> None:
-    if source.is_dir() or is_video(source):
-        return
-    found = f"a file ending in {source.suffix!r}" if source.is_file() else "nothing"
-    raise InputError(
-        f"{source}: expected a folder of photographs or a video ({', '.join(VIDEOS)}), found {found}; check the path."
-    )
 
 
 def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:

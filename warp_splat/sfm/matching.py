@@ -58,7 +58,9 @@ def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> in
     elif matching == "sequential":
         pairing = pycolmap.SequentialPairingOptions(num_threads=config.threads)
         # neighbors up to `overlap`, and at distances 2, 4, 8 ... up to 2^(overlap - 1)
-        _run(database, pycolmap.match_sequential, pairing, _sequential_pairs(images, pairing.overlap), config)
+        gaps = {*range(1, pairing.overlap + 1), *(1 << power for power in range(pairing.overlap))}
+        pairs = sum(max(images - gap, 0) for gap in gaps)
+        _run(database, pycolmap.match_sequential, pairing, pairs, config)
     else:
         pairing = pycolmap.ExhaustivePairingOptions(block_size=BLOCK)
         _run(database, pycolmap.match_exhaustive, pairing, pairs, config)
@@ -81,11 +83,6 @@ def _run(database: Path, run: Callable, pairing: object, total: int, config: Sfm
     work = partial(run, database, options, pairing, verification, pycolmap.Device.cpu)
     with opened(database) as connection:
         run_watched("matches", total, work, connection.num_matched_image_pairs, config.quiet)
-
-
-def _sequential_pairs(images: int, overlap: int) -> int:
-    gaps = {*range(1, overlap + 1), *(1 << power for power in range(overlap))}
-    return sum(max(images - gap, 0) for gap in gaps)
 
 
 def _matched(database: Path) -> dict[tuple[int, int], int]:

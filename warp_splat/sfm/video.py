@@ -4,6 +4,7 @@ The measure is that of Pech-Pacheco et al. 2000 (Diatom autofocusing in brightfi
 """
 
 from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
 
 import av
@@ -48,38 +49,36 @@ def sample_frames(
     Raises:
         InputError: if the file is not a video that PyAV (FFmpeg) can decode.
     """
+    written, damaged = 0, []
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: expected a video, found no video stream in it; give another file.")
             total = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
         with av.open(str(path)) as container:
-            return _sample(container, folder, count, total, threads, report, advance)
+            frames = enumerate(_decode(container, threads, damaged))
+            span_of = lambda numbered: min(numbered[0] * count // max(total, 1), count - 1)  # noqa: E731
+            for span, numbered in groupby(frames, span_of):
+                index, frame = max(numbered, key=lambda each: _sharpness_of(each[1]))
+                pixels = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
+                with atomic_write(folder / f"frame_{index:06d}.jpg") as temporary:
+                    Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, quality=QUALITY)
+                written += 1
+                advance(100 * (span + 1) // count)
     except FFmpegError as error:
         raise InputError(
             f"{path}: expected a video that FFmpeg can read, but it cannot ({error.strerror}); convert it to MP4 "
             "(H.264) or give another file."
         ) from error
-
-
-def _sample(container, folder: Path, count: int, total: int, threads: int, report, advance) -> int:
-    written, window, best = 0, 0, (-1.0, 0, None)
-    damaged: list[int] = []
-    for index, frame in enumerate(_decode(container, threads, damaged)):
-        here = min(index * count // max(total, 1), count - 1)
-        if here != window:
-            written += _write(best, folder)
-            window, best = here, (-1.0, 0, None)
-            advance(100 * index // total)
-        width = min(SHARPNESS_WIDTH, frame.width)
-        small = frame.reformat(width=width, height=max(3, frame.height * width // frame.width), format="gray")
-        value = sharpness(small.to_ndarray())
-        if value > best[0]:
-            best = (value, index, frame)
-    written += _write(best, folder)
     if damaged:
         report(f"warning: {len(damaged)} of {total} packets of the video are damaged and were left out.")
     return written
+
+
+def _sharpness_of(frame: av.VideoFrame) -> float:
+    width = min(SHARPNESS_WIDTH, frame.width)
+    small = frame.reformat(width=width, height=max(3, frame.height * width // frame.width), format="gray")
+    return sharpness(small.to_ndarray())
 
 
 def _decode(container, threads: int, damaged: list[int]) -> Iterator[av.VideoFrame]:
@@ -91,13 +90,3 @@ def _decode(container, threads: int, damaged: list[int]) -> Iterator[av.VideoFra
             yield from packet.decode()
         except InvalidDataError:
             damaged.append(number)
-
-
-def _write(best: tuple[float, int, av.VideoFrame | None], folder: Path) -> int:
-    _, index, frame = best
-    if frame is None:
-        return 0
-    pixels = np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90)))
-    with atomic_write(folder / f"frame_{index:06d}.jpg") as temporary:
-        Image.fromarray(pixels).save(temporary, quality=QUALITY)
-    return 1

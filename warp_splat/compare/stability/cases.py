@@ -52,8 +52,13 @@ def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = prin
         for mode, outcome in row.outcomes.items():
             if outcome.failures:
                 say(f"{row.case.name} {mode}: {'; '.join(outcome.failures)}")
-    out.mkdir(parents=True, exist_ok=True)
-    _write(out, rows)
+    flat = [
+        {"case": row.case.name, "group": row.case.group, "claim": row.case.claim, "mode": mode, **asdict(outcome)}
+        for row in rows
+        for mode, outcome in row.outcomes.items()
+    ]
+    write_json(out / "stability.json", {"verdicts": flat, "eps": EPS})  # nested; a line for each case and mode as CSV
+    write_csv(out / "stability.csv", [{**line, "failures": "; ".join(line["failures"])} for line in flat])
     failed = sum(bool(outcome.failures) for row in rows for outcome in row.outcomes.values())
     say(f"{failed} of {sum(len(row.outcomes) for row in rows)} verdicts failed.")
     return failed
@@ -78,14 +83,3 @@ def table(rows: Sequence[Row], modes: Sequence[str]) -> list[list[str]]:
 
 def _error(value: float | None) -> str:
     return "-" if value is None else "0" if value == 0 else f"{value:.0e}"
-
-
-def _write(out: Path, rows: Sequence[Row]) -> None:
-    """Everything that was measured: nested as JSON, a line for each case and mode as CSV."""
-    flat = [
-        {"case": row.case.name, "group": row.case.group, "claim": row.case.claim, "mode": mode, **asdict(outcome)}
-        for row in rows
-        for mode, outcome in row.outcomes.items()
-    ]
-    write_json(out / "stability.json", {"verdicts": flat, "eps": EPS})
-    write_csv(out / "stability.csv", [{**line, "failures": "; ".join(line["failures"])} for line in flat])
