@@ -1,8 +1,13 @@
-"""Surfaces against a sphere of known depths, and of a model of Gaussians on one."""
+"""Surfaces against a sphere and a plane of known depths, and of a model of Gaussians on a sphere."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from scene_files import write_image
 from scipy.spatial.transform import Rotation
 
 from warp_splat import RasterOptions, rasterize
@@ -10,8 +15,9 @@ from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
-from warp_splat.meshing.command import without_islands
-from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, footprint, fused, surface_of, voxels_of
+from warp_splat.meshing.command import smoothed, without_islands
+from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.stereo import filled
 
 trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
 VOXEL, VIEWS, DISTANCE = 0.08, 24, 4.0
@@ -64,12 +70,48 @@ def test_a_disc_is_where_rays_meet_its_plane():
     np.testing.assert_allclose(depth[y, x], DISTANCE * normal[2] / (along @ normal), rtol=1e-3)
 
 
+def patterned():
+    """Views of a slanted plane with a pattern, whose depths are wrong; photographs; true depths in closed form."""
+    normal, waves = np.array([0.3, -0.2, 1.0]), np.random.default_rng(0).normal(0, 10, (2, 20))
+    views, photographs, depths = [], [], []
+    x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(72) + 0.5)
+    along = np.stack([(x - 47) / 100, (y - 37) / 100, np.ones_like(x)], -1)
+    for index in range(6):
+        center = 0.4 * np.array([np.cos(index), np.sin(index), 0])
+        camera = Camera(96, 72, 100, 100, 47, 37, np.eye(3), -center)
+        depths.append((4 - normal @ center) / (along @ normal))
+        shade = np.sin((center + depths[-1][..., None] * along)[..., :2] @ waves).mean(-1, keepdims=True)
+        picture = np.rint(120 + 10 * index + (150 + 10 * index) * shade).clip(0, 255)  # exposures differ
+        photographs.append(SimpleNamespace(camera=camera, picture=picture.astype(np.uint8).repeat(3, 2)))
+        wrong = torch.from_numpy((depths[-1] * (0.85 + 0.05 * index)).astype(np.float32))
+        views.append(Drawn(camera, wrong, torch.zeros(72, 96, 3)))
+    return views, photographs, np.stack(depths)
+
+
+def test_photographs_tell_depths_that_the_model_does_not():
+    views, photographs, truth = patterned()
+    assert not any(view.depth.any() for view in agreed(views[1:3]))
+    depths = np.stack([view.depth.numpy() for view in filled(views, photographs)])
+    error = np.abs(depths / truth - 1)[depths > 0]
+    assert (depths > 0).mean() > 0.7 and np.quantile(error, 0.9) < 0.01 and np.median(error) < 0.003
+
+
+def test_nothing_to_go_by():
+    """A model without any depth, and photographs that a lens distorts."""
+    views, photographs, _ = patterned()
+    blank = filled([view._replace(depth=torch.zeros(72, 96)) for view in views], photographs)
+    assert not any(view.depth.any() for view in blank) and np.isnan(pixel(blank))
+    bent = [SimpleNamespace(camera=SimpleNamespace(lens="a lens", shutter=None))] * len(views)
+    for view, wanted in zip(filled(views, bent), agreed(views), strict=True):
+        np.testing.assert_array_equal(view.depth, wanted.depth)
+
+
 def test_any_number_of_threads(threads):
-    views = [ball(index) for index in range(4)]
+    views, (wrong, photographs, _) = [ball(index) for index in range(4)], patterned()
     found = []
     for count in (1, 3):
         threads(count)
-        found.append(surface(agreed(views)))
+        found.append([*surface(agreed(views)), *(view.depth for view in filled(wrong, photographs))])
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -81,7 +123,7 @@ def test_depths_that_others_do_not_see():
     kept = agreed([wrong, *views[1:]])
     assert not kept[0].depth.any()
     assert (kept[1].depth > 0).sum() > 0.5 * (views[1].depth > 0).sum()
-    assert np.isnan(footprint(agreed(views[:1])[0]))
+    assert np.isnan(pixel(agreed(views[:1])))
 
 
 def test_holes_stay_holes():
@@ -90,11 +132,26 @@ def test_holes_stay_holes():
     assert (mesh.vertices @ camera_at(0).rotation[2] < 0.3).all()  # nothing behind what is seen
 
 
-def test_islands():
-    large, small = (trimesh.creation.icosphere(subdivisions) for subdivisions in (4, 0))
+@pytest.mark.parametrize(("subdivisions", "stays"), [((4, 0), False), ((7, 3), True)])
+def test_islands(subdivisions, stays):
+    """One of less than 1 % of the largest one's triangles, and one that has many of its own."""
+    large, small = (trimesh.creation.icosphere(count) for count in subdivisions)
     both = trimesh.util.concatenate([large, small.apply_translation([5, 0, 0])])
-    found = without_islands(Surface(both.vertices, both.faces, np.zeros_like(both.vertices)))
-    assert len(found.faces) == len(large.faces) and len(found.vertices) == len(found.colors) == len(large.vertices)
+    found, wanted = without_islands(Surface(both.vertices, both.faces, np.zeros_like(both.vertices))), [large, both]
+    assert len(found.faces) == len(wanted[stays].faces)
+    assert len(found.vertices) == len(found.colors) == len(wanted[stays].vertices)
+
+
+def test_a_smoothed_ball_is_as_large_and_its_hole_stays():
+    ball = trimesh.creation.icosphere(5)
+    ball.update_faces((ball.triangles[..., 2] < 0.5).all(1))
+    ball.remove_unreferenced_vertices()
+    rough = ball.vertices * np.random.default_rng(0).normal(1, 0.01, (len(ball.vertices), 1))
+    found = smoothed(Surface(rough, ball.faces, np.zeros_like(rough))).vertices
+    edge = np.unique(ball.edges[trimesh.grouping.group_rows(ball.edges_sorted, require_count=1)])
+    np.testing.assert_array_equal(found[edge], rough[edge])
+    before, after = (np.delete(np.linalg.norm(vertices, axis=1), edge) - 1 for vertices in (rough, found))
+    assert len(edge) > 50 and np.std(after) < 0.5 * np.std(before) and abs(after.mean()) < 0.001
 
 
 @pytest.fixture(scope="module")
@@ -117,13 +174,24 @@ def model(tmp_path_factory):
     return path, radius, center
 
 
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Cameras of the embedded scene, with small gray photographs, which tell nothing."""
+    folder = tmp_path_factory.mktemp("gray")
+    made = json.loads(Path("assets/still_life/transforms.json").read_text())
+    made |= {name: made[name] / 2 for name in ("fl_x", "fl_y", "cx", "cy")} | {"w": 132, "h": 124}
+    del made["ply_file_path"]
+    for frame in made["frames"]:
+        write_image(folder / frame["file_path"], np.full((made["h"], made["w"], 3), 99, np.uint8))
+    (folder / "transforms.json").write_text(json.dumps(made))
+    return str(folder)
+
+
 @pytest.mark.parametrize("ending", ["ply", "glb", "obj"])
-def test_the_command(model, tmp_path, capsys, ending):
+def test_the_command(model, scene, tmp_path, capsys, ending):
     path, radius, center = model
     output = tmp_path / f"ball.{ending}"
-    assert (
-        main(["mesh", str(path), str(output), "-s", "assets/still_life", "--voxel", "0.04", "--triangles", "900"]) == 0
-    )
+    assert main(["mesh", str(path), str(output), "-s", scene, "--voxel", "0.04", "--triangles", "900"]) == 0
     mesh = trimesh.load(output, force="mesh")
     vertices = mesh.vertices * ([-1, -1, 1] if ending == "glb" else [1, 1, 1])
     assert np.abs(np.linalg.norm(vertices - center, axis=1) - radius).max() < 0.04
@@ -131,17 +199,17 @@ def test_the_command(model, tmp_path, capsys, ending):
     assert "triangles" in capsys.readouterr().out
 
 
-def test_fewer_triangles_than_there_can_be(model, tmp_path, capsys):
-    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", "assets/still_life", "--voxel", "0.1"]
+def test_fewer_triangles_than_there_can_be(model, scene, tmp_path, capsys):
+    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.1"]
     assert main(["mesh", *arguments, "--triangles", "1"]) == 0
     assert "triangles, the fewest that simplifying comes to" in capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_convex_pieces(model, tmp_path):
+def test_convex_pieces(model, scene, tmp_path):
     pytest.importorskip("vhacdx", reason="no vhacdx: pip install 'warp-splat[mesh]'")
     path, radius, _center = model
-    arguments = [str(path), str(tmp_path / "ball.obj"), "-s", "assets/still_life", "--triangles", "400"]
+    arguments = [str(path), str(tmp_path / "ball.obj"), "-s", scene, "--triangles", "400"]
     assert main(["mesh", *arguments, "--collision", "2"]) == 0
     pieces = trimesh.load(tmp_path / "ball_collision.obj", force="mesh").split()
     assert 1 <= len(pieces) <= 2 and all(piece.is_convex for piece in pieces)
@@ -161,6 +229,6 @@ def test_convex_pieces(model, tmp_path):
         (["mesh.ply", "--memory", "1e-9"], "--memory: views of 16 px and more do not fit"),
     ],
 )
-def test_sentences(model, capsys, arguments, said):
-    assert main(["mesh", str(model[0]), *arguments, "-s", "assets/still_life"]) != 0
+def test_sentences(model, scene, capsys, arguments, said):
+    assert main(["mesh", str(model[0]), *arguments, "-s", scene]) != 0
     assert said in capsys.readouterr().err

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -19,25 +19,16 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import (
-    BYTES,
-    Drawn,
-    Surface,
-    agreed,
-    as_pinhole,
-    depth_of,
-    footprint,
-    fused,
-    surface_of,
-    voxels_of,
-)
+from warp_splat.meshing.fusion import BYTES, Drawn, Surface, depth_of, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.stereo import filled
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
 from warp_splat.runtime.launch import available_memory
 
 ENDINGS = (".ply", ".glb", ".obj")
-GLTF_AXES = np.diag([-1.0, -1.0, 1.0])  # x left, y up, z forward
-ISLAND = 0.01  # of the largest piece's triangles, below which a piece is left out
+GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # x left, y up, z forward
+ISLAND, LARGE = 0.01, 500  # share of the largest piece's triangles below which a piece is left out; of more it stays
+SMOOTHING = 10 * (0.5, -0.53)  # shares of the way to the mean of neighbors, there and back
 PIXEL = 20  # bytes of a pixel of a view
 LEAST = 16  # px, of the shorter edge of a view: smaller ones agree on nothing
 PIXELS = 2.0  # edge of a voxel where nothing else is asked for
@@ -60,20 +51,23 @@ def mesh(config: MeshConfig) -> int:
             needed(package)
     opened = Opened(config)
     memory = 1e9 * config.memory or available_memory(torch.device("cpu")) / 4
-    views = agreed(drawn_views(opened, memory / 2))
-    natural = PIXELS * _pixel(config, views)
+    views = filled(drawn_views(opened, memory / 2), opened.scene.train)
+    natural = PIXELS * pixel(views)
+    if math.isnan(natural):
+        raise InputError(f"{config.model}: its views do not agree on any depth; train longer, or on more photographs.")
     voxel, voxels = _grid(config.voxel, natural, views, memory / 2)
-    surface = without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel))
+    surface = smoothed(without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel)))
     found = len(surface.faces)
     if not found:
         raise InputError(f"--voxel {voxel:g}: nothing is seen so finely or so coarsely; try {natural:.2g}.")
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)
-    write_surface(output, surface)
+    whole = trimesh_of(surface)
+    write_bytes(output, exported(whole, output.suffix))
     least = ", the fewest that simplifying comes to" if 0 < config.triangles < 0.9 * len(surface.faces) else ""
     print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
     if config.collision:
-        pieces = convex_pieces(surface, config.collision)
+        pieces = needed("trimesh").Scene(whole.convex_decomposition(maxConvexHulls=config.collision))  # V-HACD
         place = output.with_name(f"{output.stem}_collision{output.suffix}")
         write_bytes(place, exported(pieces, place.suffix))
         print(f"{place}: {len(pieces.geometry)} convex pieces")
@@ -102,19 +96,12 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
         for camera in cameras:
             if camera.lens is not None and camera.lens.family.around:
                 raise InputError("mesh: expected views of a plane to fuse, found a panorama; train on cube faces.")
-            smaller = as_pinhole(camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height))))
+            smaller = camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height)))
+            smaller = replace(smaller, lens=None, shutter=None)  # depths are drawn, not taken from photographs
             shown = render(gaussians, smaller, background, options)
             image = to_srgb(shown.image, torch.where) if opened.scene.linear else shown.image
             found.append(Drawn(smaller, depth_of(shown, smaller).cpu(), image.cpu().contiguous()))
     return found
-
-
-def _pixel(config: MeshConfig, views: Sequence[Drawn]) -> float:
-    """The median edge of a pixel where something is seen [world units]."""
-    sizes = [size for view in views if not math.isnan(size := footprint(view))]
-    if not sizes:
-        raise InputError(f"{config.model}: its views do not agree on any depth; train longer, or on more photographs.")
-    return float(np.median(sizes))
 
 
 def _grid(asked: float, natural: float, views: Sequence[Drawn], memory: float) -> tuple[float, torch.Tensor]:
@@ -122,8 +109,7 @@ def _grid(asked: float, natural: float, views: Sequence[Drawn], memory: float) -
     voxel = asked or natural
     while len(voxels := voxels_of(views, voxel)) > memory / BYTES:
         if asked:
-            wanted = 2 * len(voxels) * BYTES / 1e9
-            raise InputError(f"--voxel {voxel:g}: it takes {wanted:.1f} GB; raise it, or --memory.")
+            raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * len(voxels) * BYTES:.1f} GB; raise it, or --memory.")
         voxel *= COARSER
     return voxel, voxels
 
@@ -131,46 +117,44 @@ def _grid(asked: float, natural: float, views: Sequence[Drawn], memory: float) -
 def without_islands(surface: Surface) -> Surface:
     """Without connected pieces that are far smaller than the largest."""
     edges = surface.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    size = len(surface.vertices)
-    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(size, size))
+    graph = csr_array((np.ones(len(edges), bool), tuple(edges.T)), shape=(len(surface.vertices),) * 2)
     piece = connected_components(graph, directed=False)[1][surface.faces[:, 0]]
     counts = np.bincount(piece, minlength=1)
-    return _with_faces(surface, surface.faces[counts[piece] >= ISLAND * counts.max()])
-
-
-def _with_faces(surface: Surface, faces: np.ndarray) -> Surface:
-    used, faces = np.unique(faces, return_inverse=True)
+    large = counts[piece] >= min(ISLAND * counts.max(), LARGE)
+    used, faces = np.unique(surface.faces[large], return_inverse=True)
     return Surface(surface.vertices[used], faces.reshape(-1, 3), surface.colors[used])
+
+
+def smoothed(surface: Surface) -> Surface:
+    """With vertices moved towards their neighbors and back again and again (Taubin 1995), but for those at holes."""
+    faces, vertices, size = surface.faces, surface.vertices, len(surface.vertices)
+    edges = csr_array((np.ones(faces.size), (faces.ravel(), np.roll(faces, -1, 1).ravel())), shape=(size, size))
+    neighbors, inside = edges + edges.T, abs(edges - edges.T).sum(1) == 0  # there the other triangle has it reversed
+    weights = inside / neighbors.sum(1)
+    for step in SMOOTHING:
+        vertices = vertices + step * weights[:, None] * (neighbors @ vertices - neighbors.sum(1)[:, None] * vertices)
+    return surface._replace(vertices=vertices)
 
 
 def simplified(surface: Surface, triangles: int) -> Surface:
     """With about so many triangles (quadric errors, Garland and Heckbert 1997); colors are the nearest vertices'."""
     simplify = needed("fast_simplification").simplify
     vertices, faces = simplify(surface.vertices, surface.faces, 1 - triangles / len(surface.faces))
+    if not len(faces):  # a closed surface vanishes
+        return simplified(surface, 2 * triangles)
     nearest = KDTree(surface.vertices).query(vertices)[1]
     return Surface(vertices.astype(np.float64), faces.astype(np.int64), surface.colors[nearest])
 
 
-def convex_pieces(surface: Surface, most: int) -> Any:
-    """A trimesh scene of at most so many convex pieces around the surface (Mamou's V-HACD)."""
-    trimesh = needed("trimesh")
-    whole = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    return trimesh.Scene(whole.convex_decomposition(maxConvexHulls=most))
-
-
-def write_surface(path: Path, surface: Surface) -> None:
-    """As .ply, .glb or .obj, with colors on vertices."""
+def trimesh_of(surface: Surface) -> Any:
+    """As trimesh's, with colors on vertices."""
     colors = np.rint(255 * surface.colors.clip(0, 1)).astype(np.uint8)
-    made = needed("trimesh").Trimesh(surface.vertices, surface.faces, vertex_colors=colors, process=False)
-    write_bytes(path, exported(made, path.suffix))
+    return needed("trimesh").Trimesh(surface.vertices, surface.faces, vertex_colors=colors, process=False)
 
 
 def exported(shape: Any, suffix: str) -> bytes:
     """The bytes of a file of what trimesh holds; .glb in glTF's axes, as Gaussians are written."""
     if suffix.lower() == ".glb":
-        axes = np.eye(4)
-        axes[:3, :3] = GLTF_AXES
-        shape = shape.copy()
-        shape.apply_transform(axes)
+        shape = shape.copy().apply_transform(GLTF_AXES)
     data = shape.export(file_type=suffix.lower()[1:])
     return data.encode() if isinstance(data, str) else data

@@ -5,7 +5,6 @@ wide: what lies far behind a scene, seen from afar, has no surface of this resol
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -45,11 +44,6 @@ class Surface(NamedTuple):
     colors: np.ndarray  # [V, 3] float32, 0 to 1
 
 
-def as_pinhole(camera: Camera) -> Camera:
-    """The camera without its lens's distortion and shutter: depths are drawn through it, not taken from photographs."""
-    return replace(camera, lens=None, shutter=None)
-
-
 def lens_of(camera: Camera) -> wp.vec4:
     """Of a pinhole."""
     return wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
@@ -82,28 +76,38 @@ def depth_of(shown: RenderOutput, camera: Camera) -> torch.Tensor:
     return torch.where(shown.alpha > 0.5, (along * mean).sum(-1) / (along * along).sum(-1), 0.0)
 
 
-def agreed(views: Sequence[Drawn]) -> list[Drawn]:
-    """The views without the depths that too few of the others see, of those nearest to them."""
-    centers, found = np.stack([view.camera.center for view in views]), []
+def nearest_to(i: int, views: Sequence[Drawn]) -> list[int]:
+    """The other views, those whose centers are nearest first."""
+    distances = [np.sum((view.camera.center - views[i].camera.center) ** 2) for view in views]
+    return [int(j) for j in np.argsort(distances, kind="stable") if j != i]
+
+
+def relative(camera: Camera, other: Camera) -> tuple[wp.mat33, wp.vec3]:
+    """From a camera to another one."""
+    rotation = other.rotation @ camera.rotation.T
+    return wp.mat33(*rotation.ravel()), wp.vec3(*(other.translation - rotation @ camera.translation))
+
+
+def agreed(views: Sequence[Drawn], share: float = AGREEING) -> list[Drawn]:
+    """The views without the depths that less than a share of the others see, of those nearest to them."""
+    found = []
     for i, view in enumerate(views):
-        nearest = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")[: OTHERS + 1]
+        nearest = nearest_to(i, views)[:OTHERS]
         agreeing = torch.zeros(view.depth.numel(), dtype=torch.int32)
-        for other in (views[j] for j in nearest if j != i):
-            rotation = other.camera.rotation @ view.camera.rotation.T
-            translation = other.camera.translation - rotation @ view.camera.translation
-            pose = wp.mat33(*rotation.ravel()), wp.vec3(*translation)
+        for other in (views[j] for j in nearest):
             depths = [launch.view(seen.depth, wp.float32) for seen in (view, other)]
+            pose = relative(view.camera, other.camera)
             inputs = [TOLERANCE, *pose, lens_of(view.camera), lens_of(other.camera), *depths]
             launch.launch(agree, len(agreeing), inputs, [launch.view(agreeing, wp.int32)])
-        enough = agreeing.view_as(view.depth) >= max(AGREEING * (len(nearest) - 1), 1)
+        enough = agreeing.view_as(view.depth) >= max(share * len(nearest), 1)
         found.append(view._replace(depth=torch.where(enough, view.depth, 0.0)))
     return found
 
 
-def footprint(view: Drawn) -> float:
-    """Edge of a pixel at the view's median depth [world units]; not a number if it has none."""
-    found = view.depth[view.depth > 0]
-    return float(found.median()) / view.camera.fx if len(found) else float("nan")
+def pixel(views: Sequence[Drawn]) -> float:
+    """The median edge of a pixel at a view's median depth [world units]; not a number if no view has one."""
+    found = [(view.depth[view.depth > 0], view.camera.fx) for view in views]
+    return float(np.median([float(depths.median()) / focal for depths, focal in found if len(depths)] or [np.nan]))
 
 
 def voxels_of(views: Sequence[Drawn], voxel: float) -> torch.Tensor:
@@ -144,10 +148,9 @@ def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> tuple[t
 
 def surface_of(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor, voxel: float) -> Surface:
     """Marching cubes in the cells of which all corners are seen: holes stay holes."""
-    known = ~torch.isnan(distances)
-    voxels, distances, colors = voxels[known], distances[known], colors[known]
-    codes, order = torch.sort(code(voxels))
-    voxels, distances, colors = voxels[order], distances[order], colors[order]
+    known = (~torch.isnan(distances)).nonzero()[:, 0]
+    codes, order = torch.sort(code(voxels[known]))
+    voxels, distances, colors = (values[known[order]] for values in (voxels, distances, colors))
     corners = []
     for offset in IsoSurfaceMarchingCubes.CUBE_CORNER_OFFSETS:
         wanted = code(voxels + torch.tensor(offset, dtype=torch.int32))
