@@ -29,8 +29,8 @@ from scene_geometry import still_life
 from scene_trace import Measure
 
 from warp_splat.config import MeshConfig
-from warp_splat.meshing.command import PIXELS, drawn_views, mesh, smoothed, without_islands
-from warp_splat.meshing.fusion import EDGE, TRUNCATION, Drawn, Surface, agreed, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.command import PIXELS, drawn_views, mesh, surface_in, trimesh_of, without_islands
+from warp_splat.meshing.fusion import EDGE, TRUNCATION, Drawn, Surface, agreed, pixel, voxels_of
 from warp_splat.pruning.opened import Opened
 from warp_splat.scene.types import Scene, View
 
@@ -102,13 +102,6 @@ def against_truth(found: trimesh.Trimesh, scene: Scene) -> list[float]:
     return [*(100 * value for value in row), np.degrees(np.arccos(cosines)).mean()]
 
 
-def our_fused(views: list[Drawn], voxel: float) -> trimesh.Trimesh:
-    """As ``warp-splat mesh`` does."""
-    voxels = voxels_of(views, voxel)
-    kept = smoothed(without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel)))
-    return trimesh.Trimesh(kept.vertices, kept.faces, process=False)
-
-
 def open3d_fused(views: list[Drawn], voxel: float, least: float) -> trimesh.Trimesh:
     """Depths in Open3D's distance field where at least so many meet: our voxels and truncation, without islands."""
     import open3d  # noqa: PLC0415 - may be missing
@@ -153,7 +146,7 @@ def surfaces_of(config: MeshConfig, opened: Opened) -> Iterator[tuple[str, Calla
     views = drawn_views(opened, MEMORY)
     counting = agreed(views)
     voxel = PIXELS * pixel(counting)
-    yield "ours, the model's depths", lambda: our_fused(counting, voxel)
+    yield "ours, the model's depths", lambda: trimesh_of(surface_in(voxels_of(counting, voxel), counting, voxel))
     try:
         import open3d  # noqa: F401, PLC0415 - may be missing
     except ImportError as error:

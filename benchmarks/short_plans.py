@@ -82,7 +82,8 @@ def main() -> None:
         rows.append((name, f"{factor:g}", f"{times:g}", seeds, *quality, f"{after['ssim'].mean():.4f}"))
     note = (
         "Held-out views, beside the preset's rates with the same seeds. Photographs of an eighth of their edges "
-        "(embedded: half), budgets of 8,000 and 12,000, at half size of 100,000, times the root of the share of steps."
+        "(embedded: half), budgets of 8,000 and 12,000, at half and full size of 100,000, times the root of the "
+        "share of steps."
     )
     write_table("short_plans", arguments.out, HEADERS, rows, note)
 

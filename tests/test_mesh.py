@@ -20,6 +20,7 @@ from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, fused, p
 from warp_splat.meshing.stereo import filled
 
 trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
+MASKED = 12  # columns of a photograph
 VOXEL, VIEWS, DISTANCE = 0.08, 24, 4.0
 
 
@@ -71,7 +72,7 @@ def test_a_disc_is_where_rays_meet_its_plane():
 
 
 def patterned():
-    """Views of a slanted plane with a pattern, whose depths are wrong; photographs; true depths in closed form."""
+    """Views of a slanted plane with a pattern, whose depths are wrong; masked photographs; depths in closed form."""
     normal, waves = np.array([0.3, -0.2, 1.0]), np.random.default_rng(0).normal(0, 10, (2, 20))
     views, photographs, depths = [], [], []
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(72) + 0.5)
@@ -82,7 +83,8 @@ def patterned():
         depths.append((4 - normal @ center) / (along @ normal))
         shade = np.sin((center + depths[-1][..., None] * along)[..., :2] @ waves).mean(-1, keepdims=True)
         picture = np.rint(120 + 10 * index + (150 + 10 * index) * shade).clip(0, 255)  # exposures differ
-        photographs.append(SimpleNamespace(camera=camera, picture=picture.astype(np.uint8).repeat(3, 2)))
+        mask = np.broadcast_to(np.arange(96) >= MASKED, (72, 96)).astype(np.uint8)
+        photographs.append(SimpleNamespace(camera=camera, picture=picture.astype(np.uint8).repeat(3, 2), mask=mask))
         wrong = torch.from_numpy((depths[-1] * (0.85 + 0.05 * index)).astype(np.float32))
         views.append(Drawn(camera, wrong, torch.zeros(72, 96, 3)))
     return views, photographs, np.stack(depths)
@@ -93,7 +95,8 @@ def test_photographs_tell_depths_that_the_model_does_not():
     assert not any(view.depth.any() for view in agreed(views[1:3]))
     depths = np.stack([view.depth.numpy() for view in filled(views, photographs)])
     error = np.abs(depths / truth - 1)[depths > 0]
-    assert (depths > 0).mean() > 0.7 and np.quantile(error, 0.9) < 0.01 and np.median(error) < 0.003
+    assert not depths[..., :MASKED].any()
+    assert (depths[..., MASKED:] > 0).mean() > 0.7 and np.quantile(error, 0.9) < 0.01 and np.median(error) < 0.003
 
 
 def test_nothing_to_go_by():

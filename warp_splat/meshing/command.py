@@ -56,7 +56,7 @@ def mesh(config: MeshConfig) -> int:
     if math.isnan(natural):
         raise InputError(f"{config.model}: its views do not agree on any depth; train longer, or on more photographs.")
     voxel, voxels = _grid(config.voxel, natural, views, memory / 2)
-    surface = smoothed(without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel)))
+    surface = surface_in(voxels, views, voxel)
     found = len(surface.faces)
     if not found:
         raise InputError(f"--voxel {voxel:g}: nothing is seen so finely or so coarsely; try {natural:.2g}.")
@@ -112,6 +112,11 @@ def _grid(asked: float, natural: float, views: Sequence[Drawn], memory: float) -
             raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * len(voxels) * BYTES:.1f} GB; raise it, or --memory.")
         voxel *= COARSER
     return voxel, voxels
+
+
+def surface_in(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float) -> Surface:
+    """What is written, but for triangles that are too many."""
+    return smoothed(without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel)))
 
 
 def without_islands(surface: Surface) -> Surface:

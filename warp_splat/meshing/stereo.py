@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 import warp as wp
+from tqdm import tqdm
 
 from warp_splat.camera import Camera
 from warp_splat.kernels.patches import REACH, SPACING, Other, search
@@ -26,14 +27,14 @@ AROUND, ALIKE = 5, 0.05  # edge [px] of what a median is taken of; share of it w
 def filled(views: Sequence[Drawn], photographs: Sequence[View]) -> list[Drawn]:
     """The views with depths that others confirm: the model's, and where there is none, what photographs tell.
 
-    Photographs that a lens distorts tell nothing.
+    Photographs that a lens distorts tell nothing, and others not where they are masked.
     """
     kept, drawn = agreed(views), torch.cat([view.depth[view.depth > 0] for view in views])
     if not len(drawn) or any(photograph.camera.lens or photograph.camera.shutter for photograph in photographs):
         return kept
     near, far = (float(drawn.kthvalue(1 + int(share * len(drawn))).values) for share in (0.01, 0.99))
     small, found = [_small(view, photograph) for view, photograph in zip(views, photographs, strict=True)], []
-    for i, (view, known) in enumerate(zip(small, kept, strict=True)):
+    for i, (view, known) in enumerate(zip(tqdm(small, "comparing photographs", leave=False), kept, strict=True)):
         nearest = (small[j] for j in nearest_to(i, small))
         facing = [other for other in nearest if other.camera.rotation[2] @ view.camera.rotation[2] > ALONG]
         depth = _resized(known.depth[..., None], view)[..., 0]
@@ -55,10 +56,12 @@ def _resized(image: torch.Tensor, view: Drawn, mode: str = "nearest-exact") -> t
 
 
 def _small(view: Drawn, photograph: View) -> Drawn:
-    """The view with few enough pixels, and its photograph in gray [H, W, 1], 0 to 1."""
+    """The view with few enough pixels, and its photograph in gray [H, W, 1], 0 to 1; below where it is masked."""
     share = min(1.0, math.sqrt(MOST / view.depth.numel()))
     small = Drawn(view.camera.resized(*(max(int(share * size), FEWEST) for size in view.depth.T.shape)), *view[1:])
     gray = torch.from_numpy(photograph.picture).float().mean(2, keepdim=True) / 255
+    if photograph.mask is not None:
+        gray[torch.from_numpy(photograph.mask == 0)] = -1.0
     return small._replace(depth=_resized(view.depth[..., None], small)[..., 0], image=_resized(gray, small, "area"))
 
 
@@ -75,9 +78,10 @@ def _planes(view: Drawn, known: torch.Tensor, seen: Sequence[Drawn], nearness: w
         other.picture, other.lens = wp.from_torch(picture.image[..., 0]), lens_of(picture.camera)
         other.rotation, other.translation = relative(view.camera, picture.camera)
         others.append(other)
-    flat = PATCH(view.image[None, ..., 0])[0] == -PATCH(-view.image[None, ..., 0])[0]  # nothing to look for
-    scores = torch.where((known > 0) | flat, 2.0, -1.0)
-    guess = torch.where(known > 0, known, torch.where(flat, 0.0, view.depth))
+    image = view.image[None, ..., 0]
+    nothing = (PATCH(image) == -PATCH(-image))[0] | (image[0] < 0)  # to look for: it is flat, or masked
+    scores = torch.where((known > 0) | nothing, 2.0, -1.0)
+    guess = torch.where(known > 0, known, torch.where(nothing, 0.0, view.depth))
     planes = torch.where(guess > 0, 1 / guess, 0.0)[..., None] * torch.tensor([0.0, 0.0, 1.0])
     inputs = [nearness, lens_of(view.camera), gray, wp.array(others, dtype=Other, device="cpu")]
     for turn in range(TURNS):
