@@ -38,7 +38,9 @@ class Control:
 
     def call(self, **target):
         for handler in self.handlers:
-            handler(SimpleNamespace(target=SimpleNamespace(**target)))
+            done = handler(SimpleNamespace(target=SimpleNamespace(**target)))
+            if asyncio.iscoroutine(done):
+                asyncio.run(done)
 
     def on_update(self, handler):
         self.handlers.append(handler)

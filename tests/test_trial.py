@@ -15,6 +15,7 @@ from warp_splat.training import trial
 from warp_splat.training.config_file import read_config
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import floaters
+from warp_splat.training.plan import RATES
 from warp_splat.training.seams import Verdict
 
 CONFIG = TrainConfig(parts="auto", device="cpu", iterations=300)
@@ -71,6 +72,11 @@ def test_the_count_of_steps_is_a_tenth_of_the_work(scene):
     whole = 999 * (pixels / 16 + 30_000) + 1000 * (pixels / 4 + 30_000) + 2001 * (pixels + 30_000)
     expected = int(0.1 * whole / (pixels / 16 + 30_000) / 10) - -(-len(scene.train) // 5)
     assert trial.steps_of(config, scene, 10) == expected
+
+
+def test_trials_have_the_rates_of_the_training(scene):
+    short = trial._shortened(CONFIG, scene, 30).learn
+    assert [getattr(short, name) for name in RATES] == [getattr(CONFIG.learn, name) for name in RATES]
 
 
 def test_points_that_all_photographs_show_are_said_to_be():

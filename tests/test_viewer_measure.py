@@ -1,5 +1,6 @@
 """Measuring in the viewer: clicked points against where Gaussians are, by every kind of lens; a box as a flag."""
 
+import asyncio
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -63,7 +64,11 @@ def test_two_clicks_are_a_distance_and_two_corners_a_box(draw, fake_viser, monke
         )
         ruler.boxed.value = True
         ruler.corners[0].position, ruler.corners[1].position = np.array([[1.0, -2.0, 3.0], [0.0, 5.0, -4.0]])
-        ruler.dragged(None)
+        asyncio.run(ruler.dragged(None))
         assert ruler.note.content == "`--crop 0 -2 -4 1 5 3`"
         ruler.boxed.value = False
         assert not ruler.note.content
+        asyncio.run(ruler.dragged(None))  # by a message that was on its way
+        assert not ruler.note.content
+        for control in (ruler.measuring, ruler.boxed):  # the rest runs in threads, where the next switch may be sooner
+            assert all(map(asyncio.iscoroutinefunction, control.handlers))

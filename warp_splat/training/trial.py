@@ -18,7 +18,7 @@ from warp_splat.scene.types import Scene, as_shown
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import shares_of_size, shrink_at
-from warp_splat.training.plan import of_length, task_of
+from warp_splat.training.plan import RATES, of_length, task_of
 from warp_splat.training.seams import Verdict
 from warp_splat.training.trainer import Trainer
 
@@ -150,6 +150,7 @@ def _shortened(config: TrainConfig, scene: Scene, steps: int) -> TrainConfig:
     """The shape of the training over fewer steps, with images that stay small."""
     task = task_of(config, scene, ())
     short = of_length(config, steps / config.learn.end_or_plan, task._replace(most=task.most // SHRINK))
+    own = {name: getattr(config.learn, name) for name in RATES}  # verdicts are on the training's
     return short.changed(
-        iterations=steps, minutes=0.0, coarse=SHRINK, coarse_by="steps", coarse_until_iter=SHRINK * steps
+        iterations=steps, minutes=0.0, coarse=SHRINK, coarse_by="steps", coarse_until_iter=SHRINK * steps, **own
     )

@@ -54,10 +54,11 @@ class Ruler:
         self.measuring = client.gui.add_checkbox("Measure", False, hint="click on two points")
         self.boxed = client.gui.add_checkbox("Box", False, hint="drag two corners around what --crop is to keep")
         self.note = client.gui.add_markdown("")
-        self.measuring.on_update(self._switch)
-        self.boxed.on_update(lambda _: self._show_box(subject))
+        self.subject = subject
+        self.measuring.on_update(self._switch)  # what is async runs in order, however quickly one switches
+        self.boxed.on_update(self._show_box)
 
-    def _switch(self, _=None) -> None:
+    async def _switch(self, _) -> None:
         self.points, scene = [], self.client.scene
         if self.measuring.value:
             self.marks = scene.add_frame("/distance", show_axes=False)
@@ -75,37 +76,39 @@ class Ruler:
         while self.clicks:
             point = point_at(draw, camera, self.clicks.pop(0))
             if point is not None and self.measuring.value:
-                self.points = [*self.points, point][-2:] if len(self.points) < 2 else [point]
-                self._show_points()
+                self.points = points = [*self.points, point] if len(self.points) < 2 else [point]
+                self._show(points)  # which a switch may take away meanwhile
 
-    def _show_points(self) -> None:
-        text, ends = " ".join(f"{value:.4g}" for value in self.points[0]), np.array([self.points[0], self.points[-1]])
-        if len(self.points) == 2:
+    def _show(self, points: list[np.ndarray]) -> None:
+        text, ends = " ".join(f"{value:.4g}" for value in points[0]), np.array([points[0], points[-1]])
+        if len(points) == 2:
             text = f"{np.linalg.norm(ends[1] - ends[0]):.4g}{self.unit}"
         scene = self.client.scene
         scene.add_line_segments("/distance/line", ends[None], COLOR, thickness=2.0, thickness_units="screen")
         scene.add_label("/distance/label", text, position=ends[1])
         self.note.content = text
 
-    def _show_box(self, subject: np.ndarray) -> None:
+    async def _show_box(self, _) -> None:
         """Show two corners that can be dragged, or let them go."""
         if not self.boxed.value:
             self.box.remove()
             self.note.content = ""
             return
         self.box = self.client.scene.add_frame("/box", show_axes=False)
-        reach = REACH * float(np.linalg.norm(subject - np.asarray(self.client.camera.position)))
+        reach = REACH * float(np.linalg.norm(self.subject - np.asarray(self.client.camera.position)))
         options = {"scale": reach, "disable_rotations": True}
         self.corners = [
-            self.client.scene.add_transform_controls(f"/box/{i}", position=subject + side * reach, **options)
+            self.client.scene.add_transform_controls(f"/box/{i}", position=self.subject + side * reach, **options)
             for i, side in enumerate((-1, 1))
         ]
         for corner in self.corners:
             corner.on_update(self._frame)
-        self._frame()
+        await self._frame()
 
-    def _frame(self, _=None) -> None:
+    async def _frame(self, _=None) -> None:
         """Draw the box between the corners, and say it as a flag."""
+        if not self.boxed.value:  # dragged as it went
+            return
         ends = np.sort([corner.position for corner in self.corners], axis=0)
         self.client.scene.add_box(
             "/box/edges", COLOR, dimensions=ends[1] - ends[0], position=ends.mean(0), wireframe=True
