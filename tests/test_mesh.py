@@ -15,7 +15,7 @@ from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile
-from warp_splat.meshing.command import smoothed, without_islands
+from warp_splat.meshing.command import smoothed, surface_in, without_islands
 from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, fused, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 
@@ -135,6 +135,23 @@ def test_holes_stay_holes():
     assert (mesh.vertices @ camera_at(0).rotation[2] < 0.3).all()  # nothing behind what is seen
 
 
+@pytest.mark.parametrize("seen", [[0], [0, 5, 10, 15]])
+def test_holes_are_closed(threads, seen):
+    """What is seen stays where it was, and has an inside, in box and color as well; for any number of threads."""
+    views, found = [ball(index) for index in seen], []
+    voxels = voxels_of(views, VOXEL)
+    box = torch.cartesian_prod(*(torch.arange(axis.min() - 1, axis.max() + 2, dtype=torch.int32) for axis in voxels.T))
+    for count in (1, 2):
+        threads(count)
+        found.append(surface_in(box, views, VOXEL, True))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    mesh, opened = (trimesh.Trimesh(*each[:2], process=False) for each in (found[0], surface(views)))
+    assert mesh.is_watertight and not opened.is_watertight and mesh.volume > 4
+    assert trimesh.proximity.ProximityQuery(mesh).vertex(opened.vertices)[0].max() < VOXEL
+    np.testing.assert_allclose(found[0].colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(mesh.vertices), 0), atol=1e-5)
+
+
 @pytest.mark.parametrize(("subdivisions", "stays"), [((4, 0), False), ((7, 3), True)])
 def test_islands(subdivisions, stays):
     """One of less than 1 % of the largest one's triangles, and one that has many of its own."""
@@ -202,6 +219,13 @@ def test_the_command(model, scene, tmp_path, capsys, ending):
     assert "triangles" in capsys.readouterr().out
 
 
+def test_the_command_closes_holes(model, scene, tmp_path):
+    """The ball has one below, where no camera is."""
+    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.04", "--watertight"]
+    assert main(["mesh", *arguments]) == 0
+    assert trimesh.load(tmp_path / "ball.ply", process=False).is_watertight
+
+
 def test_fewer_triangles_than_there_can_be(model, scene, tmp_path, capsys):
     arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.1"]
     assert main(["mesh", *arguments, "--triangles", "1"]) == 0
@@ -228,7 +252,8 @@ def test_convex_pieces(model, scene, tmp_path):
         (["ball.ply", "--collision", "9999999999999999999"], "--collision: expected 0 to 1000000"),
         (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
         (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
-        (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen so finely"),
+        (["ball.ply", "--watertight", "--triangles", "9"], "--triangles: simplifying would open what"),
+        (["ball.ply", "--voxel", "0.0001", "--watertight"], "--voxel 0.0001: nothing is seen so finely"),
         (["mesh.ply", "--memory", "1e-9"], "--memory: views of 16 px and more do not fit"),
     ],
 )

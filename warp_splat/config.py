@@ -251,6 +251,7 @@ class MeshConfig(FinishedModel):
     voxel: float = flag(0.0, "edge of a voxel [world units]; 0: two pixels at their median depth")
     memory: float = flag(0.0, "views and voxels take at most so many GB; 0: a quarter of what is free")
     triangles: int = flag(0, "simplify to so many; 0: all")
+    watertight: bool = flag(False, "close all holes, so that it has an inside")
     collision: int = flag(0, "also write at most so many convex pieces around it, for simulators", most=10**6)
 
 

@@ -19,7 +19,7 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import BYTES, Drawn, Surface, depth_of, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.fusion import BYTES, Drawn, Surface, closed, depth_of, fused, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
@@ -46,6 +46,8 @@ def mesh(config: MeshConfig) -> int:
     if output.suffix.lower() not in ENDINGS:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
     check_output(output)
+    if config.triangles and config.watertight:
+        raise InputError("--triangles: simplifying would open what --watertight closes; take larger voxels (--voxel).")
     for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):
         if wanted:
             needed(package)
@@ -55,8 +57,8 @@ def mesh(config: MeshConfig) -> int:
     natural = PIXELS * pixel(views)
     if math.isnan(natural):
         raise InputError(f"{config.model}: its views do not agree on any depth; train longer, or on more photographs.")
-    voxel, voxels = _grid(config.voxel, natural, views, memory / 2)
-    surface = surface_in(voxels, views, voxel)
+    voxel, voxels = _grid(config, natural, views, memory / 2)
+    surface = surface_in(voxels, views, voxel, config.watertight)
     found = len(surface.faces)
     if not found:
         raise InputError(f"--voxel {voxel:g}: nothing is seen so finely or so coarsely; try {natural:.2g}.")
@@ -104,19 +106,26 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     return found
 
 
-def _grid(asked: float, natural: float, views: Sequence[Drawn], memory: float) -> tuple[float, torch.Tensor]:
+def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: float) -> tuple[float, torch.Tensor]:
     """The edge of a voxel [world units]: what is asked for, or what there is memory for; and the voxels."""
-    voxel = asked or natural
-    while len(voxels := voxels_of(views, voxel)) > memory / BYTES:
-        if asked:
-            raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * len(voxels) * BYTES:.1f} GB; raise it, or --memory.")
+    voxel = config.voxel or natural
+    while True:
+        voxels = voxels_of(views, voxel)
+        ends = [(int(axis.min()) - 1, int(axis.max()) + 2) for axis in voxels.T if config.watertight and len(axis)]
+        count = math.prod(end - begin for begin, end in ends) if ends else len(voxels)
+        if count <= memory / BYTES:
+            return voxel, torch.cartesian_prod(*(torch.arange(*x, dtype=torch.int32) for x in ends)) if ends else voxels
+        if config.voxel:
+            raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * count * BYTES:.1f} GB; raise it, or --memory.")
         voxel *= COARSER
-    return voxel, voxels
 
 
-def surface_in(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float) -> Surface:
-    """What is written, but for triangles that are too many."""
-    return smoothed(without_islands(surface_of(voxels, *fused(views, voxels, voxel), voxel)))
+def surface_in(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, watertight: bool = False) -> Surface:
+    """What is written, but for triangles that are too many; watertight, if ``voxels`` fill a box."""
+    field = [voxels, *fused(views, voxels, voxel)]
+    if watertight and (field[1].abs() < 1).any():
+        field = closed(*field)
+    return smoothed(without_islands(surface_of(*field, voxel)))
 
 
 def without_islands(surface: Surface) -> Surface:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
+from scipy import ndimage
 from warp.geometry import IsoSurfaceMarchingCubes, sparse_marching_cubes_from_cells
 
 from warp_splat.camera import Camera
@@ -144,6 +145,22 @@ def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> tuple[t
         launch.launch(fuse, len(voxels), [voxel, TRUNCATION * voxel, *pose, lens_of(camera), places, *pictures], made)
     distance = torch.where(sums[:, 1] > 0, sums[:, 0] / sums[:, 1], torch.nan)
     return distance, colors[:, :3] / colors[:, 3:].clamp_min(1.0)
+
+
+def closed(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor) -> list[torch.Tensor]:
+    """Places, distances and colors of those voxels of a whole box that are beside a surface without holes.
+
+    A voxel that no view sees is as the nearest one beside what is seen; the outermost are outside.
+    """
+    shape = tuple(int(size) for size in voxels[-1] - voxels[0] + 1)
+    far = ~(distances.abs() < 1).view(shape).numpy()  # or never seen
+    nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
+    nearest = torch.from_numpy(np.ravel_multi_index(tuple(nearest), shape).ravel())
+    distances = torch.where(distances.isnan(), distances[nearest], distances).view(shape)
+    distances = torch.nn.functional.pad(distances[1:-1, 1:-1, 1:-1], (1,) * 6, value=1.0)
+    inside = (distances < 0).numpy()
+    beside = torch.from_numpy(ndimage.maximum_filter(inside, 3) != ndimage.minimum_filter(inside, 3)).ravel()
+    return [voxels[beside], distances.ravel()[beside], colors[nearest[beside]]]
 
 
 def surface_of(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor, voxel: float) -> Surface:
