@@ -226,6 +226,16 @@ def test_the_command_closes_holes(model, scene, tmp_path):
     assert trimesh.load(tmp_path / "ball.ply", process=False).is_watertight
 
 
+@pytest.mark.parametrize("options", [["--triangles", "200"], ["--watertight"]])
+def test_nothing_lies_outside_of_a_crop(model, scene, tmp_path, options):
+    low, high = np.array([-np.inf, -0.1, 0.7]), np.array([0.2, np.inf, 1.2])
+    box = [f"{value}" for value in (*low, *high)]
+    output = tmp_path / "ball.glb"
+    assert main(["mesh", str(model[0]), str(output), "-s", scene, "--voxel", "0.04", *options, "--crop", *box]) == 0
+    vertices = trimesh.load(output, force="mesh").vertices * [-1, -1, 1]
+    assert (vertices >= low - 1e-6).all() and (vertices <= high + 1e-6).all() and len(vertices) > 50
+
+
 def test_fewer_triangles_than_there_can_be(model, scene, tmp_path, capsys):
     arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.1"]
     assert main(["mesh", *arguments, "--triangles", "1"]) == 0

@@ -61,9 +61,11 @@ def mesh(config: MeshConfig) -> int:
     surface = surface_in(voxels, views, voxel, config.watertight)
     found = len(surface.faces)
     if not found:
-        raise InputError(f"--voxel {voxel:g}: nothing is seen so finely or so coarsely; try {natural:.2g}.")
+        raise InputError(f"--voxel {voxel:g}: nothing is seen so finely, so coarsely or in the box; try {natural:.2g}.")
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)
+    if config.crop:  # smoothing and simplifying move vertices
+        surface = surface._replace(vertices=surface.vertices.clip(*np.reshape(config.crop, (2, 3))))
     whole = trimesh_of(surface)
     write_bytes(output, exported(whole, output.suffix))
     least = ", the fewest that simplifying comes to" if 0 < config.triangles < 0.9 * len(surface.faces) else ""
@@ -110,7 +112,7 @@ def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: fl
     """The edge of a voxel [world units]: what is asked for, or what there is memory for; and the voxels."""
     voxel = config.voxel or natural
     while True:
-        voxels = voxels_of(views, voxel)
+        voxels = voxels_of(views, voxel, config.crop)
         ends = [(int(axis.min()) - 1, int(axis.max()) + 2) for axis in voxels.T if config.watertight and len(axis)]
         count = math.prod(end - begin for begin, end in ends) if ends else len(voxels)
         if count <= memory / BYTES:

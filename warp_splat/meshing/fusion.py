@@ -111,8 +111,11 @@ def pixel(views: Sequence[Drawn]) -> float:
     return float(np.median([float(depths.median()) / focal for depths, focal in found if len(depths)] or [np.nan]))
 
 
-def voxels_of(views: Sequence[Drawn], voxel: float) -> torch.Tensor:
-    """Places on the grid [V, 3] int32 of the voxels of all blocks that depths fall into, or a truncation beside."""
+def voxels_of(views: Sequence[Drawn], voxel: float, box: Sequence[float] = ()) -> torch.Tensor:
+    """Places on the grid [V, 3] int32 of the voxels of all blocks that depths fall into, or a truncation beside.
+
+    ``box``: the smallest x, y, z and the largest [world units]; only those in it.
+    """
     blocks = torch.empty(0, dtype=torch.int64)
     for view in views:
         camera, depth = view.camera, view.depth
@@ -124,7 +127,11 @@ def voxels_of(views: Sequence[Drawn], voxel: float) -> torch.Tensor:
             blocks = torch.unique(torch.cat([blocks, torch.unique(code(places))]))
     inside = torch.cartesian_prod(*[torch.arange(EDGE)] * 3)
     corners = torch.stack([(blocks >> shift & 2 * HALF - 1) - HALF for shift in (42, 21, 0)], 1)
-    return (corners[:, None] * EDGE + inside).reshape(-1, 3).int()
+    voxels = (corners[:, None] * EDGE + inside).reshape(-1, 3).int()
+    if not box:
+        return voxels
+    low, high = torch.tensor(box).view(2, 3) / voxel
+    return voxels[((voxels >= low) & (voxels <= high)).all(1)]
 
 
 def code(places: torch.Tensor) -> torch.Tensor:
