@@ -86,11 +86,16 @@ def test_what_a_budget_makes_is_told(budget, until, sentence, scene):
     assert found[-1] == (POINTS if until == 11 else min(budget, 2 * POINTS))
 
 
-def growth_on(model, budget=None, processes=ALONE):
+def growth_on(model, budget=None, processes=ALONE, iterations=2000):
     """A growth of a model."""
-    config, scene = TrainConfig(growth="budget"), SimpleNamespace(extent=1.0)
-    setting = Setting(scene, model, torch.zeros(3), processes, 0, budget or len(model), 2000)
+    config, scene = TrainConfig(growth="budget", densify_until_iter=iterations), SimpleNamespace(extent=1.0)
+    setting = Setting(scene, model, torch.zeros(3), processes, 0, budget or len(model), iterations)
     return Budget(config.plugins["budget"], setting, Optimizer(model, config.learn, 1.0))
+
+
+def test_any_budget_is_reached_in_two_billion_steps():
+    model = GaussianModel.from_points(np.zeros((3, 3)), np.zeros((3, 3), np.uint8), 0)
+    assert not growth_on(model, 10**8, iterations=2**31 - 1).told()
 
 
 def test_where_it_is_full_the_faintest_make_room():

@@ -164,7 +164,7 @@ def test_results_are_json_and_keep_other_methods(tmp_path):
     assert read_strictly(tmp_path / "per_view.json") == {"ours_30000": views}
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "\xff"])
+@pytest.mark.parametrize("text", ["{", "[]", '{"ours_1": 3}', "\xff"])
 def test_results_that_are_not_json_are_left_alone(tmp_path, text):
     (tmp_path / "results.json").write_bytes(text.encode("latin-1"))
     refusal(lambda: write_results(tmp_path, 1, {"SSIM": 1.0, "PSNR": 2.0}, {}), match=r"results\.json.*move it away")

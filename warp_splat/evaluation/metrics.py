@@ -132,7 +132,7 @@ def write_results(
 
 def _read_object(path: Path) -> dict:
     expected = "a JSON object with entries ours_N (otherwise move it away and run again)"
-    return read_json(path, expected, lambda found: {**found}) if path.exists() else {}
+    return read_json(path, expected, lambda found: {k: {**v} for k, v in found.items()}) if path.exists() else {}
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ class Budget(Reference):
             return [f"Warning: no densification before step {self.end}: there will be {self.start} Gaussians as now."]
         if budget < self.start:
             return [f"The faintest of {self.start} Gaussians go, until there are --max_gaussians {budget}."]
-        if budget > self.start * 2.0**doublings:
+        if budget > self.start * 2 ** min(doublings, 99):
             most = f"{doublings} densifications double {self.start} to {self.start * 2**doublings}"
             return [f"Warning: --max_gaussians {budget} will not be reached, since {most} at most."]
         return []
