@@ -63,9 +63,9 @@ def test_two_clicks_are_a_distance_and_two_corners_a_box(draw, fake_viser, monke
             position=position, on_update=lambda handler: setattr(ruler, "dragged", handler)
         )
         ruler.boxed.value = True
-        ruler.corners[0].position, ruler.corners[1].position = np.array([[1.0, -2.0, 3.0], [0.0, 5.0, -4.0]])
+        ruler.corners[0].position, ruler.corners[1].position = np.array([[1234.56, -2.0, 3.0], [0.0, 5.0, -4.0]])
         asyncio.run(ruler.dragged(None))
-        assert ruler.note.content == "`--crop 0 -2 -4 1 5 3`"
+        assert ruler.note.content == "`--crop 0 -2 -4 1234.56 5 3`"
         ruler.boxed.value = False
         assert not ruler.note.content
         asyncio.run(ruler.dragged(None))  # by a message that was on its way

@@ -80,7 +80,7 @@ class Ruler:
                 self._show(points)  # which a switch may take away meanwhile
 
     def _show(self, points: list[np.ndarray]) -> None:
-        text, ends = " ".join(f"{value:.4g}" for value in points[0]), np.array([points[0], points[-1]])
+        text, ends = " ".join(f"{value:.6g}" for value in points[0]), np.array([points[0], points[-1]])
         if len(points) == 2:
             text = f"{np.linalg.norm(ends[1] - ends[0]):.4g}{self.unit}"
         scene = self.client.scene
@@ -113,4 +113,4 @@ class Ruler:
         self.client.scene.add_box(
             "/box/edges", COLOR, dimensions=ends[1] - ends[0], position=ends.mean(0), wireframe=True
         )
-        self.note.content = f"`--crop {' '.join(f'{value:.4g}' for value in ends.ravel())}`"
+        self.note.content = f"`--crop {' '.join(f'{value:.6g}' for value in ends.ravel())}`"
