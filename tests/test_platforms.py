@@ -102,13 +102,21 @@ def hashes(changes: dict[str, str], *arguments: str) -> list[str]:
     return [line for line in said.splitlines() if line.endswith(")")]
 
 
-def test_a_misspelled_switch_is_refused():
-    done = python("-m", "warp_splat", "export-html", "a.ply", "a.html", check=False, WARP_SPLAT_PORTABLE="yes")
+@pytest.mark.parametrize(
+    ("switch", "value", "said"),
+    [
+        ("WARP_SPLAT_PORTABLE", "yes", "expected 1, 0 or nothing in this environment variable, got 'yes'; set it to"),
+        (
+            "WARP_SPLAT_TARGET",
+            "x86-64",
+            "expected flags such as '-target-cpu x86-64-v3', got 'x86-64'; mend or unset it.",
+        ),
+    ],
+)
+def test_a_misspelled_switch_is_refused(switch, value, said):
+    done = python("-m", "warp_splat", "export-html", "a.ply", "a.html", check=False, **{switch: value})
     assert done.returncode == 1
-    assert done.stderr == (
-        "warp-splat: error: WARP_SPLAT_PORTABLE: expected 1, 0 or nothing in this environment variable, got 'yes'; "
-        "set it to one of them.\n"
-    )
+    assert done.stderr.startswith(f"warp-splat: error: {switch}: {said}") and done.stderr.count("\n") == 1
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names processors of the x86-64 family")

@@ -20,7 +20,10 @@ def _is_on(variable: str) -> bool:
 
 
 #: Warp's way to say "this machine", or another processor for tests: "-target-cpu x86-64-v3".
-TARGET = os.environ.get("WARP_SPLAT_TARGET", "-march=native")
+TARGET = os.environ.get("WARP_SPLAT_TARGET") or "-march=native"
+if not TARGET.startswith("-"):  # which ends Warp's compiler, and the process with it
+    expected = "expected flags such as '-target-cpu x86-64-v3'"
+    raise InputError(f"WARP_SPLAT_TARGET: {expected}, got {TARGET!r:.50}; mend or unset it.")
 
 #: Multiplications and additions apart, where :func:`.simd.fma` fuses them: x86-64 without AVX2 has no such instruction.
 PORTABLE = _is_on("WARP_SPLAT_PORTABLE")
