@@ -200,7 +200,7 @@ def _photos(
     where: Path, registered: list[pycolmap.Image], root: Path, report: Report, sampling: Sampling | None
 ) -> list[Photo]:
     names = [image.name for image in registered]
-    hint = "copy them there or choose another folder with --images"
+    hint = "copy them there or, to train, choose another folder with --images"
     paths = ImageFinder(root).find_all(names, f"images of {where}", hint, report)
     sizes = [images.read_size(path) for path in paths]
     photos = [photo_of(*each, sampling) for each in zip(registered, paths, sizes, strict=True)]
