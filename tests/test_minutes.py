@@ -65,11 +65,21 @@ def test_plans_take_their_time_and_keep_the_shape(minutes):
     before, after = schedule_of(FAST), schedule_of(plan)
     for name, value in before.items():
         assert after[name] == pytest.approx(factor * value, rel=2e-3, abs=1.0), name
-    others = {name for name, value in plan.flat().items() if value != FAST.flat()[name]}
+    others = {name for name, value in plan.flat().items() if value != FAST.flat()[name]} - {"densification_interval"}
     assert others == {name for name in before if before[name]} | ({"max_gaussians", *RATES} if factor < 1 else set())
     for name in RATES:  # higher by the root of what is left out, at most twice
         quicker = getattr(plan.learn, name) / getattr(FAST.learn, name)
         assert quicker == pytest.approx(min(max(factor**-0.5, 1), 2), rel=5e-3), name
+
+
+@pytest.mark.parametrize(("factor", "start"), [(1.0, 10_000), (0.1, 10_000), (0.06, 1000), (0.03, 20)])
+def test_short_plans_reach_their_budget(factor, start):
+    plan = of_length(FAST, factor, TASK._replace(start=start))
+    options, count = plan.plugins["budget"], start
+    for step in range(options.densify_from_iter + 1, options.densify_until_iter):
+        count *= 1 + (step % options.densification_interval == 0)
+    assert count >= plan.grow.max_gaussians
+    assert options.densification_interval == 100 or factor < 0.2
 
 
 def test_a_slower_machine_gets_fewer_steps_and_gaussians():

@@ -2,12 +2,14 @@
 
 The options of a training are the shape of a schedule: a plan stretches or shrinks all its steps by one factor, until
 what they cost adds up to the time. Below the shape's own length there are also fewer Gaussians, by the square root of
-that factor, and rates are higher by it, up to :data:`QUICKEST` times. A clock decides on the end itself
+that factor, and rates are higher by it, up to :data:`QUICKEST` times. The set grows at least as often as it has to
+double. A clock decides on the end itself
 (:mod:`warp_splat.training.deadline`), so that a plan has to be good, but not exact.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -96,7 +98,10 @@ def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
     quicker = min(1.0 / shorter, QUICKEST)
     rates = {name: float(f"{quicker * getattr(config.learn, name):.3g}") for name in RATES if factor < 1}
     steps["settle_from_iter"] = 0  # the clock says when to settle
-    return config.changed(**steps, **rates, max_gaussians=most)
+    interval, doublings = config.flat()["densification_interval"], math.ceil(math.log2(most / max(task.start, 1)))
+    window = steps["densify_until_iter"] - 1 - max(steps["densify_from_iter"], 0)
+    interval = min(interval, max(window // max(doublings, 1), 1))
+    return config.changed(**steps, **rates, max_gaussians=most, densification_interval=interval)
 
 
 def plan_for(config: TrainConfig, cost: Cost, seconds: float, task: Task) -> TrainConfig:
@@ -118,9 +123,9 @@ def as_flags(config: TrainConfig) -> str:
     idle -= {name for group in used if group in config.plugins for name in vars(config.plugins[group])}
     if not config.learn.settle_from_iter:
         idle.add("settle_from_iter")
-    shown = {name: value for name, value in schedule_of(config).items() if name not in idle}
+    shown, values = {name: value for name, value in schedule_of(config).items() if name not in idle}, config.flat()
     shown |= {name: getattr(config.learn, name) for name in ("coarse", "coarse_by", *RATES)}
-    shown |= {"max_gaussians": config.grow.max_gaussians}
+    shown |= {name: values[name] for name in ("max_gaussians", "densification_interval")}
     preset = f"--preset {config.data.preset} " if config.data.preset else ""
     return preset + " ".join(f"--{name} {value}" for name, value in shown.items())
 
