@@ -18,6 +18,7 @@ from street import make_street
 from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
 from warp_splat.config import MergeConfig
+from warp_splat.formats.model_folder import find_iteration, ply_path
 from warp_splat.gaussians import GaussianModel
 from warp_splat.presets import PRESETS
 from warp_splat.rendering.finished import Finished
@@ -27,6 +28,7 @@ from warp_splat.scene.types import View
 from warp_splat.training.options import TrainConfig, schedule_of
 
 ACROSS, SEAM = 0.1, 3
+TOGETHER = ("--iterations", 300, "--cooldown", 300, "--out_of_core", "--optimizer_type", "sparse_adam")
 COLUMNS = {
     **{"scene": "{scene}", "seed": "{seed}", "model": "{model}", "Gaussians": "{file}", "across": "{across:.2f}"},
     **{"within": "{within:.2f}", "seams": "{seams:.2f}", "elsewhere": "{rest:.2f}"},
@@ -42,6 +44,13 @@ def flags_of(source: Path, seed: int, share: float, iterations: int, width: int)
     flags = ["-s", source, "-r", width, "--eval", "--preset", "fast", "--growth", "reference", "--device", "cpu"]
     flags += ["--densify_grad_threshold", 0.001]  # of small pictures
     return [*flags, *schedule, "--threads", 1, "--seed", seed]
+
+
+def train_together(folder: Path, source: Path, seed: int, width: int) -> dict:
+    """Go on from the model in ``folder`` with all photographs: the results, of the folder within."""
+    flags = ["-s", source, "-r", width, "--eval", "--device", "cpu", "--threads", 1, "--seed", seed]
+    start = ply_path(folder, find_iteration(folder))
+    return run_training(folder / "together", [*flags, "--start_ply", start, *TOGETHER])
 
 
 def cells_in(camera: Camera, depth: np.ndarray, block: Block) -> np.ndarray:
@@ -85,16 +94,20 @@ def compare(name: str, source: Path, seed: int, models: Path, count: int, iterat
     largest = max(blocks, key=lambda part: len(part.points))
     views = f"{min(len(part.train) for part in blocks)} to {max(len(part.train) for part in blocks)}"
     records.append({"model": f"{count} blocks", "largest": len(largest.points), "views": views, "results": trained})
-    (of_whole, depths), (of_blocks, _) = (errors_of(place, scene.test) for place in (whole, folder))
-    cells = [cells_in(view.camera, depth, blocks[0].block) for view, depth in zip(scene.test, depths, strict=True)]
+    for place, record in ((whole, records[0]), (folder, records[1])):
+        more = {"model": f"{record['model']}, then together", "results": [train_together(place, source, seed, width)]}
+        records.append({**record, **more})
+    places = (whole, folder, whole / "together", folder / "together")
+    errors, depths = zip(*(errors_of(place, scene.test) for place in places), strict=True)
+    cells = [cells_in(view.camera, depth, blocks[0].block) for view, depth in zip(scene.test, depths[0], strict=True)]
     across = [(found != np.bincount(found.ravel()).argmax()).mean() > ACROSS for found in cells]
     seams = [maximum_filter(found, 2 * SEAM + 1) != minimum_filter(found, 2 * SEAM + 1) for found in cells]
-    for place, errors, record in zip((whole, folder), (of_whole, of_blocks), records, strict=True):
+    for place, of_model, record in zip(places, errors, records, strict=True):
         record["scene"], record["seed"] = f"{name}: {sum(across)} of {len(across)} across", seed
         record["file"] = len(Finished(place).file.splats.means)
         for of_views, of_pixels, chosen in (("across", "seams", True), ("within", "rest", False)):
-            views = [error for error, beyond in zip(errors, across, strict=True) if beyond == chosen]
-            pixels = [error[near == chosen] for error, near in zip(errors, seams, strict=True)]
+            views = [error for error, beyond in zip(of_model, across, strict=True) if beyond == chosen]
+            pixels = [error[near == chosen] for error, near in zip(of_model, seams, strict=True)]
             record |= {of_views: decibels(views), of_pixels: decibels([np.concatenate(pixels)])}
         record["mb"] = max(one["peak_memory_mb"] for one in record["results"])
         record["steps"] = sum(one["iterations"] for one in record["results"])
@@ -124,7 +137,8 @@ def main() -> None:
         "fast and --growth reference with --densify_grad_threshold 0.001, a block fewer in proportion to its "
         "photographs. Across: views of which a tenth or more lies in other cells than most of it; seams: pixels within "
         f"{SEAM} of another cell's; starts from: "
-        "points of the largest block; MB: peak of the largest training; steps: of all trainings."
+        "points of the largest block; then together: --start_ply with all photographs, "
+        f"{' '.join(map(str, TOGETHER))}; MB: peak of the largest training; steps: of all trainings of this line."
     )
     write_table("blocks", arguments.out, COLUMNS, records, note, {"records": records})
 

@@ -11,8 +11,11 @@ import figures as f
 
 
 def _scaling() -> list[tuple]:
-    street, street_blocks, again, again_blocks, ring, ring_blocks = f.data("blocks")["records"]
-    behind = lambda whole, blocks: [f.one(whole[place] - blocks[place]) for place in ("rest", "seams")]  # noqa: E731
+    records = f.data("blocks")["records"]
+    (street, street_after), (again, again_after), (ring, ring_after) = (
+        [[f.one(whole[place] - blocks[place]) for place in ("rest", "seams")] for whole, blocks in (four[:2], four[2:])]
+        for four in (records[:4], records[4:8], records[8:])
+    )
     on_eight, largest = (
         row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
     )
@@ -27,11 +30,13 @@ def _scaling() -> list[tuple]:
         ),
         (
             "street's blocks are {} dB behind away from the borders, and {} dB at them, with another seed {} and {}:",
-            *(*behind(street, street_blocks), *behind(again, again_blocks)),
+            *(*street, *again),
         ),
+        ("On fox they are {} and {} dB behind", *ring),
         (
-            "On fox they are {} and {} dB behind",
-            *behind(ring, ring_blocks),
+            "behind: {} dB away from the borders and {} dB at them, of the undivided training with as many steps more, "
+            "with another seed {} and {}. On fox it is {} and {} dB:",
+            *(*street_after, *again_after, *ring_after),
         ),
         ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
     ]
