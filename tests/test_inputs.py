@@ -20,6 +20,7 @@ from splat_files import some_file
 
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import load_scene
 from warp_splat.training.loss import image_loss
 from warp_splat.training.options import TrainConfig
@@ -60,15 +61,15 @@ def test_without_points_random_ones_in_the_views(tmp_path, kind):
     np.testing.assert_array_equal(scene.points, load(root)[0].points)
 
 
-@pytest.mark.parametrize("degree", [0, 2, 3])
-def test_start_from_a_file(tmp_path, degree):
+@pytest.mark.parametrize(("degree", "folder"), [(0, False), (2, True), (3, False)])
+def test_start_from_a_file(tmp_path, degree, folder):
     root = write_colmap(tmp_path / "scene")
     first = Trainer(load(root)[0], TrainConfig(device="cpu", sh_degree=2))
     with torch.no_grad():
         for leaf in first.model.parameters.values():
             leaf.add_(0.1 * torch.randn(leaf.shape, generator=torch.Generator().manual_seed(0)))
-    first.model.save(tmp_path / "a.ply")
-    scene, _ = load(root, start=str(tmp_path / "a.ply"))
+    first.model.save(path := ply_path(tmp_path / "model", 7))
+    scene, _ = load(root, start=str(tmp_path / "model" if folder else path))
     second = Trainer(scene, TrainConfig(device="cpu", sh_degree=degree))
     for name, tensor in first.model.arranged().parameters.items():
         found = second.model.parameters[name]

@@ -34,6 +34,13 @@ def test_ctrl_c_while_libraries_load():
     assert run.returncode == 130 and run.stderr == "warp-splat: interrupted before it began.\n"
 
 
+def test_ctrl_c_while_libraries_end():
+    code = (
+        "import signal, weakref; from warp_splat import cli; weakref.finalize(cli, signal.raise_signal, signal.SIGINT)"
+    )
+    assert "Traceback" not in python("-c", f"{code}; cli.main(['view'])", check=False).stderr
+
+
 def test_every_public_name_exists_after_any_other_import():
     """One process for all: lazily loaded names must not be shadowed by modules of the same name."""
     lines = ["import warp_splat.training.trainer", "from warp_splat import *"]

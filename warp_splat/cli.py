@@ -1,10 +1,12 @@
 """The command line: flags from the fields of the configurations, errors as one sentence."""
 
 import argparse
+import atexit
 import difflib
 import importlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -247,6 +249,8 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("warp-splat: interrupted; what was saved before stays.", file=sys.stderr)
         return 130
+    finally:
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # in what ends libraries, it would be a traceback
 
 
 if __name__ == "__main__":

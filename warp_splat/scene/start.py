@@ -1,4 +1,4 @@
-"""What training starts from where a scene has no points: random ones, or Gaussians of a file."""
+"""What training starts from where a scene has no points: random ones, or Gaussians."""
 
 import math
 
@@ -7,6 +7,7 @@ import numpy as np
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.model_folder import find_iteration, is_file_of_gaussians, ply_path
 from warp_splat.formats.ply import GRAY
 from warp_splat.formats.splats import SplatFile
 from warp_splat.formats.stored import SH_C0
@@ -71,12 +72,12 @@ def _power(base: float, shares: np.ndarray) -> np.ndarray:
 
 
 def load_start(path: str, report: Report) -> tuple[SplatFile, np.ndarray, np.ndarray]:
-    """Gaussians of a file, their centers [N, 3] float32 and colors [N, 3] uint8, seen from nowhere in particular.
+    """Gaussians of a file or model folder, their centers [N, 3] float32 and colors [N, 3] uint8, seen from nowhere.
 
     Raises:
         InputError: if it is missing or not a file of Gaussians, or if there are none in it.
     """
-    file = load_gaussians(path, report)
+    file = load_gaussians(path if is_file_of_gaussians(path) else ply_path(path, find_iteration(path)), report)
     if not len(file.splats.means):
         raise InputError(f"{path}: expected at least one Gaussian to start from, found none; name another file.")
     colors = (255 * (SH_C0 * file.splats.sh[:, 0].astype(np.float64) + 0.5)).clip(0, 255).round().astype(np.uint8)

@@ -113,7 +113,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     say(f"Scene {data.source_path}")
     if learn.coarse > 1 and learn.coarse_until_iter > learn.iterations:
         say(f"Warning: images reach their full size at --coarse_until_iter {learn.coarse_until_iter}, after the end.")
-    start = data.start_ply if not begun or os.path.isfile(data.start_ply) else ""  # if it has gone
+    start = data.start_ply if not begun or os.path.exists(data.start_ply) else ""  # if it has gone
     same = {
         name: getattr(data, name)
         for name in ("images", "resolution", "white_background", "eval", "invert_masks", "lens", "block")

@@ -31,7 +31,7 @@ class DataOptions:
     invert_masks: bool = data(False, "of the masks in masks/, the dark part counts, not the bright one")
     lens: str = data("undistort", "photographs with distortion: as pinholes would take them, or as is", choices=LENSES)
     loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=("srgb", "log"))
-    start_ply: str = data("", "a file of Gaussians to start from instead of the scene's points (.ply, .spz, ...)")
+    start_ply: str = data("", "Gaussians to start from instead of points: a file (.ply, .spz, ...) or a model folder")
     block: str = data("", "K/N: of the N blocks into which the scene is cut, train the K-th; see warp-splat merge")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")
 
