@@ -20,7 +20,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 import warp as wp
-from common import option, parse, write_table
+from common import RUNS, option, parse, write_table
 from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
@@ -503,11 +503,8 @@ NOTE = (
 def main() -> None:
     arguments = parse(
         __doc__,
-        option("--runs", type=Path, required=True, help="folder for what has been run"),
-        option("--fox", type=Path, help="photographs of 540 x 960 px"),
-        option("--church", type=Path, help="photographs of 768 x 512 px"),
+        *RUNS,
         option("--only", default="", help="ingredients whose names begin so, between commas"),
-        option("--only_table", action="store_true", help="train nothing more"),
     )
     launch.prepare("cpu", 1)
     launch.load(search, torch.device("cpu"))

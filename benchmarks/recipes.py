@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 import work
-from common import option, parse, write_table
+from common import RUNS, parse, write_table
 
 from warp_splat.evaluation.metrics import psnr, ssim
 from warp_splat.evaluation.perceptual import flip
@@ -216,13 +216,7 @@ NOTE = (
 
 
 def main() -> None:
-    arguments = parse(
-        __doc__,
-        option("--runs", type=Path, required=True, help="folder for what has been run"),
-        option("--fox", type=Path, help="photographs of 540 x 960 px"),
-        option("--church", type=Path, help="photographs of 768 x 512 px"),
-        option("--only_table", action="store_true", help="train nothing more"),
-    )
+    arguments = parse(__doc__, *RUNS)
     launch.prepare("cpu", 1)
     arguments.runs.mkdir(parents=True, exist_ok=True)
     given = {"fox": arguments.fox, "church": arguments.church, "embedded": embedded_scene()}

@@ -263,6 +263,7 @@ def test_convex_pieces(model, scene, tmp_path):
         (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
         (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
         (["ball.ply", "--watertight", "--triangles", "9"], "--triangles: simplifying would open what"),
+        (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen so finely"),
         (["ball.ply", "--voxel", "0.0001", "--watertight"], "--voxel 0.0001: nothing is seen so finely"),
         (["mesh.ply", "--memory", "1e-9"], "--memory: views of 16 px and more do not fit"),
     ],
