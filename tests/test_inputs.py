@@ -79,6 +79,8 @@ def test_start_from_a_file(tmp_path, degree, folder):
             assert torch.equal(found[:, :common], tensor[:, :common]) and not found[:, common:].any()
         else:
             assert torch.equal(found, tensor)
+    camera, first.degree = scene.train[0].camera, min(degree, 2)  # training goes on with all harmonics of the file
+    assert np.abs(first.look(camera).image - second.look(camera).image).max() < 1e-6
     refusal(lambda: load(root, start=str(tmp_path / "b.ply")), "no such file")
     save_gaussians(tmp_path / "empty.ply", some_file(0))
     with pytest.raises(InputError, match=r"empty\.ply: expected at least one Gaussian to start from"):

@@ -20,7 +20,7 @@ from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.curve import along_curve
 from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.model_folder import prepare_folder
-from warp_splat.formats.splats import SplatArrays
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays
 from warp_splat.gaussians import CHUNK, GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
@@ -97,7 +97,7 @@ class Trainer:
         self.told = [sentence for told in having([self.growth], "told") for sentence in told()]
         self.dropped: Counter = Counter()  # of NOT_FINITE, on the device; prunings that would have emptied the scene
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
-        self.degree = 0
+        self.degree = min(COEFFICIENTS.index(scene.start.splats.sh.shape[1]), degree) if scene.start else 0
         self.blocks = Blocks(self, processes) if isinstance(processes, Shards) else None
         self.deck = Deck(scene.train, seed)
         with_alpha = any(having(self.parts, "reads_alpha"))
@@ -242,6 +242,7 @@ class Trainer:
         return tensors, {
             "views": [view.name for view in self.scene.train],
             "extent": self.scene.extent,
+            "degree": self.degree,
             **self.deck.state(),
             **{f"dropped.{name}": count for name, count in self.all_dropped().items()},
         }
@@ -267,12 +268,15 @@ class Trainer:
         self.optimizer.restore(checkpoint)
         for restore in having((self.growth, *self.parts), "restore"):
             restore(checkpoint)
+        begun = checkpoint.count("degree") if "degree" in checkpoint.facts else 0  # unknown to older programs
+        self.degree = min(begun, self.config.model.sh_degree)
         self._radii = torch.from_numpy(checkpoint.array("radii", (len(self.model),), np.int32)).to(self.device)
         self._set_iteration(checkpoint.count("iteration"))
 
     def _set_iteration(self, iteration: int) -> None:
         self.optimizer.set_iteration(iteration)
-        self.degree = min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree)
+        risen = min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree)
+        self.degree = max(self.degree, risen)
 
     def _shown(self, camera: Camera | CameraParameters, options: RasterOptions) -> torch.Tensor | None:
         """The Gaussians that a view needs, where they live in a file; None: all."""
