@@ -14,6 +14,7 @@ import pytest
 from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.scene.embedded import embedded_scene
+from warp_splat.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[1]
 SCENE = embedded_scene()
@@ -44,6 +45,18 @@ def started(*words, **pipes):
     """A process of Python that runs, with pipes for what it says."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT, **pipes}
     return subprocess.Popen([sys.executable, *map(str, words)], env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes)
+
+
+def interrupt(monkeypatch, iteration):
+    """Send SIGINT, as Ctrl-C does, while ``iteration`` is computed."""
+    differentiate = Trainer.differentiate
+
+    def interrupted(self, number):
+        if number == iteration:
+            os.kill(os.getpid(), signal.SIGINT)
+        return differentiate(self, number)
+
+    monkeypatch.setattr(Trainer, "differentiate", interrupted)
 
 
 @contextmanager

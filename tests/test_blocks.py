@@ -5,13 +5,15 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import SCENE, train
+from commands import SCENE, interrupt, train
 from hostile import refusal, replace
 from scene_files import LENS, texture, write_image
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.checkpoint import LAST
+from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_points
 from warp_splat.scene import load_scene
 from warp_splat.scene.blocks import BLOCK, block_of
@@ -127,8 +129,32 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
     assert found in fails("merge", tmp_path)
 
 
-def test_what_a_block_cannot_have(trained, tmp_path, fails):
+def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, monkeypatch):
+    """Stopped within the second block, and gone on with; a block that has ended is not trained again."""
+    put(trained, tmp_path, 0)
+    (tmp_path / "0").rename(tmp_path / "1")
+    all_of_it, place = ("--blocks", "2", "--iterations", "20"), lambda name: ply_path(tmp_path / name, 20)
+    with monkeypatch.context() as patch:
+        interrupt(patch, 10)
+        assert train(tmp_path, *all_of_it) == 130
+    assert "goes on with block 2/2" in capsys.readouterr().out
+    assert train(tmp_path, *all_of_it) == 0
+    assert train(tmp_path / "alone", "--block", "2/2", *all_of_it[2:]) == 0
+    settled = ("--settle_from_iter", "1", "--cooldown", "19", "--start_ply", str(tmp_path))
+    assert train(tmp_path / "after", *settled) == 0
+    for one, other in (("2", "alone"), ("together", "after")):
+        assert place(one).read_bytes() == place(other).read_bytes()
+    assert len(load_gaussians(place("together")).splats.means) == len(load_gaussians(ply_path(tmp_path, 60)).splats.means)
+
+
+def test_what_a_block_cannot_have(trained, tmp_path, fails, monkeypatch):
     block = ("train", "-s", SCENE, "-m", tmp_path / "a", "--block", "1/2", "--parts")
     assert "expected no part that learns" in fails(*block, "exposure")
     assert "expected parts by name" in fails(*block, "auto")
+    for name, value in (("--block", "1/2"), ("--minutes", "1"), ("--resume", trained)):
+        more = () if name == "--resume" else ("-s", SCENE)
+        assert f"--blocks: expected no {name} beside it" in fails("train", *more, "--blocks", "2", name, value)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert "--blocks: expected one process" in fails("train", "-s", SCENE, "--blocks", "2")
+    monkeypatch.delenv("WORLD_SIZE")
     assert "--block 2/2: expected 1/2" in fails("train", "--resume", trained, "--block", "2/2")

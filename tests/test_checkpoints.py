@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import random
 import shutil
-import signal
 import sys
 import time
 from contextlib import nullcontext
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from commands import ROOT, SCENE, SHORT, no_space, started, train
+from commands import ROOT, SCENE, SHORT, interrupt, no_space, started, train
 from scene_files import pose, write_colmap
 from splat_files import some_splats
 from test_distributed import torchrun
@@ -90,18 +89,6 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     assert train(folder, "--threads", "2") == 0
     return folder
-
-
-def interrupt(monkeypatch, iteration):
-    """Send SIGINT, as Ctrl-C does, while ``iteration`` is computed."""
-    differentiate = Trainer.differentiate
-
-    def interrupted(self, number):
-        if number == iteration:
-            os.kill(os.getpid(), signal.SIGINT)
-        return differentiate(self, number)
-
-    monkeypatch.setattr(Trainer, "differentiate", interrupted)
 
 
 def results(folder):

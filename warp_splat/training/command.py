@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from warp_splat.config import MergeConfig
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
-from warp_splat.formats.checkpoint import Checkpoint, load_own
+from warp_splat.formats.checkpoint import LAST, Checkpoint, load_own
 from warp_splat.runtime import pool
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.runtime.shards import Shards
+from warp_splat.scene.blocks import BLOCK, merge_blocks
 from warp_splat.training import memory
 from warp_splat.training.deadline import plan_training
 from warp_splat.training.loop import train_steps
@@ -43,10 +46,36 @@ def train(config: TrainConfig) -> int:
             saved, has not the hash that ``verify`` asks for.
     """
     check_train(config)
+    if config.data.blocks:
+        return _train_blocks(config)
     with join(config.machine.device, config.learn.views, Shards if config.machine.shard else Processes) as processes:
         if config.report.viewer and processes.count > 1 and not processes.sharded:
             raise InputError("--viewer: expected one process, or --shard, of which process 0 draws; leave it out.")
         return _train(config, processes)
+
+
+def _train_blocks(config: TrainConfig) -> int:
+    """Train each block that has not ended yet, merge them, and go on with all of it; returns the exit code."""
+    folder, count = Path(config.report.model_path or model_folder.default_model_path()), config.data.blocks
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise InputError(f"--blocks: expected one process; let torchrun train one of them (--block 1/{count}).")
+    say = speaker(config.report.quiet)
+    for number in range(1, count + 1):
+        place, block = folder / str(number), f"{number}/{count}"
+        if (place / BLOCK).exists():
+            say(f"Block {block}: trained to its end before, in {place}.")
+        elif code := _go_on(config, place, block=block, viewer=False, verify=""):
+            print(f"The same command with -m {folder} goes on with block {block}.")
+            return code
+    merge_blocks(MergeConfig(str(folder)))
+    settled = {"settle_from_iter": 1, "cooldown": config.learn.iterations - 1, "coarse": 1}  # nothing grows, rates fall
+    return _go_on(config, folder / "together", start_ply=str(folder), **settled)
+
+
+def _go_on(config: TrainConfig, folder: Path, **changes: Any) -> int:
+    """Train in ``folder``, from where it stands there."""
+    begun = str(folder) if (folder / LAST).exists() else ""
+    return train(config.changed(blocks=0, model_path=str(folder), start_checkpoint=begun, **changes))
 
 
 def _train(config: TrainConfig, processes: Processes) -> int:

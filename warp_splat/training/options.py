@@ -33,6 +33,7 @@ class DataOptions:
     loss_space: str = data("srgb", "the curve under which linear light (EXR, HDR) is compared", choices=("srgb", "log"))
     start_ply: str = data("", "Gaussians to start from instead of points: a file (.ply, .spz, ...) or a model folder")
     block: str = data("", "K/N: of the N blocks into which the scene is cut, train the K-th; see warp-splat merge")
+    blocks: int = data(0, "train all of N blocks, one after another, merge them, and train once more with all together")
     config: str = data("", "options from a TOML file, such as a model's config.toml; flags take precedence")
 
 
@@ -247,8 +248,11 @@ def check_train(config: TrainConfig) -> None:
         raise InputError(
             f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
         )
-    if config.data.block and parts == AUTO:
+    if (config.data.block or config.data.blocks) and parts == AUTO:
         raise InputError(f"--block: expected parts by name, got --parts {AUTO}: each block would take others.")
+    others = {"--resume": config.data.start_checkpoint, "--block": config.data.block, "--minutes": learn.minutes}
+    for name in filter(others.get, others if config.data.blocks else ()):
+        raise InputError(f"--blocks: expected no {name} beside it; leave one of them out.")
     if learn.position_lr_init <= 0 or learn.position_lr_final <= 0:
         raise InputError("--position_lr_init, --position_lr_final: expected more than 0, for rates to decay between.")
     if config.grow.growth not in GROWTHS:
