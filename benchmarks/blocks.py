@@ -8,6 +8,7 @@ cell's are those of a seam.
     python benchmarks/blocks.py --models output/blocks [-s SCENE] [--blocks 4] [--seeds 0 1] [--out docs/benchmarks]
 """
 
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from warp_splat.scene.types import View
 from warp_splat.training.options import TrainConfig, schedule_of
 
 ACROSS, SEAM = 0.1, 3
-TOGETHER = ("--iterations", 300, "--cooldown", 300, "--out_of_core", "--optimizer_type", "sparse_adam")
+TOGETHER = ("--settle_from_iter", 1, "--out_of_core", "--optimizer_type", "sparse_adam")  # as --blocks does
 COLUMNS = {
     **{"scene": "{scene}", "seed": "{seed}", "model": "{model}", "Gaussians": "{file}", "across": "{across:.2f}"},
     **{"within": "{within:.2f}", "seams": "{seams:.2f}", "elsewhere": "{rest:.2f}"},
@@ -46,11 +47,11 @@ def flags_of(source: Path, seed: int, share: float, iterations: int, width: int)
     return [*flags, *schedule, "--threads", 1, "--seed", seed]
 
 
-def train_together(folder: Path, source: Path, seed: int, width: int) -> dict:
-    """Go on from the model in ``folder`` with all photographs: the results, of the folder within."""
+def train_together(folder: Path, source: Path, seed: int, width: int, steps: int) -> dict:
+    """Go on from the model in ``folder`` with all photographs: the results, of a folder within."""
     flags = ["-s", source, "-r", width, "--eval", "--device", "cpu", "--threads", 1, "--seed", seed]
     start = ply_path(folder, find_iteration(folder))
-    return run_training(folder / "together", [*flags, "--start_ply", start, *TOGETHER])
+    return run_training(folder / f"and_{steps}", [*flags, "--start_ply", start, *TOGETHER, "--cooldown", steps - 1])
 
 
 def cells_in(camera: Camera, depth: np.ndarray, block: Block) -> np.ndarray:
@@ -79,9 +80,11 @@ def decibels(errors: list) -> float:
     return float(np.mean([-10 * np.log10(error.mean()) for error in errors])) if errors else float("nan")
 
 
-def compare(name: str, source: Path, seed: int, models: Path, count: int, iterations: int, width: int) -> list[dict]:
-    """Rows of the table: trained as one, and as ``count`` blocks."""
-    whole, folder, trained = models / name / f"{seed}" / "whole", models / name / f"{seed}" / "blocks", []
+def compare(name: str, source: Path, seed: int, arguments: Namespace) -> list[dict]:
+    """Rows of the table: trained as one, and as blocks; then more steps."""
+    count, iterations, width = arguments.blocks, arguments.iterations, arguments.resolution
+    whole, folder = (arguments.models / name / f"{seed}" / kind for kind in ("whole", "blocks"))
+    trained: list[dict] = []
     load = lambda block: load_scene(source, eval=True, resolution=width, block=block, report=str)  # noqa: E731
     scene, names = load(""), [f"{number + 1}/{count}" for number in range(count)]
     result = run_training(whole, flags_of(source, seed, 1.0, iterations, width))
@@ -94,10 +97,12 @@ def compare(name: str, source: Path, seed: int, models: Path, count: int, iterat
     largest = max(blocks, key=lambda part: len(part.points))
     views = f"{min(len(part.train) for part in blocks)} to {max(len(part.train) for part in blocks)}"
     records.append({"model": f"{count} blocks", "largest": len(largest.points), "views": views, "results": trained})
-    for place, record in ((whole, records[0]), (folder, records[1])):
-        more = {"model": f"{record['model']}, then together", "results": [train_together(place, source, seed, width)]}
-        records.append({**record, **more})
-    places = (whole, folder, whole / "together", folder / "together")
+    places = [whole, folder]
+    for steps in arguments.together:
+        for place, record in zip(places[:2], records[:2], strict=True):
+            trained = [train_together(place, source, seed, width, steps)]
+            records.append({**record, "model": f"{record['model']}, and {steps} steps", "results": trained})
+            places.append(place / f"and_{steps}")
     errors, depths = zip(*(errors_of(place, scene.test) for place in places), strict=True)
     cells = [cells_in(view.camera, depth, blocks[0].block) for view, depth in zip(scene.test, depths[0], strict=True)]
     across = [(found != np.bincount(found.ravel()).argmax()).mean() > ACROSS for found in cells]
@@ -121,6 +126,7 @@ def main() -> None:
         SCENE,
         option("--blocks", type=int, default=4),
         option("--seeds", type=int, nargs="+", default=[0], help="of the street's trainings; the first of others"),
+        option("--together", type=int, nargs="+", default=[300, 800, 1600], help="steps after merging"),
         option("--iterations", type=int, default=800, help="of the undivided training"),
         option("-r", "--resolution", type=int, default=160, help="width of the pictures [px]"),
     )
@@ -128,17 +134,16 @@ def main() -> None:
     scenes = {"street": arguments.models / "street" / "scene"}
     if arguments.scene:
         scenes[arguments.scene.name] = arguments.scene
-    rest = (arguments.models, arguments.blocks, arguments.iterations, arguments.resolution)
     seeds = {"street": arguments.seeds}
     runs = [(name, at.resolve(), seed) for name, at in scenes.items() for seed in seeds.get(name, arguments.seeds[:1])]
-    records = [row for run in runs for row in compare(*run, *rest)]
+    records = [row for run in runs for row in compare(*run, arguments)]
     note = (
         f"PSNR [dB] of held-out views, {arguments.resolution} px wide, after {arguments.iterations} steps by --preset "
         "fast and --growth reference with --densify_grad_threshold 0.001, a block fewer in proportion to its "
         "photographs. Across: views of which a tenth or more lies in other cells than most of it; seams: pixels within "
-        f"{SEAM} of another cell's; starts from: "
-        "points of the largest block; then together: --start_ply with all photographs, "
-        f"{' '.join(map(str, TOGETHER))}; MB: peak of the largest training; steps: of all trainings of this line."
+        f"{SEAM} of another cell's; starts from: points of the largest block; and ... steps: --start_ply with all "
+        f"photographs, {' '.join(map(str, TOGETHER))} --cooldown; MB: peak of the largest training; steps: of all "
+        "trainings of this line."
     )
     write_table("blocks", arguments.out, COLUMNS, records, note, {"records": records})
 
