@@ -58,13 +58,17 @@ def test_masks_follow_their_photographs(tmp_path):
     assert 0 < 1 - view.mask.mean() < 0.2
 
 
-def test_photographs_that_are_masked_all_over_are_left_out(tmp_path):
+def test_photographs_that_are_masked_all_over_are_left_out(tmp_path, monkeypatch):
+    """That is known from masks alone: photographs that memory does not hold are not decoded for it."""
     root = write_colmap(tmp_path)
     black = np.zeros((HEIGHT, WIDTH, 1), np.uint8)
     write_image(root / "masks" / "a.png", black)
-    scene, lines = load(root)
-    assert [view.name for view in scene.train] == ["b.png", "c.png"]
-    assert "Leaving out 1 of 3" in lines[-1]
+    with monkeypatch.context() as patched:
+        patched.setattr("warp_splat.scene.decoding.decode", None)
+        lazily = load(root, memory=1.0)
+    for scene, lines in (load(root), lazily):
+        assert [view.name for view in scene.train] == ["b.png", "c.png"]
+        assert "Leaving out 1 of 3" in lines[-1]
     for name in "bc":
         write_image(root / "masks" / f"{name}.png", black)
     refusal(lambda: load(root), "all 3 images are black")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -97,9 +98,8 @@ def load_scene(
         report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")
     require_visible(train, points, start or source)
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
-    train_views, test_views = views[: len(train)], views[len(train) :]
-    if any(view.photograph.mask for view in views):
-        train_views, test_views = _drop_masked(train_views, source, report), _drop_masked(test_views, source, report)
+    halves = (train, views[: len(train)]), (test, views[len(train) :])
+    train_views, test_views = (_drop_masked(*half, invert_masks, source, report) for half in halves)
     if views[0].linear and not start:
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
     require_one_kind([(view.name, view.linear) for view in train_views + test_views], source)
@@ -107,11 +107,15 @@ def load_scene(
     return Scene(train_views, test_views, points, colors, file, drawn, tracks, Path(source), bound, part)
 
 
-def _drop_masked(views: list[View], source: str | Path, report: Report) -> list[View]:
-    """The views with a pixel that counts."""
-    from warp_splat.scene.decoding import in_turn  # noqa: PLC0415  keeps `import warp_splat` light
+def _drop_masked(
+    photos: list[Photo], views: list[View], invert_masks: bool, source: str | Path, report: Report
+) -> list[View]:
+    """The views with a pixel that counts; only masks are read."""
+    from warp_splat.scene.images import THREADS, read_counts  # noqa: PLC0415  keeps `import warp_splat` light
 
-    kept = [view for view, read in zip(views, in_turn(views), strict=True) if read.mask is None or read.mask.any()]
+    with ThreadPoolExecutor(THREADS) as pool:
+        masks = pool.map(lambda photo, view: read_counts(photo, view.camera, invert_masks), photos, views)
+        kept = [view for view, mask in zip(views, masks, strict=True) if mask is None or mask.any()]
     require_unmasked(len(views), len(views) - len(kept), source)
     if len(kept) < len(views):
         report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")
