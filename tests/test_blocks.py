@@ -155,6 +155,8 @@ def test_what_a_block_cannot_have(trained, tmp_path, fails, monkeypatch):
     for name, value in (("--block", "1/2"), ("--minutes", "1"), ("--resume", trained)):
         more = () if name == "--resume" else ("-s", SCENE)
         assert f"--blocks: expected no {name} beside it" in fails("train", *more, "--blocks", "2", name, value)
+    assert "it already holds a training" in fails("train", "-s", SCENE, "--blocks", "2", "-m", trained)
+    assert "expected another folder than the scene's" in fails("train", "-s", SCENE, "--blocks", "2", "-m", SCENE)
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert "--blocks: expected one process" in fails("train", "-s", SCENE, "--blocks", "2")
     monkeypatch.delenv("WORLD_SIZE")

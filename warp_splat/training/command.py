@@ -21,10 +21,9 @@ from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.runtime.shards import Shards
 from warp_splat.scene.blocks import BLOCK, merge_blocks
-from warp_splat.training import memory
+from warp_splat.training import memory, opening
 from warp_splat.training.deadline import plan_training
 from warp_splat.training.loop import train_steps
-from warp_splat.training.opening import Say, open_scene, refuse_other_training, resolve, speaker, write_inputs
 from warp_splat.training.options import TrainConfig, check_train
 from warp_splat.training.parts import PARTS
 from warp_splat.training.record import Run, finish, how_to_continue, keep, restore, save_model
@@ -59,7 +58,10 @@ def _train_blocks(config: TrainConfig) -> int:
     folder, count = Path(config.report.model_path or model_folder.default_model_path()), config.data.blocks
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError(f"--blocks: expected one process; let torchrun train one of them (--block 1/{count}).")
-    say = speaker(config.report.quiet)
+    if (folder / LAST).exists():
+        raise InputError(f"{folder}: it already holds a training; choose another with -m.")
+    opening.check_folder(config, folder)
+    say = opening.speaker(config.report.quiet)
     for number in range(1, count + 1):
         place, block = folder / str(number), f"{number}/{count}"
         if (place / BLOCK).exists():
@@ -80,10 +82,10 @@ def _go_on(config: TrainConfig, folder: Path, **changes: Any) -> int:
 
 def _train(config: TrainConfig, processes: Processes) -> int:
     """Resolve the options, open the scene, make the trainer, restore it or begin, run, and finish."""
-    config, begun = resolve(config, processes)
-    say = speaker(config.report.quiet)
+    config, begun = opening.resolve(config, processes)
+    say = opening.speaker(config.report.quiet)
     run = Run(Path(config.report.model_path), time.perf_counter())
-    scene = open_scene(config, begun, say, processes.local_count)
+    scene = opening.open_scene(config, begun, say, processes.local_count)
     if config.learn.minutes and not begun:
         config = plan_training(scene, config, processes, say)
     config, weighed = settle_parts(config, scene, processes, say)
@@ -98,7 +100,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
             return _run(trainer, run, viewer) or _finish(trainer, run, viewer, say)
 
 
-def _tell(trainer: Trainer, run: Run, say: Say) -> None:
+def _tell(trainer: Trainer, run: Run, say: opening.Say) -> None:
     scene, processes = trainer.scene, trainer.processes
     together = f"{processes.count} processes with " * (processes.count > 1)
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
@@ -110,10 +112,10 @@ def _tell(trainer: Trainer, run: Run, say: Say) -> None:
         say(sentence)
 
 
-def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say: Say) -> None:
+def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say: opening.Say) -> None:
     leads, config = trainer.processes.rank == 0, trainer.config
     if leads:
-        refuse_other_training(run.folder, begun)  # again: one may have ended meanwhile
+        opening.refuse_other_training(run.folder, begun)  # again: one may have ended meanwhile
     say("Preparing kernels (compiled once on a machine, about 40 s) ...")
     start = time.perf_counter()
     trainer.warm_up()
@@ -127,7 +129,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     else:
         keep(trainer, run)
     if leads:  # only now: where a checkpoint is refused, the folder stays as it was
-        write_inputs(run.folder, config, trainer.scene, continues=begun is not None)
+        opening.write_inputs(run.folder, config, trainer.scene, continues=begun is not None)
     if leads and config.report.tensorboard:
         run.events = EventLog(run.folder, run.iteration)
     if config.machine.device == "cpu":
@@ -159,7 +161,7 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
     return 0
 
 
-def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Say) -> int:
+def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: opening.Say) -> int:
     """Evaluate and tell; returns the process's exit code."""
     end, watched = trainer.config.learn.end, trainer.config.report.viewer
     if watched:

@@ -90,14 +90,19 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
 def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
     """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
     default = begun.path.parent if begun else model_folder.default_model_path()
-    folder, source = Path(config.report.model_path or default), config.data.source_path
+    folder = Path(config.report.model_path or default)
+    check_folder(config, folder)
+    refuse_other_training(folder, begun)
+    return folder
+
+
+def check_folder(config: TrainConfig, folder: Path) -> None:
+    """Raise InputError if a training may not write there, whatever the folder holds."""
     model_folder.check_place(folder)
-    if source:
+    if source := config.data.source_path:
         place, scene, photos = (path.resolve() for path in (folder, Path(source), Path(source, config.data.images)))
         if place == scene or (photos != scene and place.is_relative_to(photos)):
             raise InputError(f"-m {folder}: expected another folder than the scene's or its images'; choose a new one.")
-    refuse_other_training(folder, begun)
-    return folder
 
 
 def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
