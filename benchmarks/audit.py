@@ -15,8 +15,10 @@ from audit_targets import OTHERS, OURS
 
 from warp_splat.audit.command import run_audit, side_by_side, worst_gradient
 from warp_splat.audit.judged import measure
-from warp_splat.audit.renderer import Renderer, function_of
-from warp_splat.audit.small_scenes import SCENES
+from warp_splat.audit.probes import GREEN, probe_camera
+from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
+from warp_splat.audit.rules import find_rules
+from warp_splat.audit.small_scenes import SCENES, balls
 from warp_splat.errors import InputError
 from warp_splat.formats.files import write_json, write_text
 from warp_splat.formats.png import save_png
@@ -24,6 +26,33 @@ from warp_splat.text import table_of
 
 ALL = {**OURS, **OTHERS}
 NEARLY = 0.03  # eight levels of a screen
+PICTURES = 25  # of three Gaussians: rounding to 8 bits moves one in a single picture by 1e-3 px
+
+
+def camera_error(renderer: Renderer, degree: int) -> list[float]:
+    """How far three small Gaussians are from their places, and the standard error: px, the worst of six numbers.
+
+    The picture around each is a share of float64's, and shares of its derivatives by the place, by least squares.
+    """
+    try:
+        prober = find_rules(renderer.draw, degree, ("background", "camera"))
+    except RendererFailed:
+        return []
+    camera, y, x, found = probe_camera(), *np.mgrid[:47, :63] + 0.5, []
+    prober.shift *= 0
+    for wiggle in np.random.default_rng(0).uniform(-0.5, 0.5, (PICTURES, 1, 2)):
+        places = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]]) + wiggle
+        at = lambda moved: balls(camera, places + moved, [3.0, 3.5, 4.0], 2.0, 0.9, GREEN)  # noqa: B023, E731
+        covers = {m: prober.exact(at(m)).alpha.numpy() for m in ((0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01))}
+        here, right, left, down, up = covers.values()
+        images = np.stack([here, (right - left) / 0.02, (down - up) / 0.02], -1)
+        seen = prober.cover_of(at((0, 0)))
+        near = [np.maximum(abs(x - a), abs(y - b)) < 8 for a, b in places]
+        shares = [np.linalg.lstsq(images[part], seen[part], rcond=None)[0] for part in near]
+        found.append([share[1:] / share[0] for share in shares])
+    offsets, noise = np.mean(found, 0), np.std(found, 0) / np.sqrt(PICTURES)
+    worst = np.unravel_index(np.abs(offsets).argmax(), offsets.shape)
+    return [float(np.abs(offsets[worst])), float(noise[worst])]
 
 
 def measured(name: str, scenes: list[str], out: Path, more: bool) -> None:
@@ -39,6 +68,9 @@ def measured(name: str, scenes: list[str], out: Path, more: bool) -> None:
     if facts.get("version") != target.version or "worst" not in facts:
         facts, _ = run_audit(renderer, name, target.degree, ())
         facts |= {"version": target.version, "settings": target.settings, "worst": ["", 0.0], "scenes": []}
+    if "camera" not in facts:
+        facts["camera"] = camera_error(renderer, target.degree)
+        write_json(file, facts)
     facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None]
     known = {row["scene"] for row in facts["scenes"]}
     left = tuple(scene for scene in scenes if scene not in known)
@@ -68,6 +100,7 @@ def summary(facts: dict) -> dict:
         "mean": float(np.mean([row["mean"] for row in drawn])) if drawn else None,
         "gradient": float(np.median(list(gradients.values()))) if gradients else None,
         "worst": worst_gradient({"gradients": gradients}),
+        "camera": "{:.0e} ± {:.0e}".format(*facts["camera"]) if facts.get("camera") else "-",
         "same": "yes" if all(row["same"] for row in drawn) else "no",
     }
 
@@ -86,6 +119,7 @@ def write_summary(out: Path) -> None:
         "gradients, median": "{gradient:.1e}",
         "worst gradient": "{worst}",
         "same bits": "{same}",
+        "camera, px": "{camera}",
         "failed": "{failed}",
     }
     note = f"Measured by `benchmarks/audit.py` on {records[0]['machine']}."

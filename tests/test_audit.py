@@ -15,6 +15,7 @@ import pytest
 import torch
 import wrong_renderer
 from audit_targets import own
+from browser import CHROMIUM
 
 from warp_splat.audit import program
 from warp_splat.audit.judged import measure
@@ -134,6 +135,23 @@ def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says)
 
 
 @pytest.mark.slow
+def test_a_page_that_hangs_gets_a_row_and_the_next_scene_is_drawn(tmp_path):
+    """Playwright gives the first one up after half a minute; that tab answers no more."""
+    pytest.importorskip("playwright")
+    if not CHROMIUM:
+        pytest.skip("no Chromium")
+    (tmp_path / "page.html").write_text(
+        "<script>const file = new XMLHttpRequest(); file.open('GET', '/scene.ply', false);"
+        "file.overrideMimeType('text/plain; charset=x-user-defined'); file.send();"
+        "while (file.responseText.includes('vertex 1\\n')); window.show = async () => {};</script>"
+    )
+    renderer = Renderer(str(tmp_path / "page.html"))
+    verdicts = [row.verdict for row in measure(renderer, {}, scenes=("one", "two"))]
+    renderer.close()
+    assert "Timeout" in verdicts[0] and verdicts[1] == "draws nothing"
+
+
+@pytest.mark.slow
 def test_this_renderer_is_as_float64(importable):
     renderer = Renderer("audit_targets.own:manual")
     (row,) = measure(renderer, {}, scenes=("cloud",))
@@ -211,7 +229,7 @@ def test_bad_input_is_one_sentence(arguments, says, capsys):
 @pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (np.nan, np.nan, np.nan)], ids=str)
 def test_nothing_is_read_off_a_picture_that_shows_nothing(color):
     """The same picture whatever it is asked for."""
-    blank = Answer(np.broadcast_to(color, (49, 65, 3)), False, None, True)
+    blank = Answer(np.broadcast_to(color, (47, 63, 3)), False, None, True)
     rules = find_rules(lambda workload: blank)
     assert list(rules.sentences) == ["background"] and "shows nothing" in rules.sentences["background"]
 

@@ -50,6 +50,9 @@ OTHERS = {
     "babylon": NamedRenderer(f"{FOLDER}/babylon.html", "babylonjs@9.35.0", WEBGL),
     "mkkellogg": NamedRenderer(f"{FOLDER}/mkkellogg.html", "gaussian-splats-3d@0.4.7", f"three.js 0.187.0, {WEBGL}", 2),
     "gsplat-js": NamedRenderer(f"{FOLDER}/gsplat_js.html", "gsplat@1.2.9", f"no fading in, {WEBGL}", 0),
+    "gsplat-js-padded": NamedRenderer(
+        f"{FOLDER}/gsplat_js_padded.html", "gsplat@1.2.9", f"1,024 Gaussians without opacity added, {WEBGL}", 0
+    ),
     "splat-transform": NamedRenderer(
         "audit_targets.splat_transform:draw", "splat-transform@2.7.1", "a .webp by WebGPU in software"
     ),

@@ -19,9 +19,11 @@ from warp_splat.compare.scenes import make_camera, tensors
 from warp_splat.compare.workloads import Workload
 
 GREEN, FOCAL = np.array([0.0, 1.0, 0.0]), 60.0
-CENTER = np.array([32.5, 24.5])  # px, the middle of a pixel and of the picture
+PROBED, CENTER = (63, 47), np.array([31.5, 23.5])  # px, the middle of a pixel and of the picture
 SEEN = {True: 0.6 / 255, False: 1e-9}  # of a cover, by whether pictures have 8 bits
-COMPANY = 16  # Gaussians behind the camera: some viewers draw nothing of a scene that has only one or two
+#: Gaussians far beside the picture, before and behind the camera: some viewers draw nothing of a scene that has
+#: only one or two, or draw the last of their own order wrongly.
+COMPANY = np.arange(16)
 NEARLY_ROUND = np.array([0.999, 1.001, 1.0])  # of scales: some viewers do not draw what is round to the last bit
 OPAQUE = 0.9995  # what lets through more than most stops
 ASKED = (0.25, 0.5, 0.75)
@@ -68,9 +70,10 @@ class Prober:
     def picture(self, arrays: dict[str, np.ndarray], background=(0.0, 0.0, 0.0), camera=None) -> np.ndarray:
         """[H, W, 3] in the space in which it was blended."""
         camera = camera or probe_camera()
-        company = balls(camera, [CENTER] * COMPANY, -0.5, 0.1, 0.01, 0.5)
+        ring = CENTER + 4 * FOCAL * np.stack([np.cos(COMPANY), np.sin(COMPANY)], 1)
+        company = balls(camera, ring, np.where(COMPANY % 2, 25.0, -25.0), 0.1, 0.01, 0.5)
         rest = arrays["sh_rest"].shape[1]
-        company["sh_rest"] = np.zeros((COMPANY, rest, 3))
+        company["sh_rest"] = np.zeros((len(COMPANY), rest, 3))
         both = {name: np.concatenate([array, company[name]]) for name, array in arrays.items()}
         both["scales"] = both["scales"] * NEARLY_ROUND
         answer = self.draw(on_all_pixels("probe", (tensors(both), camera), background, self.degree))
@@ -117,4 +120,4 @@ class Prober:
 
 def probe_camera():
     """On whose axis CENTER lies."""
-    return make_camera(65, 49, FOCAL, seed=None)
+    return make_camera(*PROBED, FOCAL, seed=None)

@@ -117,14 +117,14 @@ def _playwright():
 
 @functools.cache
 def _browser():
-    """A page of playwright's, the folder that is served, and its address."""
+    """Playwright's browser, the folder that is served, and its address."""
     started, folder = _playwright(), Path(tempfile.mkdtemp())
     (folder / "node_modules").symlink_to(CACHE / "node_modules")
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Handler, directory=str(folder)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     found = os.environ.get("WARP_SPLAT_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     browser = started.chromium.launch(executable_path=found, args=FLAGS)
-    return browser.new_page(), folder, f"http://127.0.0.1:{server.server_port}"
+    return browser, folder, f"http://127.0.0.1:{server.server_port}"
 
 
 def _missing(page: Path) -> list[str]:
@@ -142,14 +142,14 @@ def screenshot(page: Path, camera, write: Callable[[Path], object], file: str = 
     if missing := _missing(page):
         CACHE.mkdir(parents=True, exist_ok=True)
         subprocess.run(["npm", "install", "--no-audit", "--no-fund", "--prefix", str(CACHE), *missing], check=True)
-    tab, folder, address = _browser()
+    browser, folder, address = _browser()
     (folder / "page").unlink(missing_ok=True)
     (folder / "page").symlink_to(page.parent.resolve())
     write(folder)
-    tab.set_viewport_size({"width": camera.width, "height": camera.height})
-    tab.goto(f"{address}/page/{page.name}")
-    returned = tab.evaluate(SHOW, [camera_entry(camera), f"/{file}"])
-    tab.screenshot(path=folder / "screen.png")
+    with browser.new_page(viewport={"width": camera.width, "height": camera.height}) as tab:  # the last may hang
+        tab.goto(f"{address}/page/{page.name}")
+        returned = tab.evaluate(SHOW, [camera_entry(camera), f"/{file}"])
+        tab.screenshot(path=folder / "screen.png")
     return load_png(folder / "screen.png"), returned
 
 

@@ -11,6 +11,7 @@ from warp_splat.audit.probes import (
     FOCAL,
     GREEN,
     OPAQUE,
+    PROBED,
     Prober,
     decoded_srgb,
     named_between,
@@ -70,7 +71,7 @@ def find_color_space(prober: Prober) -> str:
 def find_low_pass(prober: Prober) -> str:
     """With the antialiasing: a ball of 0.5 px, its variance by the ratio of neighbors, its strength by its height."""
     cover = prober.cover([CENTER], 4.0, 0.5, 0.9)
-    height, beside = cover[24, 32], np.mean([cover[24, 31], cover[24, 33], cover[23, 32], cover[25, 32]])
+    height, beside = cover[23, 31], np.mean([cover[23, 30], cover[23, 32], cover[22, 31], cover[24, 31]])
     if height <= prober.seen or beside <= prober.seen:
         return "Gaussians of half a pixel are not drawn, or have no width."
     if height <= beside:
@@ -130,7 +131,7 @@ def find_extent(prober: Prober) -> str:
 
 def find_clamp(prober: Prober) -> str:
     """The largest alpha."""
-    top = prober.cover([CENTER], 3.0, 9.0, OPAQUE)[24, 32]
+    top = prober.cover([CENTER], 3.0, 9.0, OPAQUE)[23, 31]
     step = max(prober.seen, 2e-6)
     if top > OPAQUE - 2 * step:
         prober.options["alpha_max"] = 0.9999
@@ -143,7 +144,7 @@ def find_clamp(prober: Prober) -> str:
 def find_stop(prober: Prober) -> str:
     """What is left of the light behind many faint layers, where blending in 8 bits stops, or fewer strong ones."""
     layers = ((160, 0.1), (20, 0.6))
-    left = 1 - max(prober.cover([CENTER] * n, np.linspace(3, 5, n), 9.0, opacity)[24, 32] for n, opacity in layers)
+    left = 1 - max(prober.cover([CENTER] * n, np.linspace(3, 5, n), 9.0, opacity)[23, 31] for n, opacity in layers)
     if left < max(2 * prober.seen, 2e-7):
         prober.options["t_min"] = 0.0 if prober.seen < 1e-6 else oracle.STOP
         return f"A pixel does not stop while its transmittance is above {max(left, prober.seen):.1g}."
@@ -188,7 +189,7 @@ def find_harmonics(prober: Prober) -> str:
     if prober.degree == 0:
         return "It claims no harmonics above degree 0."
     count = (prober.degree + 1) ** 2
-    camera = make_camera(65, 49, FOCAL, seed=5, center=(0.0, 0.0, 0.0))
+    camera = make_camera(*PROBED, FOCAL, seed=5, center=(0.0, 0.0, 0.0))
     places = np.stack(np.meshgrid(np.arange(4) * 14 + 11.5, np.arange(4) * 11 + 7.5), -1).reshape(-1, 2)[:count]
     arrays = balls(camera, places, np.linspace(3, 4, count), 1.5, 0.9, 0.5)
     rest = np.zeros((count, count - 1, 3))
@@ -237,7 +238,7 @@ def find_sort(prober: Prober) -> str:
             (1, 1): "Gaussians are not sorted: the last in the file is in front.",
             (1, 0): "The order is reversed: the farther Gaussian is in front.",
         }.get(both, "Two Gaussians behind each other do not look as in either order.")
-    wide = make_camera(65, 49, 30.0, seed=None)
+    wide = make_camera(*PROBED, 30.0, seed=None)
     arrays = balls(wide, [[56.5, 30.5], [24.5, 19.5]], [3.0, 3.3], [14.0, 16.0], 0.7, colors)
     arrays["scales"] = arrays["scales"] * [1.0, 1.0, 0.1]  # balls as large would reach behind the camera
     key = front(0, 1, wide), front(1, 0, wide)
@@ -249,7 +250,7 @@ def find_sort(prober: Prober) -> str:
 
 def find_pixels(prober: Prober) -> str:
     """Where three small Gaussians are seen: from where float64 has them, linearized or as ellipsoids."""
-    places, y, x = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]]), *np.mgrid[:49, :65] + 0.5
+    places, y, x = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]]), *np.mgrid[: PROBED[1], : PROBED[0]] + 0.5
 
     def centers(cover: np.ndarray) -> np.ndarray:
         shares = [cover * (np.maximum(*np.abs([x - int(a) - 0.5, y - int(b) - 0.5])) < 9) for a, b in places]
