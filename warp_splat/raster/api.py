@@ -158,6 +158,7 @@ def rasterize_views(
     with checks.own_explained(options), memory_explained(means.device, means, sizes, advice):
         for camera in cameras:
             outputs.append(render(gaussians, camera, background, options, adjoint, features))
+            outputs[-1].invalid_count = outputs[-1].invalid  # a GPU is waited for once
             if outputs[-1].invalid:
                 checks.explain_invalid(outputs[-1].invalid, gaussians.quats)
     return outputs

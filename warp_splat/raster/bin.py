@@ -38,7 +38,7 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, 
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     drawn, invalid = _drawn(splats2d.radii.numpy())
     count = len(drawn)
-    splats, rows = wp.empty(count, dtype=Splat2D, device="cpu"), np.empty(count, dtype=np.int32)
+    splats, rows = empty(count, Splat2D, "cpu"), np.empty(count, dtype=np.int32)
     gaussians, square = in_place(drawn), int(options.extent == "square")
     inputs = [gaussians, splats2d.view(), camera.height, options.alpha_min, square]
     launch(tiles.make_pack(falloff_of(options).reach_of), count, inputs, [splats, in_place(rows)])
@@ -46,7 +46,7 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, 
     row_ends, begins = _sums(_taken(rows, order))
     _check_count(_last(row_ends), camera, count, splats2d.radii.device)
     begins = _put(begins, order)
-    spans, counts = wp.empty(_last(row_ends), dtype=wp.vec2i, device="cpu"), np.empty(count, dtype=np.int64)
+    spans, counts = empty(_last(row_ends), wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, _boxes(options)]
     groups = -(-count // LANES)
     bounds = even_slices(groups, SMALLEST_SLICE // LANES)

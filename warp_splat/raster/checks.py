@@ -16,6 +16,7 @@ from warp_splat.kernels.project import Projection
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import DRIVERS
+from warp_splat.runtime.launch import send
 
 ROUNDING = 1e-5  # by which an opacity may lie above 1; alpha is clamped anyway
 CAMERA_PIXELS_MOST = 2**32  # 80 GiB of image, alpha and what the adjoint reads; kernels number tiles with 32 bits
@@ -142,10 +143,13 @@ def check_gaussians(means, quats, scales, opacities, sh) -> Gaussians:
     if (found := sh_dc.shape[1] + sh_rest.shape[1]) not in (1, 4, 9, 16):
         raise InputError(f"sh: expected 1, 4, 9 or 16 coefficients (degree 0 to 3), got {found}.")
     named = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh_dc, "sh ": sh_rest}
-    for name, tensor in named.items():
-        _check_finite(name.strip(), tensor.detach())
-    check_range("scales", scales, bool((scales <= 0).any()), "positive values (activated, not their logarithm)")
-    check_opacities(opacities)
+    finite = torch.stack([tensor.detach().sum() for tensor in named.values()]).isfinite().all()
+    within = (scales > 0).all() & (opacities.clamp(0, 1 + ROUNDING) == opacities).all()
+    if not bool(finite & within):  # one answer, for which a GPU is waited for; now what is wrong
+        for name, tensor in named.items():
+            _check_finite(name.strip(), tensor.detach())
+        check_range("scales", scales, bool((scales <= 0).any()), "positive values (activated, not their logarithm)")
+        check_opacities(opacities)
     return Gaussians(*(_dense(tensor) for tensor in (means, quats, scales, opacities, sh_dc, sh_rest)))
 
 
@@ -181,21 +185,22 @@ def check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.
 
 def check_background(background, device: torch.device) -> torch.Tensor:
     """The background as a tensor [3] on ``device``. Raises InputError if it is not three finite numbers there."""
-    if not isinstance(background, torch.Tensor):
+    given = isinstance(background, torch.Tensor)
+    if not given:
         try:
-            background = torch.tensor([float(value) for value in background], dtype=torch.float32, device=device)
+            background = torch.tensor([float(value) for value in background], dtype=torch.float32)
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"background: expected three numbers or a tensor [3], got {background!r:.80}.") from None
     if background.layout != torch.strided:
         raise InputError("background: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
-    if background.device != device:
+    if given and background.device != device:
         raise InputError(f"background: expected a tensor on {device}, as the means, got one on {background.device}.")
     if background.shape != (3,) or background.dtype != torch.float32 or not bool(torch.isfinite(background).all()):
         raise InputError(
             f"background: expected three finite numbers (a tensor: float32 [3]), got {background.dtype} "
             f"{list(background.shape)}: {background.tolist()}."
         )
-    return background
+    return background if given else send(background, device)
 
 
 def check_opacities(opacities: torch.Tensor) -> None:
