@@ -22,7 +22,7 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
 
 newton = pytest.importorskip("newton", reason="newton is not installed")
-from newton.sensors import SensorCamera  # noqa: E402 - behind the question for it
+from newton.sensors import SensorCamera, SensorTiledCamera  # noqa: E402 - behind the question for it
 
 from warp_splat.newton import SensorSplatCamera, camera_of_fov, gaussian_of_file  # noqa: E402
 
@@ -233,7 +233,7 @@ def allocated(monkeypatch):
 
 
 def test_buffers_are_used_again(simulation, allocated):
-    """After the first call only the renderer's lists take memory, for as long as it runs; images stay in place."""
+    """After the first call nothing takes memory of Warp's; images stay in place."""
     state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)
     camera, made = camera_of_fov(WIDTH, HEIGHT, FOV), images(rgb_image=wp.vec3, forward_depth_image=float)
     places, alive, pictures = {name: array.ptr for name, array in made.items()}, [], []
@@ -245,7 +245,7 @@ def test_buffers_are_used_again(simulation, allocated):
         pictures.append(made["rgb_image"].numpy().copy())
         if len(alive) == 1:
             allocated.clear()
-    assert set(allocated) == {"warp_splat.raster.bin"} and len(set(alive)) == 1
+    assert not allocated and len(set(alive)) == 1
     assert all(np.array_equal(picture, pictures[0]) for picture in pictures) and pictures[0].std() > 0.05
     assert places == {name: array.ptr for name, array in made.items()}
 
@@ -285,12 +285,23 @@ def test_what_newtons_sensor_is_told_this_one_understands(simulation):
         sensor.update(state, transforms, lens, **made, world_indices=worlds)
         found.append({name: (array.shape, array.dtype, array.device) for name, array in made.items()})
     assert found[0] == found[1]
-    tiled = wp.zeros((2, 3, HEIGHT, WIDTH), dtype=wp.uint32)  # [worlds, cameras], as its tiled camera has them
-    sensor.update(state, transforms, lens, color_image=tiled[:, 1], world_indices=worlds)
-    np.testing.assert_array_equal(tiled.numpy()[:, 1], made["color_image"].numpy())
-    assert not tiled.numpy()[:, ::2].any()
     indices = made["shape_index_image"].numpy()
     assert [set(np.unique(index)) - {2**32 - 1} for index in indices] == [{0, 2}, {0, 1}]
+
+
+def test_what_newtons_tiled_camera_is_told_this_one_understands(simulation):
+    """Poses [cameras, worlds], an image of its own making, a lens for each camera: what single calls draw."""
+    state, poses = state_of(simulation), wp.array([[pose] * 2 for pose in CAMERAS], dtype=wp.transform)
+    fov = camera_of_fov(WIDTH, HEIGHT, FOV)
+    lenses = [fov, replace(fov, lens=Lens("OPENCV_FISHEYE", (0.05, -0.02, 0.004, 0.0)))]
+    with pytest.warns(DeprecationWarning, match="SensorTiledCamera"):
+        color = SensorTiledCamera(simulation.model).utils.create_color_image_output(WIDTH, HEIGHT, len(lenses))
+    simulation.sensor.update(state, poses, lenses, color_image=color)
+    for number, camera in enumerate(lenses):
+        made = images(color_image=wp.uint32)
+        simulation.sensor.update(state, wp.array([CAMERAS[number]] * 2, dtype=wp.transform), camera, **made)
+        np.testing.assert_array_equal(color.numpy()[:, number], made["color_image"].numpy())
+    assert len(np.unique(color.numpy(), axis=0)) == len(np.unique(color.numpy(), axis=1)) == 2
 
 
 def test_refused_in_one_sentence(simulation):
@@ -304,6 +315,7 @@ def test_refused_in_one_sentence(simulation):
     refusal(
         lambda: update(**images(2, color_image=wp.vec3)), match=r"color_image: expected .* of uint32, got .* of vec3f"
     )
+    refusal(lambda: simulation.sensor.update(state, transforms, [camera]), "camera: expected one, or 2 of one size")
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
     refusal(partial(update, shape_index_image=named, mesh_index=named), "mesh_index: expected mesh_depth beside it")
     for worlds in ([0, 2], [0.5, 1.0], [0], 1):

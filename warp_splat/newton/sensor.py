@@ -6,7 +6,7 @@ The tape of Warp has all of it: :mod:`warp_splat.kernels.place` around :mod:`war
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partialmethod
+from functools import cache, partial, partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from warp_splat.formats.stored import sigmoid, unit_quats
 from warp_splat.kernels.place import ShapeView, make_place, name_shapes, put_among_meshes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
+#: Of what images are; others are of uint32.
+KINDS = {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}
+
 
 @dataclass
 class Piece:
@@ -29,7 +32,9 @@ class Piece:
 
     shape: int
     body: int
-    view: ShapeView
+    size: float
+    source: Any  # newton.Gaussian
+    view: ShapeView  # of it, in this size
 
 
 @dataclass
@@ -67,28 +72,23 @@ class SensorSplatCamera:
     ):
         self.model, self.device, self.adjoint = model, model.device, adjoint
         self.background, self.options = wp.vec3(*background), options or RasterOptions()
-        self._layouts: dict[tuple, Layout] = {}
-        self._pixels: dict[tuple, wp.array] = {}
-        self._owners: dict[int, wp.array] = {}
+        self._room, self._owners_of = cache(self._new_room), cache(self._find_owners)  # made once
         bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()
-        sizes, views = model.shape_scale.numpy(), {}
-        own: dict[int, list[tuple[Piece, tuple]]] = {world: [] for world in range(-1, model.world_count)}
+        sizes, view, layout = model.shape_scale.numpy(), cache(self._view), cache(self._layout)
+        own: dict[int, list[Piece]] = {world: [] for world in range(-1, model.world_count)}
         for shape, source in enumerate(model.shape_source):
             if not hasattr(source, "sh_coeffs"):
                 continue
             size = float(sizes[shape][0])
             if not (size > 0 and np.allclose(sizes[shape], size)):
                 raise InputError(f"shape {shape}: expected a scale that is positive and the same along all axes.")
-            key = (id(source), size)
-            if key not in views:
-                views[key] = self._view(source, size)
-            own[int(worlds[shape])].append((Piece(shape, int(bodies[shape]), views[key]), (key, source)))
-        if not views:
+            own[int(worlds[shape])].append(Piece(shape, int(bodies[shape]), size, source, view(source, size)))
+        if not any(own.values()):
             raise InputError("model: expected a Gaussian shape (ModelBuilder.add_shape_gaussian), found none.")
         self._worlds = []
         for world in range(max(model.world_count, 1)):
             pieces = own[-1] + own.get(world, [])
-            self._worlds.append(([piece for piece, _ in pieces], self._layout([source for _, source in pieces])))
+            self._worlds.append((pieces, layout(*((piece.source, piece.size) for piece in pieces))))
 
     def allocate_image(self, view_count: int, width: int, height: int, dtype: Any) -> wp.array:
         """An image for :meth:`update`; those below are of one kind, by Newton's names."""
@@ -100,27 +100,28 @@ class SensorSplatCamera:
     def update(
         self,
         state: Any,
-        camera_transforms: wp.array,
-        camera: Camera,
+        camera_transforms: wp.array[wp.transform] | wp.array2d[wp.transform],
+        camera: Camera | Sequence[Camera],
         *,
-        rgb_image: wp.array | None = None,
-        color_image: wp.array | None = None,
-        forward_depth_image: wp.array | None = None,
-        shape_index_image: wp.array | None = None,
-        mesh_color: wp.array | None = None,
-        mesh_depth: wp.array | None = None,
-        mesh_index: wp.array | None = None,
-        world_indices: wp.array | Sequence[int] | None = None,
+        rgb_image: wp.array3d[wp.vec3] | wp.array4d[wp.vec3] | None = None,
+        color_image: wp.array3d[wp.uint32] | wp.array4d[wp.uint32] | None = None,
+        forward_depth_image: wp.array3d[wp.float32] | wp.array4d[wp.float32] | None = None,
+        shape_index_image: wp.array3d[wp.uint32] | wp.array4d[wp.uint32] | None = None,
+        mesh_color: wp.array3d[wp.uint32] | wp.array4d[wp.uint32] | None = None,
+        mesh_depth: wp.array3d[wp.float32] | wp.array4d[wp.float32] | None = None,
+        mesh_index: wp.array3d[wp.uint32] | wp.array4d[wp.uint32] | None = None,
+        world_indices: wp.array[wp.int32] | Sequence[int] | None = None,
     ) -> None:
         """Draw; inside ``with wp.Tape()``, with gradients from ``rgb_image`` and ``forward_depth_image``.
 
         They go to ``state.body_q``, ``camera_transforms`` and ``model.shape_transform``, where those want them. Images
-        are [views, H, W], as ``newton.sensors.SensorCamera``'s, and those of meshes may be written over.
+        are [views, H, W], as ``newton.sensors.SensorCamera``'s, and those of meshes may be written over. Or,
+        as its tiled camera has them, transforms are [cameras, worlds] and images [worlds, cameras, H, W].
 
         Args:
             state: the ``newton.State``.
             camera_transforms: [views] transform, world from camera, which looks along -z with y up.
-            camera: size and lens, of all views; its pose does not count.
+            camera: size and lens of all views, or of each, or of each of the tiled cameras; its pose does not count.
             rgb_image: vec3, colors as trained, displayed without a change.
             color_image: uint32, the same packed as Newton packs RGBA.
             forward_depth_image: float, expected depth along the axis; 0 where nothing is.
@@ -133,26 +134,35 @@ class SensorSplatCamera:
         Raises:
             InputError: if an image is of another shape, one of meshes has no depth, or a view is of no world.
         """
-        views = len(camera_transforms)
-        shape = (views, camera.height, camera.width)
-        kinds = {wp.vec3: {"rgb_image": rgb_image}}
-        kinds[wp.float32] = {"forward_depth_image": forward_depth_image, "mesh_depth": mesh_depth}
-        kinds[wp.uint32] = {"color_image": color_image, "shape_index_image": shape_index_image}
-        kinds[wp.uint32] |= {"mesh_color": mesh_color, "mesh_index": mesh_index}
-        for kind, images in kinds.items():
-            for name, array in images.items():
-                if array is not None and (array.shape, array.dtype) != (shape, kind):
-                    found = f"{array.shape} of {array.dtype.__name__}"
-                    raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
-        for name, array in (("mesh_color", mesh_color), ("mesh_index", mesh_index)):
-            if array is not None and mesh_depth is None:
+        given = {"rgb_image": rgb_image, "color_image": color_image, "forward_depth_image": forward_depth_image}
+        given |= {"shape_index_image": shape_index_image}
+        given |= {"mesh_color": mesh_color, "mesh_depth": mesh_depth, "mesh_index": mesh_index}
+        given = {name: array for name, array in given.items() if array is not None}
+        cameras = [camera] * len(camera_transforms) if isinstance(camera, Camera) else list(camera)
+        sizes = {(one.height, one.width) for one in cameras}
+        if len(cameras) != (count := len(camera_transforms)) or len(sizes) != 1:
+            raise InputError(f"camera: expected one, or {count} of one size, got {len(cameras)} of {len(sizes)} sizes.")
+        shape = (*camera_transforms.shape[::-1], *sizes.pop())  # pyright: ignore[reportAttributeAccessIssue]
+        for name, array in given.items():
+            kind = KINDS.get(name, wp.uint32)
+            if (array.shape, array.dtype) != (shape, kind):
+                found = f"{array.shape} of {array.dtype.__name__}"
+                raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
+            if name in ("mesh_color", "mesh_index") and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
-        given = world_indices.numpy() if isinstance(world_indices, wp.array) else world_indices
-        chosen = np.arange(views) if given is None else np.asarray(given)
+        if camera_transforms.ndim == 2:  # one camera after another
+            for number, one in enumerate(cameras):
+                column = {name: array[:, number] for name, array in given.items()}
+                poses = camera_transforms[number]  # pyright: ignore[reportIndexIssue]
+                self.update(state, poses, one, **column, world_indices=world_indices)
+            return
+        views, shape = shape[0], shape[1:]
+        worlds = world_indices.numpy() if isinstance(world_indices, wp.array) else world_indices
+        chosen = np.arange(views) if worlds is None else np.asarray(worlds)
         whole = chosen.shape == (views,) and chosen.dtype.kind in "iu"
         if not whole or not all(0 <= world < len(self._worlds) for world in chosen):
             raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {chosen.tolist()}.")
-        camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))
+        cameras = [replace(one, rotation=np.eye(3), translation=np.zeros(3)) for one in cameras]
         options = replace(
             self.options, depth=forward_depth_image is not None, strongest=int(shape_index_image is not None)
         )
@@ -162,12 +172,12 @@ class SensorSplatCamera:
             means, quats, sh = self._place(view, pieces, layout, state, camera_transforms, recorded)
             of = lambda array: None if array is None else array[view]  # noqa: B023, E731 - called at once
             surface = of(mesh_depth)
-            room = {} if recorded else {name: self._room(name, shape[1:]) for name in ("image", "alpha", "depth")}
+            room = {} if recorded else {name: self._room(name, shape) for name in ("image", "alpha", "depth")}
             seen = tape.rasterize(
-                *(means, quats, layout.scales, layout.opacities, sh, camera),
+                *(means, quats, layout.scales, layout.opacities, sh, cameras[view]),
                 **{"adjoint": self.adjoint, "options": options, "hidden_from": surface, "out": room},
             )
-            rgb = of(rgb_image) if rgb_image is not None else self._room("rgb", shape[1:])
+            rgb = of(rgb_image) if rgb_image is not None else self._room("rgb", shape)
             inputs = [seen.image, seen.alpha, seen.depth, self.background, of(mesh_color), surface]
             made = [rgb, of(color_image), of(forward_depth_image)]
             launch_on_tape(put_among_meshes, rgb.size, inputs, made, self.device)
@@ -201,35 +211,26 @@ class SensorSplatCamera:
         view.sh = wp.array(sh, dtype=wp.vec3, device=self.device)
         return view
 
-    def _layout(self, sources: list[tuple]) -> Layout:
-        """Of the Gaussians of a world."""
-        key = tuple(key for key, _ in sources)
-        if key not in self._layouts:
-            scales = [size * source.scales for (_, size), source in sources]
-            opacities = [source.opacities for _, source in sources]
-            scales, opacities = (np.concatenate(arrays) for arrays in (scales, opacities))
-            new = {"device": self.device}
-            room = [wp.empty(len(opacities), dtype=kind, **new) for kind in (wp.vec3, wp.quat)]
-            room.append(wp.empty((len(opacities), 1), dtype=wp.vec3, **new))
-            self._layouts[key] = Layout(
-                wp.array(scales, dtype=wp.vec3, **new), wp.array(opacities, dtype=float, **new), tuple(room)
-            )
-        return self._layouts[key]
+    def _layout(self, *parts: tuple[Any, float]) -> Layout:
+        """Of the Gaussians of a world, each in its size."""
+        scales = np.concatenate([size * source.scales for source, size in parts])
+        opacities = np.concatenate([source.opacities for source, _ in parts])
+        new = partial(wp.empty, len(opacities), device=self.device)
+        return Layout(
+            wp.array(scales, dtype=wp.vec3, device=self.device),
+            wp.array(opacities, dtype=float, device=self.device),
+            (new(dtype=wp.vec3), new(dtype=wp.quat), new(dtype=wp.vec3).reshape((-1, 1))),
+        )
 
-    def _room(self, name: str, shape: tuple[int, ...]) -> wp.array:
+    def _new_room(self, name: str, shape: tuple[int, ...]) -> wp.array:
         """An image that is used again."""
-        if (name, shape) not in self._pixels:
-            kind = wp.vec3 if name in ("image", "rgb") else wp.float32
-            self._pixels[name, shape] = wp.empty(shape, dtype=kind, device=self.device)
-        return self._pixels[name, shape]
+        return wp.empty(shape, dtype=wp.vec3 if name in ("image", "rgb") else wp.float32, device=self.device)
 
-    def _owners_of(self, world: int) -> wp.array:
+    def _find_owners(self, world: int) -> wp.array:
         """The shape of each Gaussian."""
-        if world not in self._owners:
-            pieces, _ = self._worlds[world]
-            shapes = np.repeat([piece.shape for piece in pieces], [piece.view.sh.shape[0] for piece in pieces])
-            self._owners[world] = wp.array(shapes.astype(np.uint32), dtype=wp.uint32, device=self.device)
-        return self._owners[world]
+        pieces, _ = self._worlds[world]
+        shapes = np.repeat([piece.shape for piece in pieces], [piece.source.count for piece in pieces])
+        return wp.array(shapes, dtype=wp.uint32, device=self.device)
 
 
 def camera_of_fov(width: int, height: int, camera_fov: float) -> Camera:
