@@ -115,6 +115,26 @@ def test_fields_are_joined_as_their_parents_place_them(tmp_path):
     same(found._replace(**{name: getattr(found, name)[30:] for name in found._fields}), second, 2e-3)
 
 
+def test_only_what_is_to_be_drawn_is_read(tmp_path):
+    """Of four purposes two; an instance of an instance, mirrored; a point instancer's prototype once, and a line."""
+    stage, splats, lines = stage_of(tmp_path), some_splats(5, 16), []
+    for number, purpose in enumerate(("default", "render", "proxy", "guide")):
+        UsdGeom.Imageable(add(stage, f"/part{number}", some_splats(3, 16, number))).GetPurposeAttr().Set(purpose)
+    stage.CreateClassPrim("/_inner"), add(stage, "/_inner/splats", splats), stage.CreateClassPrim("/_outer")
+    for path, source in (("/_outer/one", "/_inner"), ("/two", "/_outer")):
+        place = UsdGeom.Xform.Define(stage, path)
+        place.AddTranslateOp().Set((1, 2, 3)), place.AddScaleOp().Set((-1, 1, 1))
+        place.GetPrim().GetReferences().AddInternalReference(source), place.GetPrim().SetInstanceable(True)
+    stage.Save()
+    found = load_gaussians(tmp_path / "a.usda", lines.append).splats
+    assert len(found.means) == 3 + 3 + 5 and not lines
+    expected = turned(turned(splats, np.eye(3), np.array([0.0, 4, 6])), HALF_TURN)  # mirrored twice
+    same(found._replace(**{name: getattr(found, name)[6:] for name in found._fields}), expected)
+    UsdGeom.PointInstancer.Define(stage, "/forest"), add(stage, "/forest/tree", splats), stage.Save()
+    assert len(load_gaussians(tmp_path / "a.usda", lines.append).splats.means) == 16
+    assert len(lines) == 1 and "its point instancers repeat nothing here" in lines[0]
+
+
 def test_what_a_stage_leaves_out_is_what_the_schema_says(tmp_path):
     stage = stage_of(tmp_path)
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/a").GetPrim()

@@ -103,7 +103,10 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
             for prim in stage.Traverse(Usd.TraverseInstanceProxies())
             if prim.HasAPI(UsdVol.ParticleFieldKernelGaussianEllipsoidAPI)
             and UsdGeom.Imageable(prim).ComputeVisibility(now) == UsdGeom.Tokens.inherited
+            and UsdGeom.Imageable(prim).ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
         ]
+        if any(prim.IsA(UsdGeom.PointInstancer) for prim in stage.Traverse(Usd.TraverseInstanceProxies())):
+            notes.append("its point instancers repeat nothing here; make instances of them to draw all")
         if not prims:
             raise Unexpected("none that is visible")
         up, unit = UsdGeom.GetStageUpAxis(stage), 1.0

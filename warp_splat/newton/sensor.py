@@ -163,9 +163,8 @@ class SensorSplatCamera:
         if not whole or not all(0 <= world < len(self._worlds) for world in chosen):
             raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {chosen.tolist()}.")
         cameras = [replace(one, rotation=np.eye(3), translation=np.zeros(3)) for one in cameras]
-        options = replace(
-            self.options, depth=forward_depth_image is not None, strongest=int(shape_index_image is not None)
-        )
+        asked = {"depth": forward_depth_image is not None, "strongest": int(shape_index_image is not None)}
+        options = replace(self.options, **asked)
         recorded = open_tape() is not None
         for view, world in enumerate(chosen.tolist()):
             pieces, layout = self._worlds[world]
@@ -183,8 +182,7 @@ class SensorSplatCamera:
             launch_on_tape(put_among_meshes, rgb.size, inputs, made, self.device)
             if shape_index_image is not None:
                 inputs = [seen.strongest, seen.strongest_weights, seen.alpha, self._owners_of(world), surface]
-                made = [of(shape_index_image)]
-                launch_on_tape(name_shapes, rgb.size, [*inputs, of(mesh_index)], made, self.device)
+                launch_on_tape(name_shapes, rgb.size, [*inputs, of(mesh_index)], [of(shape_index_image)], self.device)
 
     def _place(self, view: int, pieces: list[Piece], layout: Layout, state, camera_transforms, recorded: bool) -> tuple:
         """Means, quats and colors of a world's Gaussians in the camera's frame; on a tape, in arrays of their own."""
