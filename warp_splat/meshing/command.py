@@ -19,7 +19,7 @@ from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import BYTES, Drawn, Surface, closed, depth_of, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.fusion import Drawn, Surface, agreed, closed, depth_of, fused, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
@@ -29,7 +29,7 @@ ENDINGS = (".ply", ".glb", ".obj")
 GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # x left, y up, z forward
 ISLAND, LARGE = 0.01, 500  # share of the largest piece's triangles below which a piece is left out; of more it stays
 SMOOTHING = 10 * (0.5, -0.53)  # shares of the way to the mean of neighbors, there and back
-PIXEL = 20  # bytes of a pixel of a view
+PIXEL, VOXEL = 20, 60  # bytes of a pixel of a view; of a voxel, with those of the search
 LEAST = 16  # px, of the shorter edge of a view: smaller ones agree on nothing
 PIXELS = 2.0  # edge of a voxel where nothing else is asked for
 COARSER = 1.25  # times the voxel, until there is memory for all
@@ -53,15 +53,20 @@ def mesh(config: MeshConfig) -> int:
             needed(package)
     opened = Opened(config)
     memory = 1e9 * config.memory or available_memory(torch.device("cpu")) / 4
-    views = filled(drawn_views(opened, memory / 2), opened.scene.train)
+    drawn = drawn_views(opened, memory / 2)
+    views = agreed(drawn)
+    if config.voxel and any(view.depth.any() for view in views):
+        _grid(config, PIXELS * pixel(views), views, memory / 2)  # refused now, not after minutes
+    views = filled(drawn, views, opened.scene.train)
     natural = PIXELS * pixel(views)
     if math.isnan(natural):
-        raise InputError(f"{config.model}: its views do not agree on any depth; train longer, or on more photographs.")
+        expected = f"expected two or more views that agree on depths, found none of {len(views)}"
+        raise InputError(f"{config.model}: {expected}; train on more photographs, or longer.")
     voxel, voxels = _grid(config, natural, views, memory / 2)
     surface = surface_in(voxels, views, voxel, config.watertight)
     found = len(surface.faces)
     if not found:
-        raise InputError(f"--voxel {voxel:g}: nothing is seen so finely, so coarsely or in the box; try {natural:.2g}.")
+        raise InputError(f"--voxel {voxel:g}: no surface goes through voxels of this size; try {natural:.2g}.")
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)
     if config.crop:  # smoothing and simplifying move vertices
@@ -113,12 +118,14 @@ def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: fl
     voxel = config.voxel or natural
     while True:
         voxels = voxels_of(views, voxel, config.crop)
-        ends = [(int(axis.min()) - 1, int(axis.max()) + 2) for axis in voxels.T if config.watertight and len(axis)]
+        if not len(voxels) or voxel * PIXELS > natural * min(views[0].depth.shape):  # what a view shows
+            raise InputError(f"--voxel {voxel:g}: nothing is seen at this size, or in the box; try {natural:.2g}.")
+        ends = [(int(axis.min()) - 1, int(axis.max()) + 2) for axis in voxels.T if config.watertight]
         count = math.prod(end - begin for begin, end in ends) if ends else len(voxels)
-        if count <= memory / BYTES:
+        if count <= memory / VOXEL:
             return voxel, torch.cartesian_prod(*(torch.arange(*x, dtype=torch.int32) for x in ends)) if ends else voxels
         if config.voxel:
-            raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * count * BYTES:.1f} GB; raise it, or --memory.")
+            raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * count * VOXEL:.1f} GB; raise it, or --memory.")
         voxel *= COARSER
 
 

@@ -26,7 +26,6 @@ AGREEING = 0.2  # share of the views asked that see a place where a pixel sees i
 TOLERANCE = 0.01  # of the depth, within which that is the same place
 OTHERS = 40  # views that are asked, those that are nearest
 HALF = 1 << 20  # places on the grid lie between -HALF and HALF
-BYTES = 60  # of a voxel, with those of the search
 
 
 class Drawn(NamedTuple):

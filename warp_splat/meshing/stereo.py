@@ -24,12 +24,12 @@ PATCH = torch.nn.MaxPool2d(2 * REACH * SPACING + 1, 1, REACH * SPACING)
 AROUND, ALIKE = 5, 0.05  # edge [px] of what a median is taken of; share of it within which a pixel takes it over
 
 
-def filled(views: Sequence[Drawn], photographs: Sequence[View]) -> list[Drawn]:
-    """The views with depths that others confirm: the model's, and where there is none, what photographs tell.
+def filled(views: Sequence[Drawn], kept: list[Drawn], photographs: Sequence[View]) -> list[Drawn]:
+    """The views with depths that others confirm: the ``kept`` of the model's, and what photographs tell elsewhere.
 
     Photographs that a lens distorts tell nothing, and others not where they are masked.
     """
-    kept, drawn = agreed(views), torch.cat([view.depth[view.depth > 0] for view in views])
+    drawn = torch.cat([view.depth[view.depth > 0] for view in views])
     if not len(drawn) or any(photograph.camera.lens or photograph.camera.shutter for photograph in photographs):
         return kept
     near, far = (float(drawn.kthvalue(1 + int(share * len(drawn))).values) for share in (0.01, 0.99))
