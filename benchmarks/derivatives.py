@@ -14,8 +14,8 @@ _EXP = ("falloff.adj_exp2_known", "step.adj_opaque", *_CLAMP)
 _ROOT = ("step.conic_from_root",)
 _READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "falloff.adj_fall_value", *_ROOT)
 _BEGIN = ("cpu/taped.replay_begin", "cpu/taped.adj_begin")
-_UNDO = ("cpu/taped.replay_front_of", "cpu/taped.adj_front_of", "splat.odds_of")
-_KEPT = ("cpu/taped.replay_front_of_kept", "cpu/taped.adj_front_of_kept")
+_KEPT = ("cpu/taped.replay_front_of", "cpu/taped.adj_front_of")
+_UNDO = (*_KEPT, "splat.odds_of")
 
 #: Rules: functions that state a derivative or an inverse. Of overloads, one is counted.
 RULES = {
@@ -34,7 +34,7 @@ PLUMBING = {
     "manual": _LOOP,
     "stepwise": (*_LOOP, "step.stepwise", "step.step", *_KNOWN),
     "reversible": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of"),
-    "stored": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of_kept"),
+    "stored": (*_WALK, "cpu/taped.begin", "cpu/taped.front_of"),
     "generated": ("cpu/taped.walk", "cpu/taped.begin", "cpu/taped.front_of"),
     "plain": _WALK,
 }

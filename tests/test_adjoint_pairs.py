@@ -36,7 +36,7 @@ CONSTANT = {
     "largest": "chooses a factor that normalization takes out again",
     "support": "extents choose tiles",
     "covers_pixel": "masks",
-    "weight_of": "wp.grad(weigh) is asked for the direction alone",
+    "value_of": "wp.grad(weigh) is asked for the direction alone",
     "begin": "in front of everything, the transmittance is 1",
     "ask": "brings memory into the cache",
     "noise": "random numbers",
@@ -49,7 +49,7 @@ CONSTANT = {
 }
 #: Derivatives that are right only together, in the loop that Warp replays, and adjoints of whole steps: against
 #: differences of the image in test_gradcheck, in every mode.
-OF_A_LOOP = {"front_of", "front_of_kept", "behind_of", "spread", "collect", "read", "step", "geometry"}
+OF_A_LOOP = {"front_of", "behind_of", "spread", "collect", "read", "step", "geometry"}
 #: In tests of their own, below; the activations' in test_threads.
 ALONE = {"alpha_of", "alpha_blend", "everywhere", "exp", "logistic"}
 LOW, HIGH = 0.3, 2.0  # of the numbers that pieces are tried with

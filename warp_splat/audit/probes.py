@@ -13,6 +13,7 @@ import torch
 
 from warp_splat.audit.renderer import Answer
 from warp_splat.audit.small_scenes import balls, on_all_pixels
+from warp_splat.camera import Camera
 from warp_splat.color import from_srgb, to_srgb
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import make_camera, tensors
@@ -25,8 +26,6 @@ SEEN = {True: 0.6 / 255, False: 1e-9}  # of a cover, by whether pictures have 8 
 #: only one or two, or draw the last of their own order wrongly.
 COMPANY = np.arange(16)
 NEARLY_ROUND = np.array([0.999, 1.001, 1.0])  # of scales: some viewers do not draw what is round to the last bit
-OPAQUE = 0.9995  # what lets through more than most stops
-ASKED = (0.25, 0.5, 0.75)
 #: Values that renderers are known to have; a measured interval that holds one is named by it.
 KNOWN = {"1/255": 1 / 255, "1/512": 1 / 512} | {
     f"{value:g}": value for value in (1e-3, 1e-4, 1e-5, 1e-6, 0.01, 0.1, 0.2, 0.3, 0.99, 0.999)
@@ -118,6 +117,6 @@ class Prober:
         return best if errors[best] < 0.5 * min(others) else "other"
 
 
-def probe_camera():
-    """On whose axis CENTER lies."""
-    return make_camera(*PROBED, FOCAL, seed=None)
+def probe_camera(focal: float = FOCAL, seed: int | None = None, **pose) -> Camera:
+    """On whose axis CENTER lies; at the origin, unless a seed turns it."""
+    return make_camera(*PROBED, focal, seed=seed, **pose)

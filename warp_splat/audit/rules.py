@@ -5,26 +5,15 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import torch
 
-from warp_splat.audit.probes import (
-    ASKED,
-    CENTER,
-    FOCAL,
-    GREEN,
-    OPAQUE,
-    PROBED,
-    Prober,
-    decoded_srgb,
-    named_between,
-    probe_camera,
-    srgb,
-)
+from warp_splat.audit.probes import CENTER, GREEN, PROBED, Prober, decoded_srgb, named_between, probe_camera, srgb
 from warp_splat.audit.renderer import Answer, RendererFailed
 from warp_splat.audit.small_scenes import balls
 from warp_splat.compare import oracle
-from warp_splat.compare.scenes import make_camera
 from warp_splat.compare.workloads import Workload
 from warp_splat.formats.stored import SH_C0
 
+OPAQUE = 0.9995  # what lets through more than most stops
+ASKED = (0.25, 0.5, 0.75)  # a background
 #: Projections, and what is said of them.
 SHOWN_AS = {"affine": "linearized at their center", "ellipsoid": "seen as ellipsoids along rays"}
 
@@ -189,7 +178,7 @@ def find_harmonics(prober: Prober) -> str:
     if prober.degree == 0:
         return "It claims no harmonics above degree 0."
     count = (prober.degree + 1) ** 2
-    camera = make_camera(*PROBED, FOCAL, seed=5, center=(0.0, 0.0, 0.0))
+    camera = probe_camera(seed=5, center=(0.0, 0.0, 0.0))
     places = np.stack(np.meshgrid(np.arange(4) * 14 + 11.5, np.arange(4) * 11 + 7.5), -1).reshape(-1, 2)[:count]
     arrays = balls(camera, places, np.linspace(3, 4, count), 1.5, 0.9, 0.5)
     rest = np.zeros((count, count - 1, 3))
@@ -238,7 +227,7 @@ def find_sort(prober: Prober) -> str:
             (1, 1): "Gaussians are not sorted: the last in the file is in front.",
             (1, 0): "The order is reversed: the farther Gaussian is in front.",
         }.get(both, "Two Gaussians behind each other do not look as in either order.")
-    wide = make_camera(*PROBED, 30.0, seed=None)
+    wide = probe_camera(30.0)
     arrays = balls(wide, [[56.5, 30.5], [24.5, 19.5]], [3.0, 3.3], [14.0, 16.0], 0.7, colors)
     arrays["scales"] = arrays["scales"] * [1.0, 1.0, 0.1]  # balls as large would reach behind the camera
     key = front(0, 1, wide), front(1, 0, wide)

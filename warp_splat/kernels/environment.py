@@ -40,7 +40,7 @@ def make_see(lanes: int) -> wp.Function:
 def make_put_behind(lanes: int) -> wp.Kernel:
     """Of ``lanes`` pixels at once."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]
-    see = make_see(lanes)
+    see, value_of = make_see(lanes), make_harmonics(lanes).value_of
 
     @wp.kernel(module="unique", module_options=dict(OPTIONS))
     def put_behind(
@@ -62,11 +62,7 @@ def make_put_behind(lanes: int) -> wp.Kernel:
         green = fill(0.5 + C0 * h[1], r)
         blue = fill(0.5 + C0 * h[2], r)
         for k in range(COEFFICIENTS - 1):
-            value = number(0.0)
-            if wp.static(lanes == 1):
-                value = functions[k, 0]
-            else:
-                value = functions[k]
+            value = value_of(functions, k)
             red = fma(value, fill(h[3 * k + 3], r), red)
             green = fma(value, fill(h[3 * k + 4], r), green)
             blue = fma(value, fill(h[3 * k + 5], r), blue)
@@ -85,7 +81,8 @@ def make_put_behind(lanes: int) -> wp.Kernel:
 def make_adj_put_behind(lanes: int) -> wp.Kernel:
     """Of RUN times ``lanes`` pixels."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]
-    see, table = make_see(lanes), make_harmonics(lanes).table
+    see, harmonics = make_see(lanes), make_harmonics(lanes)
+    table, value_of = harmonics.table, harmonics.value_of
 
     @wp.kernel(module="unique", module_options=dict(OPTIONS))
     def adj_put_behind(
@@ -134,14 +131,9 @@ def make_adj_put_behind(lanes: int) -> wp.Kernel:
         sums[1] = C0 * inner(one, mean_g)
         sums[2] = C0 * inner(one, mean_b)
         for k in range(COEFFICIENTS - 1):
-            if wp.static(lanes == 1):
-                sums[3 * k + 3] = reds[k, 0]
-                sums[3 * k + 4] = greens[k, 0]
-                sums[3 * k + 5] = blues[k, 0]
-            else:
-                sums[3 * k + 3] = inner(one, reds[k])
-                sums[3 * k + 4] = inner(one, greens[k])
-                sums[3 * k + 5] = inner(one, blues[k])
+            sums[3 * k + 3] = inner(one, value_of(reds, k))
+            sums[3 * k + 4] = inner(one, value_of(greens, k))
+            sums[3 * k + 5] = inner(one, value_of(blues, k))
         adj_harmonics_out[run] = sums
 
     return adj_put_behind

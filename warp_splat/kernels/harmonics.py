@@ -20,7 +20,8 @@ class Harmonics(NamedTuple):
 
     table: type  # 15 rows of lanes, one for each function
     evaluate: wp.Function  # their values in the direction of an offset
-    weigh: wp.Function  # these, weighted, summed over all lanes: what one differentiates
+    value_of: wp.Function  # row k of a table, as lanes
+    weigh: wp.Function  # the functions, weighted, summed over all lanes: what one differentiates
 
 
 @functools.cache
@@ -69,24 +70,24 @@ def make_harmonics(lanes: int) -> Harmonics:
             return wp.matrix_from_rows(b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14)
 
     @wp.func
-    def weight_of(weights: table, k: int):
+    def value_of(rows: table, k: int):
         if wp.static(lanes == 1):
-            return weights[k, 0]
+            return rows[k, 0]
         else:
-            return weights[k]
+            return rows[k]
 
-    @wp.func_grad(weight_of)
-    def adj_weight_of(weights: table, k: int, adj_ret: number):  # nobody asks, and it would take a fifth of the adjoint
+    @wp.func_grad(value_of)
+    def adj_value_of(rows: table, k: int, adj_ret: number):  # nobody asks, and it would take a fifth of the adjoint
         pass
 
     @wp.func
     def weigh(x: number, y: number, z: number, weights: table):
         b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14 = basis(x, y, z)
-        s = fma(b0, weight_of(weights, 0), fma(b1, weight_of(weights, 1), times(b2, weight_of(weights, 2))))
-        s = fma(b3, weight_of(weights, 3), fma(b4, weight_of(weights, 4), fma(b5, weight_of(weights, 5), s)))
-        s = fma(b6, weight_of(weights, 6), fma(b7, weight_of(weights, 7), fma(b8, weight_of(weights, 8), s)))
-        s = fma(b9, weight_of(weights, 9), fma(b10, weight_of(weights, 10), fma(b11, weight_of(weights, 11), s)))
-        s = fma(b12, weight_of(weights, 12), fma(b13, weight_of(weights, 13), fma(b14, weight_of(weights, 14), s)))
+        s = fma(b0, value_of(weights, 0), fma(b1, value_of(weights, 1), times(b2, value_of(weights, 2))))
+        s = fma(b3, value_of(weights, 3), fma(b4, value_of(weights, 4), fma(b5, value_of(weights, 5), s)))
+        s = fma(b6, value_of(weights, 6), fma(b7, value_of(weights, 7), fma(b8, value_of(weights, 8), s)))
+        s = fma(b9, value_of(weights, 9), fma(b10, value_of(weights, 10), fma(b11, value_of(weights, 11), s)))
+        s = fma(b12, value_of(weights, 12), fma(b13, value_of(weights, 13), fma(b14, value_of(weights, 14), s)))
         return inner(s, fill(1.0, s))
 
-    return Harmonics(table, evaluate, weigh)
+    return Harmonics(table, evaluate, value_of, weigh)

@@ -97,7 +97,7 @@ def make_shade(lanes: int) -> wp.Kernel:
 @functools.cache
 def make_adj_shade(lanes: int) -> wp.Kernel:
     """The adjoint of :func:`make_shade`'s kernel."""
-    table, evaluate, weigh = make_harmonics(lanes)
+    table, evaluate, _, weigh = make_harmonics(lanes)
     number = TYPES[lanes].number
     offsets = make_offsets(lanes)
 

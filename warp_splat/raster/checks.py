@@ -88,14 +88,10 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     most = options.strongest
     if isinstance(most, bool) or not (isinstance(most, numbers.Integral) and 0 <= int(most) <= config.STRONGEST_MOST):
         raise InputError(f"options.strongest: expected a whole number, 0 to {config.STRONGEST_MOST}, got {most!r}.")
-    return replace(
-        options,
-        strongest=int(most),
-        sh_degree=None if options.sh_degree is None else int(options.sh_degree),
-        exp_degree=None if options.exp_degree is None else int(options.exp_degree),
-        **{name: float(getattr(options, name)) for name in ("alpha_min", "alpha_max", "t_min", "near", "blur")},
-        max_steps=None if steps is None else int(steps),
-    )
+    whole, kinds = ("strongest", "sh_degree", "exp_degree", "max_steps"), {}
+    kinds |= dict.fromkeys(whole, int) | dict.fromkeys(("alpha_min", "alpha_max", "t_min", "near", "blur"), float)
+    given = {name: getattr(options, name) for name in kinds}
+    return replace(options, **{name: kinds[name](value) for name, value in given.items() if value is not None})
 
 
 def check_hidden_from(options: RasterOptions, camera: Camera, device: torch.device) -> None:

@@ -163,10 +163,6 @@ def _list_end(data: bytes, start: int, length: struct.Struct, each: int) -> int:
     return start + length.size + each * length.unpack_from(data, start)[0]
 
 
-def _image_end(data: bytes, start: int) -> int:
-    return _list_end(data, data.index(b"\0", start + IMAGE_HEAD) + 1, UINT64, 24)
-
-
 def _rig_end(data: bytes, start: int) -> int:
     _, sensors = UINT32_PAIR.unpack_from(data, start)
     end = start + UINT32_PAIR.size + (SENSOR if sensors else 0)
@@ -180,7 +176,7 @@ RECORD_ENDS = {
     "rigs.bin": _rig_end,
     "cameras.bin": _camera_end,
     "frames.bin": lambda data, start: _list_end(data, start + FRAME_HEAD, UINT32, SENSOR + 8),
-    "images.bin": _image_end,
+    "images.bin": lambda data, start: _list_end(data, data.index(b"\0", start + IMAGE_HEAD) + 1, UINT64, 24),
     "points3D.bin": lambda data, start: _list_end(data, start + POINT_HEAD, UINT64, 8),
 }
 

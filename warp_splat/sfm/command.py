@@ -25,16 +25,7 @@ from warp_splat.formats.files import write_json
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
-from warp_splat.scene.photos import (
-    OTHER_PHOTOS,
-    PHOTOS,
-    VIDEOS,
-    find_files,
-    is_video,
-    photo_root,
-    scene_of,
-    sfm_hint,
-)
+from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, VIDEOS, find_files, is_video, photo_root, scene_of, sfm_hint
 from warp_splat.sfm import mapping, stages
 from warp_splat.sfm.georeference import georeference
 from warp_splat.sfm.matching import match

@@ -20,11 +20,6 @@ SHARPNESS_WIDTH = 960  # px; frames are shrunk to this width before they are jud
 QUALITY = 97  # of the JPEG files, 0 to 100
 
 
-def sharpness(luma: np.ndarray) -> float:
-    """Variance of the Laplacian of an image [H, W]: large where edges are sharp."""
-    return float(np.var(laplace(luma.astype(np.float32))[1:-1, 1:-1]))
-
-
 def sample_frames(
     path: Path,
     folder: Path,
@@ -76,9 +71,10 @@ def sample_frames(
 
 
 def _sharpness_of(frame: av.VideoFrame) -> float:
+    """Variance of the Laplacian: large where edges are sharp."""
     width = min(SHARPNESS_WIDTH, frame.width)
     small = frame.reformat(width=width, height=max(3, frame.height * width // frame.width), format="gray")
-    return sharpness(small.to_ndarray())
+    return float(np.var(laplace(small.to_ndarray().astype(np.float32))[1:-1, 1:-1]))
 
 
 def _decode(container, threads: int, damaged: list[int]) -> Iterator[av.VideoFrame]:

@@ -175,7 +175,8 @@ def truth(build: Callable[[], Problem]) -> Expected:
             gradients[name][kept] = rows
         if name in problem.gaussians:
             overflows |= (gradients[name].abs() > FLOAT_MAX).view(count, -1).any(1)
-    says = _summary(out.image.detach(), gradients)
+    largest = max((value.abs().max().item() for value in gradients.values() if value.numel()), default=0.0)
+    says = f"image {out.image.min().item():.2f}..{out.image.max().item():.2f}, gradient to {largest:.1e}"
     for name in problem.gaussians:
         gradients[name][overflows] = 0
     out = replace(out, image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach())
@@ -265,11 +266,6 @@ def judge(expected: Expected, mode: str) -> Outcome:
 def count_text(**counts: int) -> str:
     """What was counted, such as "culled 3, invalid 1"; "-" for nothing."""
     return ", ".join(f"{name} {number}" for name, number in counts.items() if number) or "-"
-
-
-def _summary(image: torch.Tensor, gradients: dict[str, torch.Tensor]) -> str:
-    largest = max((value.abs().max().item() for value in gradients.values() if value.numel()), default=0.0)
-    return f"image {image.min().item():.2f}..{image.max().item():.2f}, gradient to {largest:.1e}"
 
 
 def rendered(name: str, group: str, claim: str, build: Callable[[], Problem]) -> Case:

@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, corner, walk
+from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, vec16
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
@@ -94,7 +94,6 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0, y0 = corner(bins, tile)
         room = mat_room()
         # rows of lanes: T, dL/dT (times T for manual), instances walked, upstream gradients, sums over pixels
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
@@ -108,6 +107,6 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
             for channel in range(CHANNELS):
                 s[UP + channel * BLOCKS + block] = up[tile, block * CHANNELS + channel]
         length = steps[tile]
-        walk(bins, near, start, length, way, x0, y0, slots_out, begin, step, finish)
+        walk(bins, near, start, length, way, slots_out, begin, step, finish)
 
     return adj_blend

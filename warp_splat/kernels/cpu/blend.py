@@ -94,13 +94,14 @@ def corner(bins: BinsView, tile: int):
     return float((tile % bins.tiles_x) * TILE) + 0.5, float((tile // bins.tiles_x) * TILE) + 0.5
 
 
-def walk(bins, near, start, count, way, x0, y0, out, begin, step, finish):
+def walk(bins, near, start, count, way, out, begin, step, finish, tile):
     """The loop over ``count`` instances of a list and the blocks that they reach, of which kernels put in the text.
 
     From ``start`` on, or (``way`` -1) towards it. ``near`` has room for AHEAD splats. Parts of the kernel, for which
     ``out`` is: ``begin`` with a splat, its answer goes to ``step`` with a block; ``finish`` says whether to stop there.
     """
     boxes = mat_boxes()
+    x0, y0 = corner(bins, tile)
     for number in range(count):
         k = start + number
         if wp.static(way < 0):
@@ -208,7 +209,6 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         start = bins.ranges[tile][0]
         column = (tile % bins.tiles_x) * TILE
         line = (tile // bins.tiles_x) * TILE
-        x0, y0 = corner(bins, tile)
         room = mat_room()
         # rows of lanes: T, instances walked, sums of w color and of w z
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
@@ -220,7 +220,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         if wp.static(variant.bound):
             prepare(s)
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
-        walk(bins, near, start, length, way, x0, y0, kept_out, begin, step, finish)
+        walk(bins, near, start, length, way, kept_out, begin, step, finish)
         if wp.static(variant.bound):
             conclude(s, bound, tile, bins, length, background)
         for block in range(BLOCKS):

@@ -12,7 +12,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.adjoint import folded
-from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, corner, walk
+from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16, where_less
@@ -126,7 +126,6 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0, y0 = corner(bins, tile)
         room = mat_room()
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * STATE), shape=(AHEAD,), dtype=Splat2D)
@@ -140,7 +139,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
             for j in range(MOST):
                 s[RANK + j * BLOCKS + block] = vec16(-1.0)
         length = steps[tile]
-        walk(bins, near, start, length, way, x0, y0, pixels_out, begin, step, finish)
+        walk(bins, near, start, length, way, pixels_out, begin, step, finish)
         numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=((STATE - SUMS) * LANES,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
@@ -242,7 +241,6 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0, y0 = corner(bins, tile)
         room = mat_room()
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(SUMS + GRADS,), dtype=vec16)
         near = wp.array(ptr=s.ptr + wp.uint64(64 * (SUMS + GRADS)), shape=(AHEAD,), dtype=Splat2D)
@@ -256,7 +254,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             chosen = wp.array(ptr=s.ptr + wp.uint64(64 * RANK), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
             into_lanes(ranks, 0, channels, tile, bins.tiles_x, chosen, WIDTH)
         length = steps[tile]
-        walk(bins, near, start, length, way, x0, y0, slots_out, begin, step, finish)
+        walk(bins, near, start, length, way, slots_out, begin, step, finish)
         for k in range(start + steps[tile], bins.ranges[tile][1]):
             for grad in range(slots_out.shape[1]):
                 slots_out[k, grad] = 0.0

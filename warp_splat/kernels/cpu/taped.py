@@ -5,7 +5,7 @@ the loop hold at that moment. Recorded plainly (``plain``) that is silently wron
 every step, and so is every gradient. Two cures:
 
     reversible  the replay of ``front_of`` undoes the step, T = T / (1 - alpha): no memory
-    stored      the replay of ``front_of_kept`` reads the T that the forward pass wrote
+    stored      it reads the T that the forward pass wrote
 
 A replay cannot follow a break. So the loop runs over the instances that some pixel of the tile blended, and ``opaque``
 skips those that a pixel did not. What a loop carries has to be an element of a kernel-local array, changed by += and
@@ -46,39 +46,6 @@ def replay_begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
 @wp.func_grad(begin)
 def adj_begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
     pass
-
-
-@wp.func
-def front_of(t: wp.array[vec16], block: int, alpha: vec16):
-    """Transmittance in front of the Gaussian."""
-    return t[block]
-
-
-@wp.func_replay(front_of)
-def replay_front_of(t: wp.array[vec16], block: int, alpha: vec16):
-    t[block] = fma(t[block], odds_of(alpha), t[block])
-    return t[block]
-
-
-@wp.func_grad(front_of)
-def adj_front_of(t: wp.array[vec16], block: int, alpha: vec16, adj_ret: vec16):
-    wp.adjoint[t][block] += adj_ret
-
-
-@wp.func
-def front_of_kept(t: wp.array[vec16], block: int, kept: wp.array2d[vec16], k: int):
-    """Transmittance in front of the Gaussian."""
-    return t[block]
-
-
-@wp.func_replay(front_of_kept)
-def replay_front_of_kept(t: wp.array[vec16], block: int, kept: wp.array2d[vec16], k: int):
-    return kept[k, block]
-
-
-@wp.func_grad(front_of_kept)
-def adj_front_of_kept(t: wp.array[vec16], block: int, kept: wp.array2d[vec16], k: int, adj_ret: vec16):
-    wp.adjoint[t][block] += adj_ret
 
 
 @wp.func
@@ -136,6 +103,23 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     STATE = BLOCKS * CHANNELS
     (fall_at, fall_known, _), fall_value = make_falloff(variant.falloff), make_fall_value(variant.falloff, vec16)
 
+    @wp.func
+    def front_of(t: wp.array[vec16], block: int, alpha: vec16, kept: wp.array2d[vec16], k: int):
+        """Transmittance in front of the Gaussian."""
+        return t[block]
+
+    @wp.func_replay(front_of)
+    def replay_front_of(t: wp.array[vec16], block: int, alpha: vec16, kept: wp.array2d[vec16], k: int):
+        if wp.static(mode == "stored"):
+            return kept[k, block]
+        else:
+            t[block] = fma(t[block], odds_of(alpha), t[block])
+            return t[block]
+
+    @wp.func_grad(front_of)
+    def adj_front_of(t: wp.array[vec16], block: int, alpha: vec16, kept: wp.array2d[vec16], k: int, adj_ret: vec16):
+        wp.adjoint[t][block] += adj_ret
+
     @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
     def walk(
         first: int,
@@ -191,12 +175,10 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
                         z = exponent(dx, dy, xx, xy, spread(m, YY, splat.root[2]))
                         raw = times(fall_known(z, fall_value(z)), spread(m, OPACITY, splat.opacity))
                         alpha = opaque(raw, alphas, here, count[tile, block])
-                    if wp.static(mode == "stored"):
-                        front = front_of_kept(t, block, kept, k)
-                    elif wp.static(mode == "plain"):
+                    if wp.static(mode == "plain"):
                         front = t[block]
                     else:
-                        front = front_of(t, block, alpha)
+                        front = front_of(t, block, alpha, kept, k)
                     w = times(alpha, front)
                     if wp.static(mode == "generated"):
                         for channel in range(3):

@@ -36,38 +36,6 @@ def adj_begin(final: float, adj_ret: float):
 
 
 @wp.func
-def front_of(t: float, alpha: float):
-    """Transmittance in front of the Gaussian."""
-    return t
-
-
-@wp.func_replay(front_of)
-def replay_front_of(t: float, alpha: float):
-    return t + t * odds_of(alpha)
-
-
-@wp.func_grad(front_of)
-def adj_front_of(t: float, alpha: float, adj_ret: float):
-    wp.adjoint[t] += adj_ret
-
-
-@wp.func
-def front_of_kept(t: float, kept: wp.array2d[float], k: int, thread: int):
-    """Transmittance in front of the Gaussian."""
-    return t
-
-
-@wp.func_replay(front_of_kept)
-def replay_front_of_kept(t: float, kept: wp.array2d[float], k: int, thread: int):
-    return kept[k, thread]
-
-
-@wp.func_grad(front_of_kept)
-def adj_front_of_kept(t: float, kept: wp.array2d[float], k: int, thread: int, adj_ret: float):
-    wp.adjoint[t] += adj_ret
-
-
-@wp.func
 def behind_of(front: float, w: float):
     """Transmittance behind the Gaussian."""
     return front - w
@@ -89,6 +57,22 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
     CHANNELS, GRADS = variant.channels, variant.columns
     fall_known, fall_value = make_falloff(variant.falloff).known, make_fall_value(variant.falloff, float)
+
+    @wp.func
+    def front_of(t: float, alpha: float, kept: wp.array2d[float], k: int, thread: int):
+        """Transmittance in front of the Gaussian."""
+        return t
+
+    @wp.func_replay(front_of)
+    def replay_front_of(t: float, alpha: float, kept: wp.array2d[float], k: int, thread: int):
+        if wp.static(mode == "stored"):
+            return kept[k, thread]
+        else:
+            return t + t * odds_of(alpha)
+
+    @wp.func_grad(front_of)
+    def adj_front_of(t: float, alpha: float, kept: wp.array2d[float], k: int, thread: int, adj_ret: float):
+        wp.adjoint[t] += adj_ret
 
     @wp.func
     def read(splat: Splat2D, slots: wp.array2d[float], slot: int, thread: int):
@@ -128,10 +112,7 @@ def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
             z = exponent(g[MEAN_X] - x, g[MEAN_Y] - y, g[XX], g[XY], g[YY])
             raw = fall_known(z, fall_value(z)) * g[OPACITY]
             alpha = opaque(raw, alphas, float(k - start), walked)
-            if wp.static(mode == "stored"):
-                front = front_of_kept(t, kept, k, thread)
-            else:
-                front = front_of(t, alpha)
+            front = front_of(t, alpha, kept, k, thread)
             w = alpha * front
             if wp.static(CHANNELS > 3):
                 color += wp.vec4(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2], g[CHANNEL + 3]) * w
