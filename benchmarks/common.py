@@ -6,7 +6,8 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from warp_splat.color import to_bytes
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation.report import machine
 from warp_splat.gaussians import GaussianModel
+from warp_splat.raster.drivers import DRIVERS, Driver
 from warp_splat.rendering.finished import make_renderer
 from warp_splat.runtime import launch, pool
 from warp_splat.text import cells_of, format_table
@@ -159,3 +161,14 @@ def picture_of(model: GaussianModel, background=None, options: RasterOptions | N
     """A function from a camera to the model's image, [H, W, 3] uint8; see ``make_renderer``."""
     draw = make_renderer(model, background, options)
     return lambda camera: to_bytes(draw(camera).image, linear)
+
+
+@contextmanager
+def using(driver: Driver) -> Iterator[None]:
+    """Render on the CPU by ``driver``, for tests and dry runs; a GPU's kernels then run in slow fibers."""
+    before = DRIVERS["cpu"], wp.config.enable_cpu_blocks
+    DRIVERS["cpu"], wp.config.enable_cpu_blocks = driver, True
+    try:
+        yield
+    finally:
+        DRIVERS["cpu"], wp.config.enable_cpu_blocks = before

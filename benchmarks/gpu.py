@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import warp as wp
-from common import option, parse
+from common import option, parse, using
 from gpu_blends import blends_of, measure_blends, measure_longest
 from gpu_results import Results
 from gpu_steps import measure_errors, measure_modes, measure_orbit, measure_step
@@ -38,7 +38,7 @@ from made_up import cameras, make_crowd, make_gaussians
 from warp_splat import rasterize
 from warp_splat.config import ADJOINTS
 from warp_splat.errors import InputError
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CUDA
 from warp_splat.raster.selftest import check_device
 from warp_splat.runtime.launch import prepare
 

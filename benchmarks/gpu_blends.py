@@ -81,7 +81,7 @@ class Blends:
             self.splats = project(gaussians, camera, self.options)
             self.bins = CUDA.bin(self.splats, camera, self.options)
         self.count, new = len(gaussians.means), self.background.new_empty
-        self.slots = self.bins.new_slots(self.options)
+        self.slots = new(len(self.bins.instances), variant_of(self.options).columns)
         self.forward()
         self.adj_pixels = Pixels(torch.ones_like(self.image), torch.zeros_like(self.image[..., 0]), new(0, 0))
         self.upstream(self.slots)

@@ -13,6 +13,7 @@ from unittest import mock
 import numpy as np
 import torch
 import warp as wp
+from common import using
 from made_up import VIEWS, make_trainer, steps_of
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -28,7 +29,7 @@ from warp_splat.kernels.falloff import LOG2_E, reach_of
 from warp_splat.kernels.splat import exponent
 from warp_splat.kernels.structs import BinsView
 from warp_splat.raster.data import Gaussians
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.project import project
 from warp_splat.runtime import timers
 from warp_splat.runtime.launch import launch, view

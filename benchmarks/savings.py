@@ -19,13 +19,13 @@ from unittest.mock import patch
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from common import interleaved, parse, write_table
+from common import interleaved, parse, using, write_table
 from made_up import NEVER, steps_of
 from step import GIVEN, synthetic, trained
 
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Bins, Gaussians
-from warp_splat.raster.drivers import CPU, using
+from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch, pool
 from warp_splat.scene.images import read_pixels

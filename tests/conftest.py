@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 import warp as wp
+from common import using
 from fake_viser import FakeServer
 from filelock import FileLock
 
@@ -23,7 +24,7 @@ from warp_splat.kernels.project.shared import make_project
 from warp_splat.kernels.sh_colors import make_adj_shade
 from warp_splat.kernels.simd import LANES
 from warp_splat.raster.data import falloff_of, variant_of
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.project import projection_of
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene

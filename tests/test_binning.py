@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from common import using
 from hostile import refusal
 
 from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.raster import api, bin
 from warp_splat.raster import project as projection
 from warp_splat.raster.data import Bins, Gaussians, Room
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 
 SIZE = (70, 53)
 PLAIN = RasterOptions()

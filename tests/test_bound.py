@@ -6,6 +6,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from common import using
 from exact_cameras import exact_render
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -124,7 +125,7 @@ def test_kernels_of_cuda_find_a_bound_as_well():
     camera = look(24, 20)
     gaussians = made_up(5, 60, (0.5, 6.0), (0.05, 0.9), 0.2, 1.0, camera)
     on_cpu = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True)).bound
-    with drivers.using(drivers.CUDA):
+    with using(drivers.CUDA):
         ratios(gaussians, camera, torch.zeros(3), RasterOptions())
         on_cuda = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True)).bound
     assert np.median(on_cuda / on_cpu) < 1.5

@@ -5,6 +5,7 @@ import functools
 import pytest
 import scenes
 import torch
+from common import using
 from learned_cameras import (
     DEPTH,
     HERE,
@@ -22,7 +23,7 @@ from scenes import SCENES, scene_of
 
 from warp_splat import CameraParameters, RasterOptions, rasterize
 from warp_splat.config import ADJOINTS
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 
 ERROR = 1e-5  # relative L2, of each part of a camera
 THERE = (0.3, -0.2, 0.5, 0.2, 0.4, -0.3)  # a twist

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from common import using
 from scenes import SCENES
 
 from warp_splat import RasterOptions, cli
@@ -24,7 +25,7 @@ from warp_splat.kernels.cpu.taped import make_walk
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.data import alphas_of
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, view
 

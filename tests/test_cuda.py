@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from common import using
 from test_rasterize import check_gradients, check_image, relative_error, run, truth
 
 from warp_splat import RasterOptions
@@ -15,7 +16,7 @@ from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster import api
 from warp_splat.raster.data import LONG, Gaussians, Room
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CUDA
 from warp_splat.runtime.launch import launch_blocks, view
 
 SCENES = ("degree1", "dense_tile", "saturated", "needles", "ties", "size_1x1", "size_17x33", "single", "empty")

@@ -9,6 +9,7 @@ import cuda_on_host
 import numpy as np
 import pytest
 import torch
+from common import using
 from cuda_on_host import build, recorded, run
 from scenes import PARAMETERS, cloud, dense_tile, make_camera
 from test_binning import crowded
@@ -16,7 +17,7 @@ from test_binning import crowded
 from warp_splat import RasterOptions, rasterize
 from warp_splat.config import ADJOINTS
 from warp_splat.gsplat import rasterization
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CUDA
 from warp_splat.training.loss import image_loss
 
 pytestmark = [

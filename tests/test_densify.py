@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from common import using
 from scipy.spatial.transform import Rotation
 
 from warp_splat.errors import InputError
 from warp_splat.formats.curve import along_curve
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training import adam_step
 from warp_splat.training.adam_step import HALF, move

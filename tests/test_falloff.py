@@ -7,13 +7,14 @@ import pytest
 import torch
 import warp as wp
 from commands import ROOT
+from common import using
 from heavy_tails import fall, heavy_tails, reach
 from hostile import refusal
 from scenes import SCENES
 
 from warp_splat import Falloff, InputError, RasterOptions, check_gradients, rasterize
 from warp_splat.config import ALPHA_MAX
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.gradcheck import _check_falloff
 
 OPTIONS = RasterOptions(falloff=heavy_tails, alpha_min=0.02, t_min=0.0, depth=True)

@@ -15,6 +15,7 @@ import pytest
 import torch
 import warp as wp
 from commands import ROOT, python
+from common import using
 from gpu_counts import LAUNCHES, OPERATIONS, REST, WAITS
 from made_up import cameras, make_gaussians
 
@@ -25,7 +26,7 @@ from warp_splat.gsplat import rasterization
 from warp_splat.raster.api import render
 from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.data import Gaussians, Splats2D
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.project import project
 
 PRETENDING = {"cuda": f"{ROOT / 'tests/pretend_cuda'}:{ROOT}", "cpu": str(ROOT)}

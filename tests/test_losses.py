@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
+from common import using
 from hostile import refusal
 
-from warp_splat.raster.drivers import CPU, CUDA, using
+from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.runtime.timers import profile
 from warp_splat.training import loss as losses
 from warp_splat.training.loss import image_loss

@@ -10,6 +10,7 @@ import cubins
 import pytest
 import torch
 import warp as wp
+from common import using
 from cuda_on_host import Launch, compiled, recorded
 from ptx import execute
 from scenes import FISHEYE, OPENCV
@@ -22,7 +23,7 @@ from warp_splat import Camera, CameraParameters, RasterOptions
 from warp_splat.gaussians import Activate
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.behind import put_behind
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CUDA
 from warp_splat.raster.expose import expose
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch_in_lanes

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from common import using
 from hostile import refusal
 from scenes import PARAMETERS, SCENES
 from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, relative_error, run, truth
@@ -16,7 +17,7 @@ from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, r
 import warp_splat
 from warp_splat import InputError, RasterOptions
 from warp_splat.config import ADJOINTS
-from warp_splat.raster.drivers import CPU, CUDA, DRIVERS, using
+from warp_splat.raster.drivers import CPU, CUDA, DRIVERS
 from warp_splat.training.loss import image_loss
 
 

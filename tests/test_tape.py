@@ -8,12 +8,13 @@ import pytest
 import torch
 import warp as wp
 from commands import ROOT
+from common import using
 from scenes import SCENES, cloud, make_camera
 
 import warp_splat
 from warp_splat import CameraParameters, InputError, RasterOptions, tape
 from warp_splat.config import ADJOINTS
-from warp_splat.raster.drivers import CUDA, using
+from warp_splat.raster.drivers import CUDA
 
 KINDS = {"means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": wp.float32, "sh": wp.vec3}
 TWIST = [0.01, -0.02, 0.015, 0.05, -0.03, 0.02]

@@ -10,7 +10,7 @@ from commands import train
 from warp_splat.camera import Camera
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.runtime.distributed import ALONE
-from warp_splat.scene.coverage import few_photographs
+from warp_splat.scene.horizon import few_photographs
 from warp_splat.training import trial
 from warp_splat.training.config_file import read_config
 from warp_splat.training.options import TrainConfig

@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
 from typing import Any
 
 from warp_splat import __version__
@@ -219,12 +218,6 @@ def _check_minutes(given: dict) -> None:
         raise InputError(f"--minutes: expected no --{steps[0]} beside it, since it plans the steps; leave one out.")
 
 
-def _function_of(config: Any) -> Callable[[Any], int]:
-    """The function that runs the command of this configuration, loaded now."""
-    module, name = next(place for kind, place, _ in COMMANDS.values() if isinstance(config, kind)).rsplit(".", 1)
-    return getattr(importlib.import_module(f"warp_splat.{module}"), name)
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
     alike = os.environ.get("LOCAL_RANK", "0") != "0"  # what another process of this machine says as well
@@ -239,7 +232,9 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         with leaving_at_once():
-            run = _function_of(config)
+            place = next(place for kind, place, _ in COMMANDS.values() if isinstance(config, kind))
+            module, name = place.rsplit(".", 1)
+            run = getattr(importlib.import_module(f"warp_splat.{module}"), name)
         alike = False
         return run(config)
     except (InputError, OSError) as error:

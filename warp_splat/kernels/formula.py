@@ -144,10 +144,6 @@ def _linear(combine: Callable[[Notes, Name, Name], Name], notes: Notes, a: Numbe
 _add, _subtract = partial(_linear, Notes.sum), partial(_linear, Notes.difference)
 
 
-def _negative(notes: Notes, a: Number) -> Number:
-    return _subtract(notes, Number(notes, None, (None,) * len(a.slopes)), a)
-
-
 def _divide(notes: Notes, a: Number, b: Number) -> Number:
     per_b = notes.note("inverse", notes.real(b.name))
     ratio = notes.product(a.name, per_b)
@@ -186,7 +182,7 @@ RULES = {
     np.subtract: _subtract,
     np.multiply: _multiply,
     np.true_divide: _divide,
-    np.negative: _negative,
+    np.negative: lambda notes, a: _subtract(notes, Number(notes, None, (None,) * len(a.slopes)), a),
     np.sqrt: _sqrt,
     np.arctan2: _arctan2,
     np.less: partial(_flat, "less"),

@@ -43,14 +43,11 @@ def widened(half: wp.uint16) -> float:
 def widened(half: vec16h) -> vec16: ...
 
 
-@wp.func
-def widened(whole: float):
-    return whole  # it is
+for number in (float, vec16):
 
-
-@wp.func
-def widened(whole: vec16):
-    return whole
+    @wp.func
+    def widened(whole: number):
+        return whole  # it is
 
 
 @wp.func_native(

@@ -5,7 +5,6 @@ cost nothing where they are not asked for. Channels go in groups, so that memory
 """
 
 from functools import partial
-from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -24,14 +23,6 @@ from warp_splat.runtime.timers import stage
 
 WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
 MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them
-
-
-class Strongest(NamedTuple):
-    """Which Gaussians a pixel shows."""
-
-    gaussians: torch.Tensor  # [H, W, k] int64, the strongest first, of equal ones the nearest; -1 where there is none
-    weights: torch.Tensor  # [H, W, k] opacity times transmittance; 0 where there is none
-    median_depth: torch.Tensor  # [H, W] depth of the Gaussian at which half of the light is gone; 0 where it is not
 
 
 def blend_beside(
@@ -59,14 +50,13 @@ def blend_beside(
         parts = image.split(widths, 2) if len(widths) > 1 else [image]  # the adjoint of a split copies
         found |= zip(channels, parts, strict=True)
     if options.strongest or options.median_depth:
-        strongest = find_strongest(splats, blending)
+        numbers, weights, median_depth = find_strongest(splats, blending)
         if options.strongest:
             owners = with_copies(torch.arange(len(gaussians.means), device=splats.means2d.device), crossing)
-            numbers = strongest.gaussians
             numbers = torch.where(numbers < 0, numbers, owners[numbers]) if crossing else numbers
-            found |= {"strongest": numbers, "strongest_weights": strongest.weights}
+            found |= {"strongest": numbers, "strongest_weights": weights}
         if options.median_depth:
-            found["median_depth"] = strongest.median_depth
+            found["median_depth"] = median_depth
     return found
 
 
@@ -75,8 +65,14 @@ def blend_channels(splats: Splats2D, features: torch.Tensor, blending: Blending)
     return Channels.apply(splats.means2d, splats.conics, splats.opacities, features, blending)
 
 
-def find_strongest(splats: Splats2D, blending: Blending) -> Strongest:
-    """The ``options.strongest`` Gaussians of each pixel; weights are differentiable in the splats, the median in z."""
+def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Which Gaussians a pixel shows; weights are differentiable in the splats, the median in z.
+
+    Returns:
+        The k Gaussians of the largest weights, [H, W, k] int64, the strongest first, of equal ones the nearest, -1
+        where there is none; opacity times transmittance of these, 0 there; and the depth of the Gaussian at which half
+        of the light is gone, [H, W], 0 where it is not.
+    """
     bins, camera, options = blending.bins, blending.camera, blending.options
     shape, most, device = (camera.height, camera.width), options.strongest, splats.means2d.device
     ranks = torch.empty(*shape, most, dtype=torch.int32, device=device)
@@ -89,7 +85,7 @@ def find_strongest(splats: Splats2D, blending: Blending) -> Strongest:
     # an embedding, whose adjoint sums in one order, on a GPU as well; the last row is that of no Gaussian
     depths = torch.cat([splats.depths, splats.depths.new_zeros(1)])[:, None]
     median_depth = torch.nn.functional.embedding(middle % len(depths), depths)
-    return Strongest(gaussians, weights, median_depth.view(shape))
+    return gaussians, weights, median_depth.view(shape)
 
 
 def _launch(

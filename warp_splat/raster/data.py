@@ -75,11 +75,6 @@ class Bins:
             BinsView, tiles_x=self.tiles_x, ranges=self.ranges, instances=self.instances, splats=self.splats
         )
 
-    def new_slots(self, options: RasterOptions) -> torch.Tensor:
-        """Room for a row of gradients per tile instance, [M, 9 or 10]."""
-        count, columns = len(self.instances), variant_of(options).columns
-        return torch.empty(count, columns, dtype=torch.float32, device=self.instances.device)
-
     def new_gradients(self, slots: torch.Tensor) -> list[torch.Tensor]:
         """Room for what slots sum up to, [N, width] each; zeros for depths, if slots have none."""
         grads = [slots.new_empty(self.gaussian_count, width) for width in WIDTHS]

@@ -6,8 +6,7 @@ the rows and their summation; they differ in the kernel between them alone. Two 
 kernel that writes every T, and ``generated`` (for the comparison) reads a copy of the Gaussian per tile instance.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
@@ -121,7 +120,7 @@ class Driver:
             saved: what :meth:`blend` returned last.
             adj_pixels: upstream gradients; dense.
         """
-        slots = bins.new_slots(options)
+        slots = background.new_empty(len(bins.instances), variant_of(options).columns)  # a row per tile instance
         up, adj_background, dropped, steps = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
         self.differentiate(mode, bins, options, saved, up, steps, slots)
         if self.peeks:  # numpy's sum is one after another, whatever the number of torch's threads
@@ -262,14 +261,3 @@ DRIVERS = {"cpu": CPU, "cuda": CUDA}
 def driver_of(device: torch.device) -> Driver:
     """The driver of ``device``."""
     return DRIVERS[device.type]
-
-
-@contextmanager
-def using(driver: Driver) -> Iterator[None]:
-    """Render on the CPU by ``driver``, for tests and dry runs; a GPU's kernels then run in slow fibers."""
-    before = DRIVERS["cpu"], wp.config.enable_cpu_blocks
-    DRIVERS["cpu"], wp.config.enable_cpu_blocks = driver, True
-    try:
-        yield
-    finally:
-        DRIVERS["cpu"], wp.config.enable_cpu_blocks = before

@@ -26,7 +26,9 @@ def expose(
     """
     if falloff is not None:
         near, far = _Spread.apply(falloff, image.shape[:2])
-        square = _squared_radius(*image.shape[:2], image.device)
+        height, width = image.shape[:2]
+        y, x = (torch.arange(size, device=image.device) + 0.5 - 0.5 * size for size in (height, width))
+        square = ((y * y)[:, None] + x * x) / (0.25 * (height * height + width * width))
         image = (image + pivot) * (1.0 + (near + far * square) * square)[..., None] - pivot
     if kind == "bilateral":
         if numbers.requires_grad:  # no pixel that is not finite may spoil the cells
@@ -100,9 +102,3 @@ class _Spread(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, adj):
         return in_pairs(adj.flatten(1).T).to(adj.dtype).nan_to_num(0.0, 0.0, 0.0), None
-
-
-def _squared_radius(height: int, width: int, device: torch.device) -> torch.Tensor:
-    """Of each pixel from the middle, 1 at the corners of the image, [H, W]."""
-    y, x = (torch.arange(size, device=device) + 0.5 - 0.5 * size for size in (height, width))
-    return ((y * y)[:, None] + x * x) / (0.25 * (height * height + width * width))

@@ -1,11 +1,14 @@
-"""Whether photographs show a sky: directions above the horizon in which structure from motion found no point."""
+"""What points say of photographs: whether these show a sky, and how many of them show the same.
+
+A sky are directions above the horizon in which structure from motion found no point.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from warp_splat.camera import Camera
-from warp_splat.scene.types import visible
+from warp_splat.scene.types import Scene, visible
 
 CELLS = 24  # along the longer side of a photograph
 NEEDED = 0.015  # share from which on a sky is worth to learn; indoors plain walls make up to 0.010
@@ -38,3 +41,18 @@ def _sky(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
     right, down = (camera.rotation @ up)[:2]
     turns = (0 if down < 0 else 2) if abs(down) > abs(right) else (1 if right > 0 else 3)  # until up is up
     return np.rot90(np.logical_and.accumulate(np.rot90(sky, turns)), -turns)
+
+
+def few_photographs(scene: Scene, limit: int) -> tuple[bool, str]:
+    """Whether half of the points lie in fewer training photographs than ``limit``, and a sentence with the figure.
+
+    Hidden points count. They are not asked where the scene does not say which of them its photographs saw, since they
+    may be made up.
+    """
+    if not any(view.name in scene.tracks for view in scene.train):
+        return False, "the scene does not say which points its photographs saw"
+    points = scene.points.astype(np.float64)
+    shown = float(np.median(sum(visible(view.camera, points).astype(int) for view in scene.train)))
+    if shown >= len(scene.train):
+        return shown < limit, f"half of its points lie in all {len(scene.train)} photographs"
+    return shown < limit, f"half of its points lie in {shown:.0f} photographs or fewer"

@@ -14,8 +14,8 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import RenderOutput
 from warp_splat.runtime.timers import stage
-from warp_splat.scene.coverage import few_photographs
 from warp_splat.scene.depth_maps import nearest_of, read_inverse_depths
+from warp_splat.scene.horizon import few_photographs
 from warp_splat.scene.types import Scene, View, visible
 from warp_splat.training.optimizer import log_linear
 from warp_splat.training.parts import DepthOptions

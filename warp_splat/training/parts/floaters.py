@@ -3,7 +3,7 @@
 import torch
 
 from warp_splat.raster.data import Gaussians
-from warp_splat.scene.coverage import few_photographs
+from warp_splat.scene.horizon import few_photographs
 from warp_splat.scene.types import Scene
 from warp_splat.training.parts import FloatersOptions
 from warp_splat.training.seams import Setting, Verdict
