@@ -10,6 +10,7 @@ import sys
 import time
 from functools import partial
 
+import av
 import numpy as np
 import pycolmap
 import pytest
@@ -245,6 +246,20 @@ def test_the_sharpest_frame_of_each_span_is_taken(tmp_path):
     written = sample_frames(tmp_path / "clip.mp4", tmp_path / "frames", 6, 2, pytest.fail, shares.append)
     taken = sorted(int(re.search(r"\d+", path.name)[0]) for path in (tmp_path / "frames").iterdir())
     assert written == 6 and taken == sharp and shares == sorted(shares)
+
+
+@pytest.mark.parametrize(("keep", "said"), [(1.0, ""), (0.5, "pictures end after")])
+def test_a_video_that_is_cut_off_is_told(tmp_path, keep, said):
+    """Of Matroska the rest is a video, a shorter one."""
+    with av.open(str(tmp_path / "clip.mkv"), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25, width=64, height=64)
+        for frame in np.random.default_rng(0).integers(0, 256, (40, 64, 64, 3), np.uint8):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    data, told = (tmp_path / "clip.mkv").read_bytes(), []
+    (tmp_path / "clip.mkv").write_bytes(data[: int(keep * len(data))])
+    sample_frames(tmp_path / "clip.mkv", tmp_path, 2, 1, told.append, lambda share: None)
+    assert said in "".join(told) and len(told) == bool(said)
 
 
 @pytest.mark.slow

@@ -49,7 +49,11 @@ def sample_frames(
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: expected a video, found no video stream in it; give another file.")
-            total = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+            packets = (packet for packet in container.demux(container.streams.video[0]) if packet.size > 0)
+            ends = [((packet.pts or 0) + (packet.duration or 0)) * packet.time_base for packet in packets]
+            total, end, told = len(ends), float(max(ends, default=0)), (container.duration or 0) / av.time_base
+            if end < 0.9 * told:
+                report(f"warning: the video's pictures end after {end:.1f} of {told:.1f} s: is the file cut off?")
         with av.open(str(path)) as container:
             frames = enumerate(_decode(container, threads, damaged))
             span_of = lambda numbered: min(numbered[0] * count // max(total, 1), count - 1)  # noqa: E731
