@@ -12,10 +12,14 @@ import figures as f
 
 def _scaling() -> list[tuple]:
     records = f.data("blocks")["records"]
-    (street, street_after), (again, again_after), (ring, ring_after) = (
-        [[f.one(whole[place] - blocks[place]) for place in ("rest", "seams")] for whole, blocks in (four[:2], four[2:])]
-        for four in (records[:4], records[4:8], records[8:])
+    street, again, ring = (
+        [
+            [f"{whole[place] - blocks[place]:.2f}" for place in ("rest", "seams")]
+            for whole, blocks in zip(rows, others, strict=True)
+        ]
+        for rows, others in ((records[k : k + 8 : 2], records[k + 1 : k + 8 : 2]) for k in (0, 8, 16))
     )
+    after = lambda run: [pair[place] for place in (0, 1) for pair in run[1:]]  # noqa: E731
     on_eight, largest = (
         row for row in f.data("sharding_model")["rows"] if row["gaussians"] == 1000 and row["by"] == "a core"
     )
@@ -30,13 +34,14 @@ def _scaling() -> list[tuple]:
         ),
         (
             "street's blocks are {} dB behind away from the borders, and {} dB at them, with another seed {} and {}:",
-            *(*street, *again),
+            *(*street[0], *again[0]),
         ),
-        ("On fox they are {} and {} dB behind", *ring),
+        ("On fox they are {} and {} dB behind", *ring[0]),
         (
-            "behind: {} dB away from the borders and {} dB at them, of the undivided training with as many steps more, "
-            "with another seed {} and {}. On fox it is {} and {} dB:",
-            *(*street_after, *again_after, *ring_after),
+            "blocks are {}, {} and {} dB behind away from the borders and {}, {} and {} dB at them, of the undivided "
+            "training with as many steps more; with another seed {}, {} and {}, and {}, {} and {} dB. On fox it is {}, "
+            "{} and {}, and {}, {} and {} dB.",
+            *(*after(street), *after(again), *after(ring)),
         ),
         ("A billion takes {} GB on each of eight", f"{on_eight['held']:.0f}"),
     ]
