@@ -68,9 +68,6 @@ def measured(name: str, scenes: list[str], out: Path, more: bool) -> None:
     if facts.get("version") != target.version or "worst" not in facts:
         facts, _ = run_audit(renderer, name, target.degree, ())
         facts |= {"version": target.version, "settings": target.settings, "worst": ["", 0.0], "scenes": []}
-    if "camera" not in facts:
-        facts["camera"] = camera_error(renderer, target.degree)
-        write_json(file, facts)
     facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None]
     known = {row["scene"] for row in facts["scenes"]}
     left = tuple(scene for scene in scenes if scene not in known)
@@ -80,6 +77,9 @@ def measured(name: str, scenes: list[str], out: Path, more: bool) -> None:
             facts["worst"] = [row.scene, row.mean]
             save_png(out / "audit" / f"{name}.png", side_by_side(*row.pictures))
         facts["scenes"].append(row.record())
+        write_json(file, facts)
+    if "camera" not in facts:
+        facts["camera"] = camera_error(renderer, target.degree)
         write_json(file, facts)
     renderer.close()
 
@@ -121,6 +121,8 @@ def write_summary(out: Path) -> None:
         "same bits": "{same}",
         "camera, px": "{camera}",
         "failed": "{failed}",
+        "date": "{date}",
+        "settings": "{settings}",
     }
     note = f"Measured by `benchmarks/audit.py` on {records[0]['machine']}."
     write_text(out / "audit.md", f"{table_of(records, columns)}\n\n{note}\n")

@@ -54,7 +54,7 @@ OTHERS = {
         f"{FOLDER}/gsplat_js_padded.html", "gsplat@1.2.9", f"1,024 Gaussians without opacity added, {WEBGL}", 0
     ),
     "splat-transform": NamedRenderer(
-        "audit_targets.splat_transform:draw", "splat-transform@2.7.1", "a .webp by WebGPU in software"
+        "audit_targets.splat_transform:draw", "splat-transform@2.7.1", "a .webp by WebGPU in software (SwiftShader)"
     ),
     "gsplat-cuda": NamedRenderer("audit_targets.gsplat_cuda:draw", "gsplat", "rasterization"),
     "diff-gaussian": NamedRenderer("audit_targets.diff_gaussian:draw", "diff-gaussian-rasterization"),

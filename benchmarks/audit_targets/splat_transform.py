@@ -1,7 +1,8 @@
 """The renderer of splat-transform, a program of npm: pictures by WebGPU.
 
-Without a GPU it draws with SwiftShader, which Chromium brings along: ``VK_ICD_FILENAMES`` tells where
-``vk_swiftshader_icd.json`` is, and ``LD_LIBRARY_PATH`` where its libraries are.
+Without a GPU it draws with SwiftShader, which Chromium brings along, or with Mesa's lavapipe (25.0; 22.3 is refused):
+``VK_ICD_FILENAMES`` tells where ``vk_swiftshader_icd.json`` or ``lvp_icd.json`` is, ``LD_LIBRARY_PATH`` where the
+libraries are.
 """
 
 import shutil
