@@ -184,7 +184,7 @@ def check_background(background, device: torch.device) -> torch.Tensor:
     given = isinstance(background, torch.Tensor)
     if not given:
         try:
-            background = torch.tensor([float(value) for value in background], dtype=torch.float32)
+            background = torch.tensor([float(value) for value in background], dtype=torch.float32, device="cpu")
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"background: expected three numbers or a tensor [3], got {background!r:.80}.") from None
     if background.layout != torch.strided:
