@@ -25,7 +25,7 @@ WIDTH, HEIGHT = 1000, 600
 pytestmark = pytest.mark.slow  # half a minute each where WebGL runs in software
 #: The picture without viser's panel, its warning that WebGL runs in software, and its axes.
 CLEAR = np.ones((HEIGHT, WIDTH), bool)
-CLEAR[:, -340:] = CLEAR[:170, :320] = CLEAR[-80:, :80] = False
+CLEAR[:, -340:] = CLEAR[:210, :330] = CLEAR[-80:, :80] = False
 
 
 def eventually(condition):

@@ -14,7 +14,6 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels import simd
 from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
@@ -22,7 +21,24 @@ from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.project.image import parts_of_image
 from warp_splat.kernels.project.pieces import all_finite, offset, rotation, sized_or_one, taken_along, turned_or_not
-from warp_splat.kernels.simd import fill, fma, less, pick, times, vec16
+from warp_splat.kernels.simd import (
+    LANES,
+    TYPES,
+    equal,
+    fill,
+    fma,
+    inverse,
+    less,
+    pick,
+    real,
+    root,
+    rounded_down,
+    rounded_up,
+    some,
+    times,
+    vec16,
+    whole,
+)
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
@@ -43,8 +59,8 @@ for number in (float, vec16):
     @wp.func
     def covers_pixel(mean: number, extent: number, size: float):
         """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
-        first = wp.max(simd.rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
-        last = wp.min(simd.rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
+        first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
+        last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
         return fill(1.0, mean) - less(last, first)
 
     @wp.func_grad(covers_pixel)
@@ -64,14 +80,14 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     What Warp's adjoint finds for each is summed outside. Tried: a kernel for the coefficients alone, which takes as
     long again as projection and adjoint.
     """
-    number, integer, row2, row3, row4 = simd.TYPES[lanes]
+    number, integer, row2, row3, row4 = TYPES[lanes]
     turns = wp.array2d[row4] if expose else wp.array[row4]
 
     @wp.func
     def reaches(opacity: vec16, alpha_min: float):
         """``reach_of`` in every lane."""
         r = vec16()
-        for lane in range(simd.LANES):
+        for lane in range(LANES):
             r[lane] = reach_of(opacity[lane], alpha_min)
         return r
 
@@ -81,11 +97,11 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
         """Half sides of the box where alpha >= alpha_min, its farthest point's distance, rounded up [px]."""
         reach = reaches(opacity, alpha_min)
-        widest = (xx + yy + simd.root(fma(xx - yy, xx - yy, times(xy, xy) * 4.0))) * 0.5  # variance of the long axis
+        widest = (xx + yy + root(fma(xx - yy, xx - yy, times(xy, xy) * 4.0))) * 0.5  # variance of the long axis
         return (
-            simd.root(times(reach, xx)),
-            simd.root(times(reach, yy)),
-            wp.min(simd.rounded_up(simd.root(times(reach, widest))), fill(1.0e9, opacity)),
+            root(times(reach, xx)),
+            root(times(reach, yy)),
+            wp.min(rounded_up(root(times(reach, widest))), fill(1.0e9, opacity)),
         )
 
     @wp.func_grad(support)
@@ -128,8 +144,8 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         size = largest(qw, qx, qy, qz)
         valid = times(finite, less(zero, size))
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
-        here = times(valid, less(zero, simd.real(radii_out[g])))
-        radii_out[g] = simd.whole(valid - one)  # CULLED or INVALID
+        here = times(valid, less(zero, real(radii_out[g])))
+        radii_out[g] = whole(valid - one)  # CULLED or INVALID
         ox, oy, oz = offset(camera, here, mx, my, mz)
         if wp.static(expose is not None):
             ox, oy, oz, n00, n01, n02, n10, n11, n12, n20, n21, n22 = expose(camera, quats, g, ox, oy, oz)
@@ -138,9 +154,9 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         r22 = turn(camera, 2, 2, one)
         depth = fma(r20, ox, fma(r21, oy, times(r22, oz)))
         if wp.static(projection.wide):
-            depth = simd.root(fma(ox, ox, fma(oy, oy, times(oz, oz))))
+            depth = root(fma(ox, ox, fma(oy, oy, times(oz, oz))))
         here = times(here, less(fill(camera.near, one), depth))
-        if not simd.some(here):
+        if not some(here):
             return
         # harmless numbers take the place of those that are left out
         z = pick(here, depth, one)
@@ -158,17 +174,17 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         px, py, xx, xy, yy, det, opacity, here = image(
             camera, x, y, z, m00, m01, m02, m10, m11, m12, m20, m21, m22, sx, sy, sz, opacity, here
         )
-        bounded = simd.equal(times(det, zero), zero)  # else too large for float32 numbers, about 4e9 px
+        bounded = equal(times(det, zero), zero)  # else too large for float32 numbers, about 4e9 px
         code = valid - one - times(here, one - bounded)
-        radii_out[g] = simd.whole(code)
+        radii_out[g] = whole(code)
         here = times(times(here, bounded), one - less(opacity, fill(camera.alpha_min, one)))
         extent_x, extent_y, farthest = support(opacity, camera.alpha_min, xx, xy, yy)
         inside = times(covers_pixel(px, extent_x, camera.size[0]), covers_pixel(py, extent_y, camera.size[1]))
         here = times(here, inside)
-        if not simd.some(here):
+        if not some(here):
             return
         means2d_out[g] = rows(pick(here, px, zero), pick(here, py, zero))
-        per_det = simd.inverse(det)
+        per_det = inverse(det)
         conics_out[g] = rows(
             pick(here, times(yy, per_det), zero),
             pick(here, times(-xy, per_det), zero),
@@ -177,6 +193,6 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         opacities_out[g] = pick(here, opacity, zero)
         depths_out[g] = pick(here, depth, zero)
         extents_out[g] = rows(pick(here, extent_x, zero), pick(here, extent_y, zero))
-        radii_out[g] = simd.whole(pick(here, farthest, code))
+        radii_out[g] = whole(pick(here, farthest, code))
 
     return project
