@@ -113,7 +113,7 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys, fails):
     assert f"To continue after iteration {STOP}: warp-splat train --resume {folder}\n" in out
     checkpoint, model = load_checkpoint(folder), load_ply(ply_path(folder, STOP)).splats
     means = checkpoint.arrays["parameters.means"]
-    order = along_curve(torch.from_numpy(means)).numpy()  # that of the file
+    order = along_curve(torch.tensor(means)).numpy()  # that of the file
     assert np.array_equal(means[order], model.means)
     assert safetensors.numpy.load_file(folder / LAST)["parameters.scales"][order].tobytes() == model.scales.tobytes()
     named = folder / "chkpnt20.safetensors"

@@ -111,20 +111,21 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: M
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Read a checkpoint: a file, or that of a model folder.
+    """Read a checkpoint: a file, or that of a model folder. Arrays of Gaussians stay there, mapped and read-only.
 
     Raises:
         InputError: if there is none, or it is damaged, cut short, of a newer program, or something else.
     """
     path = find_checkpoint(path)
     with _opened(path) as file:
-        text, facts = _facts(file)
-        arrays = {}
-        for name in file.keys():
-            dtype = file.get_slice(name).get_dtype()
-            if dtype not in DTYPES:
-                raise Unexpected(f"an array of {dtype}")
-            arrays[name] = file.get_tensor(name)
+        (text, facts), content, arrays = _facts(file), np.memmap(path, np.uint8, "r"), {}
+        end = 8 + int.from_bytes(content[:8], "little")  # of the header; without gaps, arrays follow
+        for name in file.offset_keys():
+            kept = file.get_slice(name)
+            if kept.get_dtype() not in DTYPES:
+                raise Unexpected(f"an array of {kept.get_dtype()}")
+            found = np.ndarray(kept.get_shape(), DTYPES[kept.get_dtype()], content, end)
+            arrays[name], end = found if OF_GAUSSIANS.fullmatch(name) else found.copy(), end + found.nbytes
         if file.metadata().get("crc32") != _checksum(text, arrays):
             raise ValueError("its checksum does not match")
     return Checkpoint(path, arrays, facts)

@@ -14,7 +14,7 @@ import torch
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
-from warp_splat.gaussians import GaussianModel
+from warp_splat.gaussians import CHUNK, GaussianModel
 from warp_splat.training.adam_step import HALF, load_adam, move
 from warp_splat.training.options import LearnOptions
 
@@ -199,6 +199,13 @@ class Optimizer:
             return zeros_in_file(self.folder, shape, dtype)
         return torch.zeros(*shape, dtype=dtype, device=self.model.device)
 
+    def _copied(self, rows: np.ndarray) -> torch.Tensor:
+        """A table of ``rows``, which may lie in a file: a part after another, since memory may be short."""
+        found = self._zeros(rows.shape)
+        for start in range(0, len(rows), CHUNK):
+            found[start : start + CHUNK] = torch.tensor(rows[start : start + CHUNK])
+        return found
+
     def _taken(self, tensor: torch.Tensor, rows: torch.Tensor, more: int = 0) -> torch.Tensor:
         """The ``rows`` of a table, and zeros for some more."""
         found = self._zeros((len(rows) + more, *tensor.shape[1:]), tensor.dtype)
@@ -259,10 +266,8 @@ class Optimizer:
             shape = table.leaf.shape if name in self.parts else (count, *table.leaf.shape[1:])
             moments = MOMENTS if any(f"{moment}.{name}" in arrays for moment in MOMENTS) else ()
             gradients = ("gradients",) if f"gradients.{name}" in arrays else ()
-            found = {
-                kind: self._zeros(shape).copy_(torch.from_numpy(checkpoint.array(f"{kind}.{name}", shape)))
-                for kind in ("parameters", *gradients, *moments)
-            }
+            kinds = ("parameters", *gradients, *moments)
+            found = {kind: self._copied(checkpoint.array(f"{kind}.{name}", shape)) for kind in kinds}
             if name in self.parts:
                 table.leaf.detach().copy_(found["parameters"])  # the part knows this leaf
             else:

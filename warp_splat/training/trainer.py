@@ -270,7 +270,7 @@ class Trainer:
             restore(checkpoint)
         begun = checkpoint.count("degree") if "degree" in checkpoint.facts else 0  # unknown to older programs
         self.degree = min(begun, self.config.model.sh_degree)
-        self._radii = torch.from_numpy(checkpoint.array("radii", (len(self.model),), np.int32)).to(self.device)
+        self._radii = torch.tensor(checkpoint.array("radii", (len(self.model),), np.int32), device=self.device)
         self._set_iteration(checkpoint.count("iteration"))
 
     def _set_iteration(self, iteration: int) -> None:

@@ -95,7 +95,7 @@ class Reference:
         self.clear()
         for name, own in self.statistics().items():
             dtype = np.int32 if name == "radius" else np.float32
-            rows = torch.from_numpy(checkpoint.array(f"statistics.{name}", (-1, len(self.model)), dtype))
+            rows = torch.tensor(checkpoint.array(f"statistics.{name}", (-1, len(self.model)), dtype))
             own.copy_(self.processes.restored(rows, largest=name == "radius"))
         self.random.set_state(torch.from_numpy(checkpoint.generator("random.densification")))
 
