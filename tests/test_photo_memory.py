@@ -1,5 +1,8 @@
 """Photographs within a bound of memory: the same bytes of the model as with all of them in memory."""
 
+from collections import Counter
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from commands import train
@@ -13,6 +16,7 @@ from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import decoding, load_scene
 from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.embedded import embedded_scene
+from warp_splat.scene.types import View
 from warp_splat.training.photographs import Deck
 
 SIZE = 3 * 33 * 31  # bytes of a photograph
@@ -34,6 +38,23 @@ def test_a_bound_changes_no_byte(options, scene, bounded, tmp_path):
         steps(trainer, other, 36, lambda t=trainer: check_kept(t))
         check_same((trainer, other), whole)
     check_same(resumed(bounded[1], tmp_path / "resumed", (20, 36), then=scene, **options), whole)
+
+
+@pytest.mark.parametrize("fit", [10**9, 20])
+def test_what_does_not_fit_is_decoded_once_while_the_disk_has_room(scene, bounded, tmp_path, monkeypatch, fit):
+    """A header of 128 bytes is before each."""
+    room = 2 * fit * (SIZE + 128)
+    whole, decoded, pixels = stepped(scene, tmp_path, 2 * len(scene.train)), Counter(), View.pixels.fget
+    monkeypatch.setattr(View, "pixels", property(lambda view: decoded.update([view.name]) or pixels(view)))
+    trainer, run = begin(bounded[0], tmp_path, model_path=str(tmp_path))
+    file = trainer.photographs._file
+    monkeypatch.setattr(file, "_spared", room / 2)
+    taken = lambda _: SimpleNamespace(free=room - file._file.seek(0, 2))  # noqa: E731
+    monkeypatch.setattr("warp_splat.training.photographs.shutil.disk_usage", taken)
+    steps(trainer, run, 2 * len(scene.train))
+    check_same((trainer, run), whole)
+    once = sum(count == 1 for count in decoded.values())
+    assert once == min(fit, len(scene.train))
 
 
 def check_kept(trainer):

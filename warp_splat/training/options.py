@@ -149,7 +149,7 @@ class MachineOptions:
     device: str = machinery("auto", "where kernels run", choices=("auto", "cpu", "cuda"))
     data_device: str = machinery("cpu", "where the photographs are kept; cuda: if they fit", choices=("cpu", "cuda"))
     photo_memory: float = machinery(
-        0.0, "GiB for photographs; those that do not fit are decoded again; 0: a quarter of what is free"
+        0.0, "GiB for photographs; others wait on the disk, or are decoded again; 0: a quarter of what is free"
     )
     threads: int = machinery(0, "CPU threads of a process; 0: all cores, or its share (results do not depend on it)")
     shard: bool = machinery(False, "each process that torchrun starts holds a share of the Gaussians, not all of them")

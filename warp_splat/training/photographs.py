@@ -1,9 +1,16 @@
 """Which photograph a step sees; on its device and at its size, which may double from coarse to fine."""
 
+import math
+import os
 import random
+import shutil
+import tempfile
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +20,7 @@ from torch.nn import functional
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import Checkpoint
+from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.decoding import AHEAD, in_turn
 from warp_splat.scene.images import THREADS
@@ -21,6 +29,7 @@ from warp_splat.training.options import LearnOptions, TrainConfig
 
 SAMPLED = 12  # photographs whose frequencies are looked at
 DIGITS = 3  # of a share: the same on every processor
+ON_DISK = 0.5  # of the room on the disk, for photographs that do not fit in memory
 
 
 class Photograph(NamedTuple):
@@ -30,12 +39,47 @@ class Photograph(NamedTuple):
     alpha: torch.Tensor | None  # [H, W, 1] uint8, if it is needed
     mask: torch.Tensor | None  # [H, W, 1] uint8
 
+    @property
+    def nbytes(self) -> int:
+        """Of all planes."""
+        return sum(plane.nbytes for plane in self if plane is not None)
+
+    def each(self, change: Callable) -> "Photograph":
+        """With its planes changed."""
+        return Photograph(*(None if plane is None else change(plane) for plane in self))
+
+
+class PhotoFile:
+    """Photographs in a file without a name, as far as its disk has room: one is read sooner than decoded."""
+
+    def __init__(self, folder: Path):
+        self._file, self._lock, self._folder = tempfile.TemporaryFile(dir=folder, buffering=0), Lock(), folder
+        self._spared = (1 - ON_DISK) * shutil.disk_usage(folder).free
+        self._places: dict[tuple[View, int], tuple[int, list[bool]]] = {}  # where each begins, and what it has
+
+    def read(self, view: View, shrink: int) -> Photograph | None:
+        """On the host; None: it was not written."""
+        with self._lock:
+            if (place := self._places.get((view, shrink))) is None:
+                return None
+            self._file.seek(place[0])
+            return Photograph(*(torch.from_numpy(np.load(self._file)) if there else None for there in place[1]))
+
+    def write(self, view: View, shrink: int, made: Photograph) -> None:
+        """Keep it, if there is room."""
+        with self._lock, suppress(OSError):
+            if shutil.disk_usage(self._folder).free - made.nbytes >= self._spared:
+                begin = self._file.seek(0, os.SEEK_END)
+                for plane in filter(torch.is_tensor, made):
+                    np.save(self._file, plane.cpu().numpy())
+                self._places[view, shrink] = begin, [plane is not None for plane in made]
+
 
 class Photographs:
     """Those that were used, kept until their size changes; for a GPU, there or in page-locked memory of the host.
 
     Args:
-        config: says how coarse they are, and where they are kept.
+        config: says how coarse they are, where they are kept, and in which folder those that do not fit.
         scene: says how many may be kept.
         device: where they are compared.
         with_alpha: whether they bring their transparency along.
@@ -46,6 +90,8 @@ class Photographs:
         self.shares = shares_of_size(config.learn, scene.train)
         self.kept: dict[View, Photograph] = {}
         self._count, self._limit = len(scene.train), scene.memory.limit
+        folder = config.report.model_path
+        self._file = PhotoFile(prepare_folder(folder)) if folder and self._limit < math.inf else None
         self._size = 0  # bytes of those that are kept
         self._shrink = 1  # likewise
         self._pool = ThreadPoolExecutor(THREADS)
@@ -90,16 +136,19 @@ class Photographs:
                 coming = self._coming.pop((view, self._shrink), None)
                 self._read_ahead()
                 found = coming.result() if coming else self._made(view, self._shrink)
-            size = sum(plane.nbytes for plane in found if plane is not None)
-            if self._size + size <= self._limit:
-                self.kept[view], self._size = found, self._size + size
-        return camera, Photograph(*(None if p is None else p.to(self.device, non_blocking=True) for p in found))
+            if self._size + found.nbytes <= self._limit:
+                self.kept[view], self._size = found, self._size + found.nbytes
+        return camera, found.each(lambda plane: plane.to(self.device, non_blocking=True))
 
     def _made(self, view: View, shrink: int) -> Photograph:
-        """Decoded, and resized."""
-        (width, height), (image, alpha, mask) = _shrunk(view, shrink), view.pixels
-        planes = [image, *(None if p is None else p[..., None] for p in (alpha if self.with_alpha else None, mask))]
-        return Photograph(*(None if p is None else self._resized(p, height, width) for p in planes))
+        """Decoded and resized, or as it was then."""
+        if not self._file or (made := self._file.read(view, shrink)) is None:
+            (width, height), (image, alpha, mask) = _shrunk(view, shrink), view.pixels
+            planes = [image, *(None if p is None else p[..., None] for p in (alpha if self.with_alpha else None, mask))]
+            made = Photograph(*planes).each(lambda plane: self._resized(plane, height, width))
+            if self._file and self._size + made.nbytes > self._limit:
+                self._file.write(view, shrink, made)
+        return made if self.config.machine.data_device == self.device.type else made.each(torch.Tensor.pin_memory)
 
     def _resized(self, pixels: np.ndarray, height: int, width: int) -> torch.Tensor:
         kept = torch.from_numpy(pixels).to(self.config.machine.data_device)
@@ -107,7 +156,7 @@ class Photographs:
             planes = kept.permute(2, 0, 1)[None].float()
             means = functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
             kept = (means.round() if kept.dtype == torch.uint8 else means).to(kept.dtype).contiguous()
-        return kept if kept.device.type == self.device.type else kept.pin_memory()
+        return kept
 
 
 def _shrunk(view: View, shrink: int) -> tuple[int, int]:
