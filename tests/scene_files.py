@@ -90,15 +90,15 @@ def distorted_picture(distort, params, width, height, fx, fy, cx, cy):
     return np.rint(pattern(x, y) * 65535).astype(np.uint16)
 
 
-def check_ideal(view):
-    """A view shows the pattern as a pinhole would."""
+def check_ideal(view, error_most=0.52):
+    """A view shows the pattern as a pinhole would, within so many levels of 255; quantization alone gives 0.5."""
     camera = view.camera
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     ideal = pattern((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy) * 255
     assert view.image.shape == ideal.shape
     error = np.abs(view.image - ideal)
-    assert error[2:-2, 2:-2].max() < 0.6  # levels of 255; quantization alone gives 0.5
-    assert error.max() < 3  # the outermost pixels may lie half a pixel outside of the file
+    assert error[2:-2, 2:-2].max() < error_most
+    assert error.max() < error_most + 0.2  # the outermost pixels may lie half a pixel outside of the file
 
 
 def write_model(folder, names, camera=PINHOLE, points=POINTS, binary=False):

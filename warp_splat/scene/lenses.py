@@ -119,10 +119,13 @@ def _undistorted(lens: Calibration, size: tuple[int, int]) -> pycolmap.Camera:
         ) from error
 
 
-def sampling_of(lens: Calibration, size: tuple[int, int]) -> np.ndarray:
-    """Where in the distorted image each pixel of the undistorted one lies, for :func:`images.undistort`."""
-    pinhole = _undistorted(lens, size)
-    y, x = np.mgrid[-1 : pinhole.height + 1, -1 : pinhole.width + 1] + 0.5
-    rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
-    pixels = lens.load(*size).img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-    return pixels.astype(np.float32).reshape(*x.shape, 2)
+def sampling_of(lens: Calibration, size: tuple[int, int], pinhole: tuple[float, ...]) -> np.ndarray:
+    """Where in the distorted image each pixel of the undistorted one lies, for :func:`images.undistort`.
+
+    The file has ``size``; the ``pinhole`` is the other's width, height, fx, fy, cx, cy.
+    """
+    width, height, fx, fy, cx, cy = pinhole
+    y, x = np.mgrid[:height, :width] + 0.5
+    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], 2)
+    pixels = np.asarray(lens.load(*size).img_from_cam(rays.reshape(-1, 3)))
+    return (pixels / size).astype(np.float32).reshape(*x.shape, 2)
