@@ -78,7 +78,8 @@ def measure(scene: Path, memory: float) -> dict:
     launch.prepare("cpu", 1)
     loaded = load_scene(scene, memory=memory * 2**30 or 2**50)
     opened = time.perf_counter() - started
-    trainer = Trainer(loaded, TrainConfig(source_path=str(scene), device="cpu"))
+    where = {"source_path": str(scene), "model_path": str(scene.with_name("model"))}
+    trainer = Trainer(loaded, TrainConfig(device="cpu", **where))
     trainer.warm_up()
     seconds, threads, first = [], [], 0.0
     for iteration in range(1, STEPS + 1):

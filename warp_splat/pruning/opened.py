@@ -55,9 +55,11 @@ class Opened(Finished):
         """The views, of which only counts what Gaussians cover: photographs show what a crop left out, too."""
         draw, found = self.renderer(GaussianModel.from_splats(self.file.splats).to(device)), []
         for view in views:
-            cover = (draw(view.camera).alpha > COVERED).cpu().numpy()
-            if _masked(view, cover).mask.any():
-                read = partial(_masked, view, cover)
+            counts = (draw(view.camera).alpha > COVERED).cpu().numpy()
+            if view.mask is not None:
+                counts &= view.mask > 0
+            if counts.any():
+                read = partial(_masked, view, counts.astype(np.uint8))
                 found.append(replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True)))
         return found
 
@@ -76,10 +78,9 @@ class Opened(Finished):
         return {name: self.psnr(splats, some) for name, some in views.items() if some}
 
 
-def _masked(view: View, cover: np.ndarray) -> Decoded:
-    """A photograph that counts only where ``cover`` [H, W] says so."""
-    pixels = view.pixels
-    return pixels._replace(mask=(cover if pixels.mask is None else cover & (pixels.mask > 0)).astype(np.uint8))
+def _masked(view: View, mask: np.ndarray) -> Decoded:
+    """A photograph with another mask."""
+    return view.pixels._replace(mask=mask)
 
 
 def require_some(finished: Finished) -> None:
