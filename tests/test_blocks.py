@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import SCENE, interrupt, train
+from commands import SCENE, SHORT, interrupt, train
 from hostile import refusal, replace
 from scene_files import LENS, texture, write_image
 
@@ -129,7 +129,7 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
     assert found in fails("merge", tmp_path)
 
 
-def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, monkeypatch):
+def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, monkeypatch, fails):
     """Stopped within the second block, and gone on with; a block that has ended is not trained again."""
     put(trained, tmp_path, 0)
     (tmp_path / "0").rename(tmp_path / "1")
@@ -138,6 +138,9 @@ def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, 
         interrupt(patch, 10)
         assert train(tmp_path, *all_of_it) == 130
     assert "goes on with block 2/2" in capsys.readouterr().out
+    for other, found in {"--blocks 3": "block 1/3", "-w": "white_background True", "-r 2": "resolution 2"}.items():
+        words = ("train", "-s", SCENE, "-m", tmp_path, *SHORT, *all_of_it, *other.split())
+        assert f"1: expected a block with --{found}" in fails(*words)
     assert train(tmp_path, *all_of_it) == 0
     assert train(tmp_path / "alone", "--block", "2/2", *all_of_it[2:]) == 0
     settled = ("--settle_from_iter", "1", "--cooldown", "19", "--start_ply", str(tmp_path))

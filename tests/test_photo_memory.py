@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from commands import train
 from scene_files import texture, write_colmap, write_image
 from trainings import begin, check_same, resumed, stepped, steps
@@ -17,7 +18,7 @@ from warp_splat.scene import decoding, load_scene
 from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import View
-from warp_splat.training.photographs import Deck
+from warp_splat.training.photographs import Deck, PhotoFile, Photograph
 
 SIZE = 3 * 33 * 31  # bytes of a photograph
 
@@ -55,6 +56,21 @@ def test_what_does_not_fit_is_decoded_once_while_the_disk_has_room(scene, bounde
     check_same((trainer, run), whole)
     once = sum(count == 1 for count in decoded.values())
     assert once == min(fit, len(scene.train))
+
+
+def test_a_photograph_whose_end_finds_no_room_is_not_kept(tmp_path):
+    """And what is written after it is whole."""
+    file, random = PhotoFile(tmp_path), np.random.default_rng(0)
+    made = [Photograph(torch.tensor(random.integers(0, 255, (9, 7, 3), np.uint8)), None, None) for _ in range(6)]
+    raw = file._file
+    for index, each in enumerate(made):
+        cut = SimpleNamespace(seek=raw.seek, write=lambda content: raw.write(content[:150]))
+        file._file = cut if index % 2 else raw
+        file.write(each, 1, each)
+    file._file = raw
+    for index, each in enumerate(made):
+        found = file.read(each, 1)
+        assert found is None if index % 2 else torch.equal(found.image, each.image)
 
 
 def check_kept(trainer):

@@ -161,6 +161,16 @@ def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, 
     assert any(model in line for line in lines)
 
 
+def test_a_lamp_stays_where_it_is_when_linear_light_is_undistorted(tmp_path):
+    """No filter that rings reaches far around what is 100,000 times as bright."""
+    pixels = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    pixels[15:17, 20:23] = 65504.0
+    root = write_colmap(tmp_path, ["a.exr"], pixels, camera=f"SIMPLE_RADIAL {WIDTH} {HEIGHT} 40 22.5 17.25 -0.05")
+    image = load(root)[0].train[0].image
+    assert 0.5 * 65504 < image.max() <= 65504 and image.min() >= 0.5
+    assert np.count_nonzero(np.abs(image - 0.5).max(2) > 1e-6) <= 5 * 6
+
+
 @pytest.mark.parametrize("scale", [1, 2], ids=["same-size", "half-size"])
 def test_native_lenses_see_points_where_colmap_does(tmp_path, scale):
     params = (40, 44, 22.5, 17.25, -0.15, 0.04, 0.002, -0.003)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 from PIL import Image
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, reason_of
@@ -28,6 +28,7 @@ PIXELS_MOST = 200_000_000  # of a file: more than any camera has, and 2.4 GB onc
 CHANNELS_MOST = 32  # likewise: OpenImageIO decodes all of them
 FLOATS = (oiio.BASETYPE.HALF, oiio.BASETYPE.FLOAT, oiio.BASETYPE.DOUBLE)
 RATIO_MOST = 2**14  # of decoded to stored bytes: a black mask of one bit per pixel has half of it
+BRIGHTEST = 1e12  # more than any light; filters take sums
 PAD = 4  # px around what is undistorted, continued straight: splines end flat
 
 
@@ -127,8 +128,8 @@ def read_pixels(path: Path, background: float) -> LoadedImage:
     spec = file.spec()
     if spec.format.basetype == oiio.UINT8:
         pixels = _decoded(path, file, oiio.UINT8) * np.float32(1 / 255)  # as OpenImageIO, in half of the time
-    elif not np.isfinite(pixels := _decoded(path, file, oiio.FLOAT)).all():
-        raise _unreadable(path, "pixels that are NaN or infinite")
+    elif not (abs(pixels := _decoded(path, file, oiio.FLOAT)) < BRIGHTEST).all():
+        raise _unreadable(path, f"pixels that are NaN or beyond {BRIGHTEST:g}")
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
     linear = _is_linear(spec)
     if spec.alpha_channel < 0:
@@ -194,19 +195,26 @@ def read_numbers(path: Path) -> np.ndarray:
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
 
 
-def undistort(image: np.ndarray, sampling: np.ndarray) -> np.ndarray:
+def undistort(image: np.ndarray, sampling: np.ndarray, linear: bool) -> np.ndarray:
     """Resample ``image`` by cubic splines, in float64: the same bytes on every processor.
 
     Args:
         image: the image with its distortion, [H, W, C] float32.
         sampling: where in ``image`` each pixel of the result lies, as shares of its width and height, [h, w, 2].
+        linear: it is in linear light, where splines ring far around a lamp: stay within the pixels nearby.
 
     Returns:
         The resampled image, [h, w, C] float32.
     """
-    places = np.moveaxis(sampling * np.float64(image.shape[1::-1]) + (PAD - 0.5), 2, 0)[::-1]
-    planes = (np.pad(plane, PAD, "reflect", reflect_type="odd") for plane in np.moveaxis(image, 2, 0))
-    return np.stack([map_coordinates(plane, places, mode="reflect") for plane in planes], 2)
+    places, found = np.moveaxis(sampling * np.float64(image.shape[1::-1]) + (PAD - 0.5), 2, 0)[::-1], []
+    for plane in np.moveaxis(image, 2, 0).astype(np.float64):
+        padded = np.pad(plane, PAD, "reflect", reflect_type="odd")
+        pixels = map_coordinates(padded, places, mode="reflect")
+        if linear:
+            low, high = (nearby(padded, 3) for nearby in (minimum_filter, maximum_filter))
+            pixels = pixels.clip(*(map_coordinates(bound, places, order=0, mode="reflect") for bound in (low, high)))
+        found.append(pixels.astype(np.float32))
+    return np.stack(found, 2)
 
 
 def resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -226,7 +234,7 @@ def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: b
         return Decoded(plain, None, mask)
     pixels = read_pixels(photo.path, float(white_background))
     image = pixels.color if pixels.alpha is None else np.dstack([pixels.color, pixels.alpha])
-    image = _through_lens(image, photo, camera)
+    image = _through_lens(image, photo, camera, pixels.linear)
     color = np.maximum(image[..., :3], 0) if pixels.linear else _quantized(image[..., :3])
     return Decoded(color, None if pixels.alpha is None else _quantized(image[..., 3]), mask)
 
@@ -240,10 +248,10 @@ def read_counts(photo: Photo, camera: Camera, invert_masks: bool) -> np.ndarray 
     if photo.mask is None:
         return None
     counts = read_mask(photo.mask, read_size(photo.path), invert_masks)
-    return (_through_lens(counts[..., None], photo, camera)[..., 0] >= 0.5).astype(np.uint8)
+    return (_through_lens(counts[..., None], photo, camera, linear=False)[..., 0] >= 0.5).astype(np.uint8)
 
 
-def _through_lens(image: np.ndarray, photo: Photo, camera: Camera) -> np.ndarray:
+def _through_lens(image: np.ndarray, photo: Photo, camera: Camera, linear: bool) -> np.ndarray:
     """What ``camera`` sees of the photo's file [H, W, C] float32; undistorted last, where there are fewer pixels."""
     size = camera.width, camera.height
     if photo.sampling:
@@ -253,7 +261,7 @@ def _through_lens(image: np.ndarray, photo: Photo, camera: Camera) -> np.ndarray
     if photo.sampling is None:
         return image
     pinhole = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return undistort(image, photo.sampling(pinhole))
+    return undistort(image, photo.sampling(pinhole), linear)
 
 
 def _read_plain(path: Path, channels: tuple[int, ...], size: tuple[int, int] | None = None) -> np.ndarray | None:

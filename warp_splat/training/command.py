@@ -61,8 +61,10 @@ def _train_blocks(config: TrainConfig) -> int:
     if (folder / LAST).exists():
         raise InputError(f"{folder}: it already holds a training; choose another with -m.")
     opening.check_folder(config, folder)
-    say = opening.speaker(config.report.quiet)
-    for number in range(1, count + 1):
+    say, numbers = opening.speaker(config.report.quiet), range(1, count + 1)
+    for number in numbers:
+        opening.refuse_other_block(config.changed(blocks=0, block=f"{number}/{count}"), folder / str(number))
+    for number in numbers:
         place, block = folder / str(number), f"{number}/{count}"
         if (place / BLOCK).exists():
             say(f"Block {block}: trained to its end before, in {place}.")

@@ -27,6 +27,7 @@ from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
 from warp_splat.training.tensorboard import writer_class
 
 Say = Callable[[str], None]
+OF_SCENE = ("images", "resolution", "white_background", "eval", "invert_masks", "lens", "block")  # load_scene's options
 
 
 def speaker(quiet: bool) -> Say:
@@ -105,6 +106,21 @@ def check_folder(config: TrainConfig, folder: Path) -> None:
             raise InputError(f"-m {folder}: expected another folder than the scene's or its images'; choose a new one.")
 
 
+def refuse_other_block(config: TrainConfig, folder: Path) -> None:
+    """Raise InputError if the folder holds another block than ``config`` says, or one of another scene."""
+    if not (folder / "cfg_args").exists():
+        return
+    source = config.data.source_path
+    now = config.flat() | {"source_path": os.path.abspath(source or embedded_scene())}
+    before = now | model_folder.read_cfg_args(folder)
+    for name in (*OF_SCENE, "seed", *["source_path"] * (not config.data.sfm)):
+        if before[name] != now[name]:
+            raise InputError(
+                f"{folder}: expected a block with --{name} {now[name]}, as asked for, found one with {before[name]}; "
+                "choose another folder with -m, or give the options that it was begun with."
+            )
+
+
 def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
     """Raise InputError if the folder holds a training that does not go on from here."""
     continued = begun and begun.path.resolve() == (folder / LAST).resolve()
@@ -119,10 +135,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     if learn.coarse > 1 and learn.coarse_until_iter > learn.iterations:
         say(f"Warning: images reach their full size at --coarse_until_iter {learn.coarse_until_iter}, after the end.")
     start = data.start_ply if not begun or os.path.exists(data.start_ply) else ""  # if it has gone
-    same = {
-        name: getattr(data, name)
-        for name in ("images", "resolution", "white_background", "eval", "invert_masks", "lens", "block")
-    }
+    same = {name: getattr(data, name) for name in OF_SCENE}
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     if scene.random_points and not begun:

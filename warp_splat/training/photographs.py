@@ -1,5 +1,6 @@
 """Which photograph a step sees; on its device and at its size, which may double from coarse to fine."""
 
+import io
 import math
 import os
 import random
@@ -67,12 +68,14 @@ class PhotoFile:
 
     def write(self, view: View, shrink: int, made: Photograph) -> None:
         """Keep it, if there is room."""
+        content = io.BytesIO()
+        for plane in filter(torch.is_tensor, made):
+            np.save(content, plane.cpu().numpy())  # to a file, NumPy does not tell when the end is missing
         with self._lock, suppress(OSError):
             if shutil.disk_usage(self._folder).free - made.nbytes >= self._spared:
                 begin = self._file.seek(0, os.SEEK_END)
-                for plane in filter(torch.is_tensor, made):
-                    np.save(self._file, plane.cpu().numpy())
-                self._places[view, shrink] = begin, [plane is not None for plane in made]
+                if self._file.write(content.getbuffer()) == content.tell():
+                    self._places[view, shrink] = begin, [plane is not None for plane in made]
 
 
 class Photographs:
