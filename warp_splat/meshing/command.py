@@ -99,7 +99,7 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     cameras = [view.camera for view in opened.scene.train]
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
     if share * min(min(camera.width, camera.height) for camera in cameras) < LEAST:
-        raise InputError(f"--memory: views of {LEAST} px and more do not fit into {memory / 1e9:.2g} GB; raise it.")
+        raise InputError(f"--memory: views of {LEAST} px and more do not fit into half of it; raise it.")
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
         for camera in cameras:
