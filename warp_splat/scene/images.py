@@ -196,7 +196,7 @@ def read_numbers(path: Path) -> np.ndarray:
 
 
 def undistort(image: np.ndarray, sampling: np.ndarray, linear: bool) -> np.ndarray:
-    """Resample ``image`` by cubic splines, in float64: the same bytes on every processor.
+    """Resample ``image`` by cubic splines, in float64, whose rounding hardly ever reaches a byte.
 
     Args:
         image: the image with its distortion, [H, W, C] float32.
