@@ -140,7 +140,11 @@ def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, 
     assert "goes on with block 2/2" in capsys.readouterr().out
     for other, found in {"--blocks 3": "block 1/3", "-w": "white_background True", "-r 2": "resolution 2"}.items():
         words = ("train", "-s", SCENE, "-m", tmp_path, *SHORT, *all_of_it, *other.split())
-        assert f"1: expected a block with --{found}" in fails(*words)
+        assert f"1: expected a block of --{found}" in fails(*words)
+    options = tmp_path / "1" / "cfg_args"
+    options.write_text(options.read_text().replace(f"source_path='{SCENE}'", f"source_path='{tmp_path}'"))
+    assert "1: expected a block of --source_path" in fails("train", "-s", SCENE, "-m", tmp_path, *SHORT, *all_of_it)
+    options.write_text(options.read_text().replace(f"source_path='{tmp_path}'", "source_path='/on/another/machine'"))
     assert train(tmp_path, *all_of_it) == 0
     assert train(tmp_path / "alone", "--block", "2/2", *all_of_it[2:]) == 0
     settled = ("--settle_from_iter", "1", "--cooldown", "19", "--start_ply", str(tmp_path))

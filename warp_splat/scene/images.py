@@ -126,15 +126,14 @@ def read_pixels(path: Path, background: float) -> LoadedImage:
     """
     file = _open(path)
     spec = file.spec()
-    if spec.format.basetype == oiio.UINT8:
-        pixels = _decoded(path, file, oiio.UINT8) * np.float32(1 / 255)  # as OpenImageIO, in half of the time
-    elif not (abs(pixels := _decoded(path, file, oiio.FLOAT)) < BRIGHTEST).all():
-        raise _unreadable(path, f"pixels that are NaN or beyond {BRIGHTEST:g}")
+    kind, scale = (oiio.UINT8, 1 / 255) if spec.format.basetype == oiio.UINT8 else (oiio.FLOAT, 1.0)
+    pixels = _decoded(path, file, kind) * np.float32(scale)  # as OpenImageIO does with bytes, in half of the time
     color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    linear = _is_linear(spec)
+    linear, alpha = _is_linear(spec), pixels[..., spec.alpha_channel if spec.alpha_channel >= 0 else 0]
+    if kind == oiio.FLOAT and not ((abs(color) < BRIGHTEST).all() and np.isfinite(alpha).all()):
+        raise _unreadable(path, f"pixels that are NaN or beyond {BRIGHTEST:g}")
     if spec.alpha_channel < 0:
         return LoadedImage(color, None, linear)
-    alpha = pixels[..., spec.alpha_channel]
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha")
     color = (color * alpha[..., None] if straight else color) + (1 - alpha[..., None]) * np.float32(background)
     return LoadedImage(color, alpha if alpha.min() < 1 else None, linear)

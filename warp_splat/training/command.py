@@ -67,7 +67,7 @@ def _train_blocks(config: TrainConfig) -> int:
     for number in numbers:
         place, block = folder / str(number), f"{number}/{count}"
         if (place / BLOCK).exists():
-            say(f"Block {block}: trained to its end before, in {place}.")
+            say(f"Block {block}: trained to its end before, by the options of {place}/cfg_args.")
         elif code := _go_on(config, place, block=block, viewer=False, verify=""):
             print(f"The same command with -m {folder} goes on with block {block}.")
             return code

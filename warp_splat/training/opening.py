@@ -21,6 +21,7 @@ from warp_splat.scene import load_scene
 from warp_splat.scene.blocks import BLOCK
 from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
+from warp_splat.scene.photos import scene_of
 from warp_splat.scene.types import Scene
 from warp_splat.training.config_file import load_options, write_config
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
@@ -108,17 +109,17 @@ def check_folder(config: TrainConfig, folder: Path) -> None:
 
 def refuse_other_block(config: TrainConfig, folder: Path) -> None:
     """Raise InputError if the folder holds another block than ``config`` says, or one of another scene."""
-    if not (folder / "cfg_args").exists():
-        return
+    before = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() else {}
     source = config.data.source_path
-    now = config.flat() | {"source_path": os.path.abspath(source or embedded_scene())}
-    before = now | model_folder.read_cfg_args(folder)
-    for name in (*OF_SCENE, "seed", *["source_path"] * (not config.data.sfm)):
-        if before[name] != now[name]:
-            raise InputError(
-                f"{folder}: expected a block with --{name} {now[name]}, as asked for, found one with {before[name]}; "
-                "choose another folder with -m, or give the options that it was begun with."
-            )
+    source = str(scene_of(Path(source))) if config.data.sfm else source or embedded_scene()
+    now = config.flat() | {"source_path": source}
+    for name in (*OF_SCENE, "seed", "source_path", "start_ply"):
+        there, here = before.get(name, now[name]), now[name]
+        if name in ("source_path", "start_ply"):
+            there, here = (path and os.path.realpath(path) for path in (str(there), here))
+            there = there if not there or os.path.exists(there) else here  # it was moved, or trained elsewhere
+        if there != here:
+            raise InputError(f"{folder}: expected a block of --{name} {here}, found {there!r}; choose another with -m.")
 
 
 def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
