@@ -56,6 +56,8 @@ def camera_error(renderer: Renderer, degree: int) -> list[float]:
         near = [np.maximum(abs(x - a), abs(y - b)) < 8 for a, b in places]
         shares = [np.linalg.lstsq(images[part], seen[part], rcond=None)[0] for part in near]
         found.append([share[1:] / share[0] for share in shares])
+    if not found:
+        return []
     offsets, noise = np.mean(found, 0), np.std(found, 0) / np.sqrt(len(found))
     worst = np.unravel_index(np.abs(offsets).argmax(), offsets.shape)
     return [float(np.abs(offsets[worst])), float(noise[worst])]
