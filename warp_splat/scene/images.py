@@ -264,7 +264,7 @@ def _through_lens(image: np.ndarray, photo: Photo, camera: Camera, linear: bool)
 
 
 def _read_plain(path: Path, channels: tuple[int, ...], size: tuple[int, int] | None = None) -> np.ndarray | None:
-    """The bytes of a file that are its colors, if it has that size: a fourth of the time (19 instead of 88 ms)."""
+    """The bytes of a file that are its colors, if it has that size: they need no filter."""
     file = _open(path)
     spec = file.spec()
     if size not in (None, (spec.height, spec.width)) or spec.nchannels not in channels or _is_linear(spec):
