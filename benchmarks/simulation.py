@@ -5,16 +5,17 @@ delivered, and in its mode QUALITY. The difference to the float64 renderer is th
 Gaussians cover a pixel wholly, because Newton draws others as if they did. Warp launches on one thread of a CPU, so one
 row has ours on one. Two minutes.
 
-    python benchmarks/simulation.py [--worlds 64] [--out docs/benchmarks]
+    python benchmarks/simulation.py [--worlds 64] [--device cuda] [--out docs/benchmarks]
 """
 
 import time
+from functools import partial
 
 import newton
 import numpy as np
 import torch
 import warp as wp
-from common import option, parse, write_table
+from common import option, parse, synchronize, write_table
 from newton.sensors import SensorCamera
 
 from warp_splat.camera import Camera
@@ -45,7 +46,7 @@ def ball(count: int, size: float, seed: int) -> newton.Gaussian:
     return newton.Gaussian(rng.normal(0, size, (count, 3)), quats, scales, opacities, colors)
 
 
-def worlds_of(count: int):
+def worlds_of(count: int, device: str):
     """A model of so many worlds, and the Gaussians of one of them."""
     body, shared = ball(300, 0.25, 1), ball(2_000, 0.8, 2)
     world, scene = newton.ModelBuilder(), newton.ModelBuilder()
@@ -55,7 +56,7 @@ def worlds_of(count: int):
     world.add_shape_gaussian(number, gaussian=body)
     scene.add_shape_gaussian(-1, gaussian=shared)
     scene.replicate(world, count)
-    return scene.finalize(device="cpu"), (shared, body)
+    return scene.finalize(device=device), (shared, body)
 
 
 def exact_view(parts: tuple) -> Render:
@@ -79,9 +80,12 @@ def place_all(sensor: SensorSplatCamera, state: newton.State, eyes: wp.array) ->
 
 
 def main() -> None:
-    arguments = parse(__doc__, option("--worlds", type=int, default=64))
-    prepare("cpu", 0)
-    model, parts = worlds_of(arguments.worlds)
+    where = option("--device", choices=("cpu", "cuda"), default="cpu")
+    arguments = parse(__doc__, option("--worlds", type=int, default=64), where)
+    device = arguments.device
+    prepare(device, 0)
+    wp.set_device(device)
+    model, parts = worlds_of(arguments.worlds, device)
     state, eyes = model.state(), wp.array([EYE] * arguments.worlds, dtype=wp.transform)
     shape = (arguments.worlds, SIDE, SIDE)
     ours, theirs = (wp.zeros(shape, dtype=wp.vec3) for _ in range(2))
@@ -94,17 +98,19 @@ def main() -> None:
         sensor.update(state, eyes, camera, rgb_image=ours)
 
     cores = pool.get_threads()
+    ways = {f"ours, {cores} threads": cores, "ours, 1 thread": 1} if device == "cpu" else {"ours": 1}
     runs = {
-        f"ours, {cores} threads": lambda: draw(cores),
-        "ours, 1 thread": lambda: draw(1),
+        **{name: partial(draw, threads) for name, threads in ways.items()},
         "Newton's": lambda: own.update(state, eyes, rays, hdr_color_image=theirs),
         "Newton's, QUALITY": lambda: own.update(state, eyes, rays, hdr_color_image=theirs, render_config=quality),
     }
     times, shown = {name: [] for name in runs}, {}
     for _ in range(CALLS + 1):
         for name, run in runs.items():
+            synchronize(device)
             begun = time.perf_counter()
             run()
+            synchronize(device)
             times[name].append(time.perf_counter() - begun)
             shown[name] = ours.numpy()[0].copy() if "ours" in name else to_srgb(theirs.numpy()[0].clip(0, 1), np.where)
     exact, records = exact_view(parts), []
@@ -115,7 +121,9 @@ def main() -> None:
         records.append(row | {"mean": apart.mean(), "covered": apart[covered].mean()})
     note = f"{arguments.worlds} worlds, a view of {SIDE} x {SIDE} each, wall time, the best of {CALLS} calls. "
     note += f"Gaussians cover {covered.mean():.0%} of the pixels wholly."
-    write_table("simulation", arguments.out, COLUMNS, records, note)
+    write_table("simulation" if device == "cpu" else "simulation_cuda", arguments.out, COLUMNS, records, note)
+    if device != "cpu":
+        return
     spent = []  # of one thread, without what else runs on the machine
     for work in (lambda: draw(1), lambda: place_all(sensor, state, eyes)):
         begun = time.thread_time()

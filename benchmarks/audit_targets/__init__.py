@@ -4,6 +4,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from warp_splat.config import ADJOINTS
+
 
 class NamedRenderer(NamedTuple):
     """How a renderer is called, and what it claims."""
@@ -56,6 +58,10 @@ OTHERS = {
     "splat-transform": NamedRenderer(
         "audit_targets.splat_transform:draw", "splat-transform@2.7.1", "a .webp by WebGPU in software (SwiftShader)"
     ),
+    **{
+        f"{mode}-cuda": NamedRenderer(f"audit_targets.own_cuda:{mode}", settings=f"adjoint {mode}, on a GPU")
+        for mode in ADJOINTS
+    },
     "gsplat-cuda": NamedRenderer("audit_targets.gsplat_cuda:draw", "gsplat", "rasterization"),
     "diff-gaussian": NamedRenderer("audit_targets.diff_gaussian:draw", "diff-gaussian-rasterization"),
     "fvdb": NamedRenderer("audit_targets.fvdb_cuda:draw", "fvdb-core", "render_images"),
