@@ -32,7 +32,7 @@ def noise(place: int, key: int, like: float) -> int:
 def noise(place: int, key: int, like: vec16) -> vec16i: ...
 
 
-@wp.func_native("unsigned x = (unsigned)half << 16; float r; __builtin_memcpy(&r, &x, 4); return r;")
+@wp.func_native("unsigned x = (unsigned)half << 16; float r; memcpy(&r, &x, 4); return r;")
 def widened(half: wp.uint16) -> float:
     """In 32 bits."""
 
@@ -51,8 +51,7 @@ for number in (float, vec16):
 
 
 @wp.func_native(
-    "unsigned x; __builtin_memcpy(&x, &value, 4); "
-    "return (unsigned short)((x + (((unsigned)bits >> shift) & 65535u)) >> 16);"
+    "unsigned x; memcpy(&x, &value, 4); return (unsigned short)((x + (((unsigned)bits >> shift) & 65535u)) >> 16);"
 )
 def rounded(value: float, bits: int, shift: int) -> wp.uint16:
     """In 16 bits, by 16 random ``bits`` from ``shift`` on; what they hold exactly stays."""
