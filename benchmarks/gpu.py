@@ -125,9 +125,10 @@ def run_checked(results: Results, what: str, command: Sequence, limit: float = n
     except subprocess.TimeoutExpired:
         results.add("Left out", [(what, "not finished")])
         return
-    results.judge(
-        what, f"{done.stdout[-1500:]}{done.stderr[-500:]}" if done.returncode else "no errors", not done.returncode
-    )
+    if done.returncode:
+        print(done.stdout[-3000:], done.stderr[-1000:])
+    said = (done.stdout.strip() or done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
+    results.judge(what, said if done.returncode else "no errors", not done.returncode)
 
 
 def check_by_sanitizer(results: Results) -> None:

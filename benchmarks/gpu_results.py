@@ -106,5 +106,7 @@ class Results:
         for line in done.stdout.splitlines():
             if line.startswith(ROWS):
                 self.add(*json.loads(line.removeprefix(ROWS)))
+            else:
+                print(line)
         if done.returncode:
             self.judge(what, (done.stderr.strip().splitlines() or ["no word"])[-1], False)

@@ -32,9 +32,15 @@ def train(folder, *options):
     return main(["train", "-s", str(SCENE), "-m", str(folder), *SHORT, *options])
 
 
-def python(*words, check=True, **environment):
+def environment_of(path=ROOT, **more):
+    """Of a process of Python that looks for modules in ``path`` first."""
+    paths = [str(path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), **more}
+
+
+def python(*words, check=True, path=ROOT, **environment):
     """A process of Python that has ended: what it said, and its exit code."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    environment = environment_of(path, **environment)
     options = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True, "timeout": 600}
     done = subprocess.run([sys.executable, *map(str, words)], check=False, **options)
     assert not (check and done.returncode), done.stderr
@@ -44,7 +50,7 @@ def python(*words, check=True, **environment):
 def started(*words, **pipes):
     """A process of Python that runs, with pipes for what it says."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT, **pipes}
-    return subprocess.Popen([sys.executable, *map(str, words)], env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes)
+    return subprocess.Popen([sys.executable, *map(str, words)], env=environment_of(), **pipes)
 
 
 def interrupt(monkeypatch, iteration):

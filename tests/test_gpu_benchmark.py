@@ -91,6 +91,13 @@ def test_steps_of_training_are_those_of_the_cpu(kinds):
         assert (others[name] - gradient).norm() < 1e-5 * gradient.norm(), name
 
 
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_program_that_fails_says_so_in_its_last_line(stream, capsys):
+    results, code = gpu.Results(None, "cpu", seconds=60), f"import sys; print('FAILED a\\n1 failed', file=sys.{stream})"
+    gpu.run_checked(results, "tests", [sys.executable, "-c", f"{code}; raise SystemExit(1)"])
+    assert results.tables == {"Checks": [("tests", "WRONG: 1 failed")]} and "FAILED a" in capsys.readouterr().out
+
+
 def test_rows_survive_what_comes_after_them(tmp_path, capsys):
     results = gpu.Results(tmp_path, "cpu", seconds=60)
 
@@ -167,7 +174,7 @@ def test_lines_of_ncu():
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.long)])
 def test_dry_run(device, tmp_path):
     """All of it, at small sizes: on a GPU that is pretended, or with its kernels in fibers."""
-    python("benchmarks/gpu.py", "--device", device, "--dry", "--out", tmp_path, PYTHONPATH=PRETENDING[device])
+    python("benchmarks/gpu.py", "--device", device, "--dry", "--out", tmp_path, path=PRETENDING[device])
     found = json.loads((tmp_path / "gpu.json").read_text())
     tables = found["tables"]
     assert set(tables) == set(gpu_results.HEADERS) - {"Left out", "Kernels of a step", "Kernels by ncu"} or (

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 
 import psutil
 import pytest
-from commands import ROOT, SCENE, python
+from commands import ROOT, SCENE, environment_of, python
 from test_sharding import GROWTHS, SCHEDULE, train
 
 from warp_splat.errors import InputError
@@ -69,7 +69,7 @@ class Host:
         words += ["--nnodes", "2", "--nproc-per-node", "2", "--local-addr", f"10.77.0.{self.number}"]
         words += ["--rdzv-conf", f"is_host={self.number == 1}"]  # its name is that of both
         words += ["--rdzv-backend", "c10d", "--rdzv-endpoint", "10.77.0.1:29400", str(ROOT / "train.py"), "--shard"]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "GLOO_SOCKET_IFNAME": self.cable}
+        environment = environment_of(GLOO_SOCKET_IFNAME=self.cable)
         self.log = folder.with_name(f"host{self.number}.txt")
         with self.log.open("w") as log:
             pipes = {"stdout": log, "stderr": log, "env": environment}

@@ -20,7 +20,7 @@ WAITING = {"profile": {"runtime/timers.py:_now"}}
 
 def ran(folder, names=()):
     """What became of each command."""
-    done = python(HERE / "pretended_runs.py", folder, *names, check=False, PYTHONPATH=PRETENDING)
+    done = python(HERE / "pretended_runs.py", folder, *names, check=False, path=PRETENDING)
     lines = [json.loads(line.removeprefix("ran ")) for line in done.stdout.splitlines() if line.startswith("ran ")]
     assert lines and not done.returncode, done.stderr
     return {line["name"]: line for line in lines}
