@@ -217,7 +217,7 @@ def test_channels_cross_the_seam(device):
     torch.testing.assert_close(out.features, colors.image, rtol=0, atol=1e-5)
     assert out.strongest.max() < len(scene.means) and (out.strongest[:, [0, -1]] >= 0).any()
     out.features.sum().backward()
-    assert features.grad.sum() == pytest.approx(3 * float(out.alpha.sum()), rel=1e-4)
+    assert float(features.grad.sum()) == pytest.approx(3 * float(out.alpha.sum()), rel=1e-4)
 
 
 @pytest.mark.parametrize(

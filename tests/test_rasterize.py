@@ -120,7 +120,8 @@ def check_culling(out, expected, camera, options):
 def relative_error(gradient, expected):
     """L2 of the difference over L2 of the truth; a truth of zero asks for (almost) zero."""
     assert gradient is not None and gradient.shape == expected.shape
-    return ((gradient.cpu().double() - expected.double()).norm() / expected.double().norm().clamp_min(1e-6)).item()
+    gradient, expected = gradient.cpu().double(), expected.cpu().double()
+    return ((gradient - expected).norm() / expected.norm().clamp_min(1e-6)).item()
 
 
 def check_gradients(gradients, expected):

@@ -194,7 +194,8 @@ SCENE = scenes.cloud(0, 6, scenes.make_camera(20, 18), degree=1)
 
 def call(device, **changed):
     """Rasterize a good scene with some arguments changed."""
-    arguments = {name: getattr(SCENE, name).to(device) for name in PARAMETERS} | {"camera": SCENE.camera}
+    arguments = {name: getattr(SCENE, name).to(device) for name in (*PARAMETERS, "background")}
+    arguments["camera"] = SCENE.camera
     for name, change in changed.items():
         arguments[name] = change(arguments.get(name)) if callable(change) else change
     return warp_splat.rasterize(**arguments)
@@ -242,8 +243,8 @@ SHAPES = [
     ("means", lambda t: t.to_sparse(), "dense"),
     ("sh", lambda t: t.to_sparse(), "dense"),
     ("background", lambda _: (0, 0), "2"),
-    ("background", lambda _: torch.zeros(4), "4"),
-    ("background", lambda _: torch.zeros(1, 3), "1, 3"),
+    ("background", lambda t: t.new_zeros(4), "4"),
+    ("background", lambda t: t[None], "1, 3"),
 ]
 KINDS = [
     (name, change, found)
@@ -267,7 +268,7 @@ NUMBERS = [
         for name in PARAMETERS
         for value in (math.nan, math.inf, -math.inf)
     ),
-    *(("background", lambda _, v=v: torch.tensor([0, v, 0]), FINITE) for v in (math.nan, math.inf, -math.inf)),
+    *(("background", put(value, 1), FINITE) for value in (math.nan, math.inf, -math.inf)),
 ]
 OTHERS = [
     ("camera", SCENE.camera.resized(10**6, 10**6), "expected at most .* pixels, got 1000000 x 1000000"),
@@ -299,9 +300,12 @@ def test_number_and_device_of_one_that_differs(name, device):
     with pytest.raises(InputError, match=r"(?s)(means|quats|scales|opacities|sh).*5") as error:
         call(device, **{name: lambda t: t[:5]})
     assert "6" in str(error.value) and (name == "means" or name in str(error.value))
-    with pytest.raises(InputError, match=rf"(?s){name}.*meta") as error:
-        call(device, **{name: lambda t: t.to("meta")})
-    assert str(device).split(":", maxsplit=1)[0] in str(error.value)
+    refusal(lambda: call(device, **{name: lambda t: t.to("meta")}), match=rf"{name}: .* got one on meta; .*\.cpu\(\)")
+    if torch.cuda.is_available():
+        other = "cuda" if device == "cpu" else "cpu"
+        means, first, found = (other, "quats", device) if name == "means" else (device, name, other)
+        said = rf"{first}: expected a tensor on {means}.*, as the means, got one on {found}"
+        refusal(lambda: call(device, **{name: lambda t: t.to(other)}), match=said)
 
 
 def test_ends_of_the_ranges_are_good(device):
