@@ -165,7 +165,8 @@ def test_the_first_call_of_a_process_finds_warp_initialized(code):
 def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
     calls = []
     monkeypatch.setattr(launch, "_stream", lambda device: f"stream of {device}")
-    monkeypatch.setattr(wp, "launch", lambda kernel, **options: calls.append(options))
+    named = lambda dim, inputs, outputs, **more: {"dim": dim, "inputs": inputs, "outputs": outputs, **more}  # noqa: E731
+    monkeypatch.setattr(wp, "launch", lambda kernel, *given, **more: calls.append(named(*given, **more)))
     monkeypatch.setattr(wp, "launch_tiled", lambda kernel, **options: calls.append(options))
     launch.launch(add_index, 9000, ["in"], ["out"], bounds=[0, 4000, 9000], device=torch.device("cuda", 1))
     launch.launch(add_index, 7, ["in"], ["out"], device="cuda", adj_inputs=["grad"], adj_outputs=["up"])

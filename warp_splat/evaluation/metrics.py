@@ -78,7 +78,9 @@ def cc_psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = 
     corrected = colors
     for _ in range(ROUNDS):
         used = (usable & _unsaturated(corrected)).T
-        changes = [_least_squares(terms[rows], column[rows]) for rows, column in zip(used, difference.T, strict=True)]
+        pairs = [(terms[rows], column[rows]) for rows, column in zip(used, difference.T, strict=True)]
+        # the smallest weights: gray images leave some of them open
+        changes = [np.linalg.lstsq(some.T @ some, some.T @ aim, rcond=1e-12)[0] for some, aim in pairs]
         corrected = np.clip(colors + terms @ np.column_stack(changes), 0.0, 1.0)
     return _decibels((corrected - wanted) ** 2)
 
@@ -90,11 +92,6 @@ def _decibels(squares: np.ndarray) -> float:
 
 def _unsaturated(values: np.ndarray) -> np.ndarray:
     return (values >= SATURATED) & (values <= 1.0 - SATURATED)
-
-
-def _least_squares(terms: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """The smallest weights of ``terms`` [M, 4]: gray images leave some of them open."""
-    return np.linalg.lstsq(terms.T @ terms, terms.T @ wanted, rcond=1e-12)[0]
 
 
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]  # of an image, its reference, a mask as for psnr

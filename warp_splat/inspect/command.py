@@ -48,8 +48,9 @@ def inspect(config: InspectConfig) -> int:
     findings.sort(key=lambda finding: list(COLORS).index(finding.level))
     verdict = _verdict(findings)
     write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))
+    shown = "\033[{1}m{0:7s}\033[0m" if sys.stdout.isatty() else "{0:7s}"
     for finding in findings:
-        print(f"{_colored(finding.level)}  {finding.check:13s} {finding.text}")
+        print(f"{shown.format(finding.level, COLORS[finding.level])}  {finding.check:13s} {finding.text}")
     print(f"{source}: {verdict} ({time.perf_counter() - started:.1f} s)\n  page {page}")
     return int(any(finding.level == "error" for finding in findings))
 
@@ -60,7 +61,3 @@ def _verdict(findings: list[Finding]) -> str:
     if not parts:
         return "nothing wrong was found."
     return f"{' and '.join(parts)}; {'training would fail or be useless' if counts['error'] else 'training will work'}."
-
-
-def _colored(level: str) -> str:
-    return f"\033[{COLORS[level]}m{level:7s}\033[0m" if sys.stdout.isatty() else f"{level:7s}"

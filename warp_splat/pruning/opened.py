@@ -20,7 +20,7 @@ from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
-from warp_splat.scene.types import Decoded, Stored, View
+from warp_splat.scene.types import Stored, View
 
 COVERED = 0.9  # of a pixel's light, from which on Gaussians of a crop explain it
 
@@ -59,7 +59,7 @@ class Opened(Finished):
             if view.mask is not None:
                 counts &= view.mask > 0
             if counts.any():
-                read = partial(_masked, view, counts.astype(np.uint8))
+                read = partial(lambda view, mask: view.pixels._replace(mask=mask), view, counts.astype(np.uint8))
                 found.append(replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True)))
         return found
 
@@ -76,11 +76,6 @@ class Opened(Finished):
         """PSNR [dB] of the training views and, if there are any, of those held out."""
         views = {"train": self.scene.train, "test": self.scene.test}
         return {name: self.psnr(splats, some) for name, some in views.items() if some}
-
-
-def _masked(view: View, mask: np.ndarray) -> Decoded:
-    """A photograph with another mask."""
-    return view.pixels._replace(mask=mask)
 
 
 def require_some(finished: Finished) -> None:

@@ -75,15 +75,12 @@ def bent(
         shrunk = np.where(beyond, limit * z / np.sqrt(np.where(beyond, across, 1.0)), 1.0)
         x, y, excess = shrunk * x, shrunk * y, 1.0 / shrunk
     variables = [
-        Number(notes, number.name, _unit(axis, one.name) if linear else ()) for axis, number in enumerate((x, y, z))
+        Number(notes, number.name, tuple(one.name if axis == other else None for other in range(3)) if linear else ())
+        for axis, number in enumerate((x, y, z))
     ]
     indices = range(family.count)
     coefficients = [notes.element(f"coefficients[g, {i}]") if learned else notes.of_lens(i) for i in indices]
     return family.formula(coefficients, *variables), excess, seen
-
-
-def _unit(axis: int, one: str | None) -> tuple[str | None, ...]:
-    return tuple(one if axis == other else None for other in range(3))
 
 
 @functools.cache
