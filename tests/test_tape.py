@@ -56,8 +56,8 @@ def by_torch(device, mode="manual", options=None):
     scene, intrinsics, weights = scene_of(device)
     leaves = [tensor.clone().requires_grad_() for tensor in (scene.means / 2, *scene.parameters()[1:])]
     background = scene.background.clone().requires_grad_()
-    numbers = {"dtype": torch.float64, "device": device, "requires_grad": True}
-    learned = [torch.tensor(values, **numbers) for values in (TWIST, intrinsics)]
+    numbers = [torch.tensor(values, dtype=torch.float64, device=device) for values in (TWIST, intrinsics)]
+    learned = [tensor.requires_grad_() for tensor in numbers]
     camera = CameraParameters(scene.camera, *learned)
     out = warp_splat.rasterize(2.0 * leaves[0], *leaves[1:], camera, background, mode, options)
     torch.autograd.backward([out.image, out.alpha], [weights[..., :3].contiguous(), weights[..., 3].contiguous()])
@@ -71,9 +71,10 @@ def on_tape(device, mode="manual", options=None, requires_grad=True):
     given = {name: getattr(scene, name) for name in KINDS} | {"means": scene.means / 2}
     arrays = [wp.from_torch(given[name].clone(), KINDS[name], requires_grad=requires_grad) for name in KINDS]
     arrays.append(wp.from_torch(scene.background.clone(), requires_grad=requires_grad))
-    numbers = {"dtype": wp.float64, "device": device, "requires_grad": requires_grad}
-    arrays += [wp.array(values, **numbers) for values in (TWIST, intrinsics)]
-    loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
+    for values in (TWIST, intrinsics):
+        numbers = torch.tensor(values, dtype=torch.float64, device=device)
+        arrays.append(wp.from_torch(numbers, requires_grad=requires_grad))
+    loss = wp.from_torch(torch.zeros(1, device=device), requires_grad=True)
     with wp.Tape() as recorded:
         means = wp.empty_like(arrays[0], requires_grad=True)
         wp.launch(twice, len(means), [arrays[0], means], device=device)
