@@ -146,7 +146,8 @@ def _launch_geometry(
     for part in [slice(0, whole)] + [slice(whole, count)] * (whole < count):
         rows, kernel = -(-(part.stop - part.start) // lanes) * lanes, it.kernel
         given, made, adj_given, adj_made = (
-            [filled_up(tensor[part], rows) for tensor in table] for table in (inputs, outputs, adj_inputs, adj_outputs)
+            [filled_up(tensor if whole == count else tensor[part], rows) for tensor in table]
+            for table in (inputs, outputs, adj_inputs, adj_outputs)
         )
         arrays, adj_arrays = [it.cam, *arrays_of(types_in, given)], [it.cam, *arrays_of(types_in, adj_given)]
         if it.bend and adj_inputs:

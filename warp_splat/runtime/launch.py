@@ -223,8 +223,8 @@ def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
 
 def arrays_of(types: Sequence[type], tensors: Sequence[torch.Tensor]) -> list:
     """Dense tensors as arrays of these types, as many numbers in each element as its type has."""
-    pairs = zip(tensors, types, strict=False)
-    return [view(tensor.view(-1, *getattr(dtype, "_shape_", ())), dtype) for tensor, dtype in pairs]
+    given = [(tensor, getattr(dtype, "_shape_", ()), dtype) for tensor, dtype in zip(tensors, types, strict=False)]
+    return [view(t if t.shape[1:] == inner else t.view(-1, *inner), dtype) for t, inner, dtype in given]
 
 
 def load(kernel: wp.Kernel, device: torch.device) -> None:
