@@ -70,6 +70,8 @@ def modules() -> dict[str, wp.Module]:
         "loss": compare_block.module,
         "adam": make_adam_by_number(False).module,
         "adam, sparse": make_adam_by_number(True).module,
+        "adam, halves": make_adam_by_number(False, True).module,
+        "adam, sparse halves": make_adam_by_number(True, True).module,
         "map of colors": make_map_colors(1).module,
         "adjoint of the map": make_adj_map_colors(1).module,
         "environment": make_put_behind(1).module,

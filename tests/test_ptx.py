@@ -16,7 +16,7 @@ from ptx import execute
 from scenes import FISHEYE, OPENCV
 from test_binning import crowded
 from test_cuda_on_host import CASES, adjoint_of, check_memory, differentiate, small, sum_magnitudes
-from test_densify import steps, tables_of
+from test_densify import HALF, steps, tables_of
 from test_sky import made
 
 from warp_splat import Camera, CameraParameters, RasterOptions
@@ -86,8 +86,8 @@ def sum_rows(*widths: int) -> None:
     CUDA.gather(bins, slots, [torch.zeros(40, width) for width in widths])
 
 
-def adam(named: dict[int, int], sparse: bool) -> None:
-    tables = tables_of(203, torch.float32)
+def adam(named: dict[int, int], sparse: bool, kind: torch.dtype = torch.float32) -> None:
+    tables = tables_of(203, kind)
     named |= {tensor.data_ptr(): tensor.nbytes for table in tables for tensor in table}
     steps(tables, 1, torch.arange(203, dtype=torch.int32) % 3 if sparse else None)
 
@@ -116,6 +116,8 @@ RUNS: dict[str, Callable[[dict], None]] = {
     "sums, channels": lambda _: sum_rows(*cubins.WIDTHS[:3], cubins.CHANNEL_WIDTHS[-1]),
     "adam": lambda named: adam(named, False),
     "adam, sparse": lambda named: adam(named, True),
+    "adam, halves": lambda named: adam(named, False, HALF),
+    "adam, sparse halves": lambda named: adam(named, True, HALF),
 }
 IN_THE_GATE = ("manual", "loss", "adam")
 
