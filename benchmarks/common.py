@@ -105,7 +105,9 @@ def write_table(
     measured = {**({"headers": headers, "rows": rows} if data is None else data), "machine": machine()}
     if out:
         out.mkdir(parents=True, exist_ok=True)
-        (out / f"{name}.md").write_text(f"{table}\n\n{note} Measured by `benchmarks/{name}.py` on {machine()}.\n")
+        (out / f"{name}.md").write_text(
+            f"{table}\n\n{note} Measured by `benchmarks/{name.removesuffix('_cuda')}.py` on {machine()}.\n"
+        )
         (out / f"{name}.json").write_text(json.dumps(measured, indent=1) + "\n")
 
 

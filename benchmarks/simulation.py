@@ -121,9 +121,11 @@ def main() -> None:
         records.append(row | {"mean": apart.mean(), "covered": apart[covered].mean()})
     note = f"{arguments.worlds} worlds, a view of {SIDE} x {SIDE} each, wall time, the best of {CALLS} calls. "
     note += f"Gaussians cover {covered.mean():.0%} of the pixels wholly."
-    write_table("simulation" if device == "cpu" else "simulation_cuda", arguments.out, COLUMNS, records, note)
-    if device != "cpu":
+    if device == "cuda":
+        note += f" On {torch.cuda.get_device_name()}."
+        write_table("simulation_cuda", arguments.out, COLUMNS, records, note)
         return
+    write_table("simulation", arguments.out, COLUMNS, records, note)
     spent = []  # of one thread, without what else runs on the machine
     for work in (lambda: draw(1), lambda: place_all(sensor, state, eyes)):
         begun = time.thread_time()

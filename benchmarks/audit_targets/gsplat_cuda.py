@@ -1,6 +1,6 @@
 """gsplat's ``rasterization``.
 
-It was written from what the package documents, and waits for a GPU.
+It was written from what the package documents. On a GPU it ran with ``packed``, and refused.
 """
 
 import torch
@@ -15,5 +15,6 @@ if not torch.cuda.is_available():
 def draw(means, quats, scales, opacities, sh, camera, background):
     viewmat, k = (matrix[None].cuda() for matrix in matrices_of(camera))
     given = (tensor.cuda() for tensor in (means, quats, scales, opacities, sh))
-    settings = {"sh_degree": int(sh.shape[1] ** 0.5) - 1, "backgrounds": background[None].cuda()}
+    # packed, its default, refuses a background
+    settings = {"sh_degree": int(sh.shape[1] ** 0.5) - 1, "backgrounds": background[None].cuda(), "packed": False}
     return rasterization(*given, viewmat, k, camera.width, camera.height, **settings)[0][0]
