@@ -39,6 +39,26 @@ def quoted(name: str, pattern: str) -> list[str]:
     return list(re.search(pattern, text(name)).groups())
 
 
+def on_card(table: str, size: str = "", count: int = 0, **more: str) -> list[dict]:
+    """Rows of a table of gpu.json, of a size and a number of Gaussians, if these are given."""
+    wanted = {**({"size": size} if size else {}), **({"Gaussians": count} if count else {}), **more}
+    return [row for row in data("gpu")["tables"][table] if wanted.items() <= row.items()]
+
+
+def off_on_card() -> tuple[str, str]:
+    """The largest errors of an image and of a gradient against the CPU, over all modes and cases."""
+    found = {row["check"]: [] for row in on_card("Checks") if row["check"].endswith("against the CPU")}
+    for row in on_card("Checks"):
+        found.get(row["check"], []).append(row["found"])
+    of = lambda image: max((v for k, s in found.items() if (": image" in k) == image for v in s), key=float)  # noqa: E731
+    return of(True), of(False)
+
+
+def thousands(shown: str) -> str:
+    """10,631."""
+    return f"{round(float(shown)):,}"
+
+
 def compared_on() -> str:
     """The machine of ``warp-splat compare``."""
     return quoted("compare/compare.txt", r"Measured on (.*), 2 threads")[0]

@@ -272,7 +272,48 @@ def _cameras() -> list[tuple]:
 
 
 def _cuda() -> list[tuple]:
+    million = ("980 x 545", 1_000_000)
+    small, large = (f.on_card("Training step", size, count)[0] for size, count in (("64 x 64", 100), million))
+    modes = f.on_card("Adjoints: time and memory", *million)
+    ours, theirs = f.on_card("Beside gsplat", *million)
+    ways = [row["sum ms"] for row in f.on_card("Slots against atomics")]
+    errors = [row for row in f.on_card("Adjoints: error against time", scene=f.MANY) if row["variant"] in f.MODES]
+    shares = [row["share"].rstrip(" %") for row in f.on_card("Longest tile")]
+    adjoint_of_colors, adjoint_of_blend, adam = (
+        next(row for row in f.on_card("Kernels by ncu") if word in row["kernel"])
+        for word in ("adj_shade", "adj_blend", "adam")
+    )
+    own, other = (f.data("simulation_cuda")["rows"][place][2] for place in (0, 1))
     return [
+        ("the image is the CPU's within {}, the gradients within {},", *f.off_on_card()),
+        (
+            "A step of 100 Gaussians on 64 x 64 px takes {} ms, and its kernels {} ms. With a million on 980 x 545 px "
+            "it takes {} ms, its kernels {} ms.",
+            *(row[what] for row in (small, large) for what in ("step ms", "kernels ms")),
+        ),
+        (
+            "`manual` {} ms, `stepwise` {}, `reversible` {}, `stored` {} with {} MiB instead of {}.",
+            *(row["forward + backward ms"] for row in modes),
+            *(modes[place]["peak MiB"] for place in (3, 0)),
+        ),
+        ("at most {} of float64's", max((row["error"] for row in errors), key=float)),
+        ("which draws {} pictures a second without it", round(float(f.on_card("Orbit")[0]["frames per second"]))),
+        (
+            "forward {} ms, gsplat {}; both passes {}, gsplat {}. That was",
+            *(row[what] for what in ("forward ms", "forward + backward ms") for row in (ours, theirs)),
+        ),
+        (
+            "take {} ms for the ball, atomic additions {}; for the crowd {} and {}. So",
+            *(f.two(float(way)) for way in ways),
+        ),
+        (
+            "the first to mend: {} ms, at {} % of the card's bandwidth",
+            *(f.two(float(adjoint_of_colors["ms"])), adjoint_of_colors["% of bandwidth"]),
+        ),
+        ("The adjoint of the blend takes {} ms;", f.two(float(adjoint_of_blend["ms"]))),
+        ("its longest tile, alone, {} % of the time of all. Adam reaches {} % of", shares[0], adam["% of bandwidth"]),
+        ("the longest tile of the ball takes {} % of the adjoint's time, that of the crowd {} %;", *shares),
+        ("it draws {} pictures a second, where Newton's own sensor draws {} ([table]", *map(f.thousands, (own, other))),
         ("the blend has {} registers and", f.registers("blend")[0]),
         ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),
         (
