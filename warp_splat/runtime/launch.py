@@ -268,11 +268,11 @@ def view(tensor: torch.Tensor, dtype):
 
     In half of the time of ``wp.from_torch``; a step asks for over a hundred of these.
     """
-    shape, inner, size = tensor.shape, getattr(dtype, "_shape_", ()), tensor.element_size()
+    shape, strides, size, inner = tensor.shape, tensor.stride(), tensor.element_size(), getattr(dtype, "_shape_", ())
     dims = len(shape) - len(inner)
-    if dims < 1 or shape[dims:] != inner:  # it says what is wrong
+    if dims < 1 or shape[dims:] != inner or strides[dims:] not in ((), (*inner[1:], 1)):  # it says what is wrong
         return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
-    array = _Array(tensor.data_ptr(), 0, dims, shape, [size * stride for stride in tensor.stride()])
+    array = _Array(tensor.data_ptr(), 0, dims, shape, [size * stride for stride in strides])
     array._ref = tensor  # a copy, say, that nobody else has
     return array
 
