@@ -26,9 +26,11 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.raster.data import falloff_of, variant_of
 from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.project import projection_of
+from warp_splat.runtime import pool
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
+pool.SMALLEST_SLICE = 256  # so that threads share small scenes, too
 # Tests start dozens of processes: what one has compiled of torch serves the next.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
 from warp_splat.raster.differences import INPUTS
 from warp_splat.raster.project import Project
-from warp_splat.runtime import launch
 
 FINITE = "twist: expected finite numbers, of which the rotation vector"
 NO_COEFFICIENTS = "coefficients: expected None for a camera"
@@ -51,8 +50,7 @@ def test_a_turn_is_that_of_scipy(angle):
 
 
 @pytest.mark.parametrize("kind", ["pinhole", "lens", "shutter"])
-def test_any_number_of_threads(kind, monkeypatch, same_by_threads):
-    monkeypatch.setattr(launch, "SMALLEST_SLICE", 32)
+def test_any_number_of_threads(kind, same_by_threads):
     scene = scenes.cloud(0, 1003, scenes.make_camera(64, 48), degree=1)
     more = {"pinhole": {}, "lens": {"lens": SCENES["opencv"]().camera.lens}, "shutter": {"shutter": SHUTTER}}[kind]
     scene, weight = replace(scene, camera=replace(scene.camera, **more)), torch.rand(48, 64, 3)

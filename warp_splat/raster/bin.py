@@ -17,7 +17,7 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.runtime.launch import check_memory, empty, launch, read_later, view
-from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, get_threads, in_slices, torch_slices
+from warp_splat.runtime.pool import even_slices, in_slices, slice_count, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
@@ -49,8 +49,7 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, 
     spans, counts = empty(_last(row_ends), wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, _boxes(options)]
     groups = -(-count // LANES)
-    bounds = even_slices(groups, SMALLEST_SLICE // LANES)
-    launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=bounds)
+    launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=even_slices(groups, each=LANES))
     place_ends, begins = _sums(counts)
     _check_count(_last(place_ends), camera, count, splats2d.radii.device)
     instances, places, ends = _sort_by_tile(
@@ -236,7 +235,7 @@ def _check_longest(count: int) -> None:
 def balanced_slices(ends: np.ndarray) -> list[int]:
     """Bounds of slices of tiles with about the same number of instances; an empty tile counts a little, too."""
     work = ends + 32 * np.arange(1, len(ends) + 1)
-    parts = SLICES_PER_THREAD * get_threads() if get_threads() > 1 else 1
+    parts = slice_count(int(work[-1]), SLICES_PER_THREAD)
     inner = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
     return [0, *inner.tolist(), len(ends)]
 

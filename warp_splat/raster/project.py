@@ -28,7 +28,7 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct, view
-from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_all, torch_slices
+from warp_splat.runtime.pool import even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
 
 
@@ -184,8 +184,7 @@ def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
 def _launch_groups(kernel: wp.Kernel, lanes: int, count: int, inputs, outputs, device, **adjoint) -> None:
     """Launch a kernel for groups of ``lanes`` on ``count`` Gaussians."""
     groups = -(-count // lanes)
-    bounds = even_slices(groups, SMALLEST_SLICE // lanes)
-    launch(kernel, groups, inputs, outputs, bounds=bounds, device=device, **adjoint)
+    launch(kernel, groups, inputs, outputs, bounds=even_slices(groups, each=lanes), device=device, **adjoint)
 
 
 class Project(torch.autograd.Function):

@@ -22,7 +22,7 @@ import warp as wp
 from warp_splat.errors import InputError
 from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
-from warp_splat.runtime.pool import SMALLEST_SLICE, even_slices, in_slices, set_threads
+from warp_splat.runtime.pool import even_slices, in_slices, set_threads
 
 #: Else Warp leaves assembling to newer drivers; benchmarks/cubins.py looks at what its own assembler makes.
 wp.config.cuda_output = wp.config.cuda_output or "cubin"
@@ -171,7 +171,7 @@ def launch_in_lanes(
     found = torch.empty(rows_of_sums, columns, dtype=torch.float32, device=device)
     for size, rows, runs in parts:
         if runs:
-            bounds = even_slices(runs, max(SMALLEST_SLICE // (size * run), 1))
+            bounds = even_slices(runs, each=size * run)
             given, made = ([_in_lanes(t, TYPES[size], count, rows) for t in tables] for tables in (inputs, outputs))
             if sums:
                 made.append(view(found[done : done + runs], sums[1]))

@@ -17,7 +17,7 @@ from warp_splat.config import CORES
 from warp_splat.errors import InputError
 
 MOST_THREADS = 1024
-SMALLEST_SLICE = 1024  # indices; below, starting a thread costs more than it saves
+SMALLEST_SLICE = 4096  # indices, or tile instances; below, starting a thread costs more than it saves
 SMALLEST_OF_TORCH = 2**16  # likewise, of rows for torch, which takes less time and more of the interpreter's lock
 WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
 
@@ -135,9 +135,14 @@ def set_threads(count: int) -> None:
     _threads = int(count)
 
 
-def even_slices(dim: int, smallest: int = SMALLEST_SLICE) -> list[int]:
-    """Bounds of one slice per thread of ``dim`` equal pieces of work, none much below ``smallest``."""
-    parts = max(1, min(_threads, dim // smallest))
+def slice_count(work: int, shares: int = 1, smallest: int = 0) -> int:
+    """In how many slices to cut ``work`` indices: ``shares`` for each thread, none much below ``smallest``."""
+    return max(1, min(shares * _threads if _threads > 1 else 1, work // (smallest or SMALLEST_SLICE)))
+
+
+def even_slices(dim: int, smallest: int = 0, each: int = 1) -> list[int]:
+    """Bounds of one slice per thread of ``dim`` equal pieces of work, of ``each`` indices."""
+    parts = slice_count(dim * each, smallest=smallest)
     return [dim * part // parts for part in range(parts + 1)]
 
 
