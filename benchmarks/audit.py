@@ -116,6 +116,8 @@ def summary(facts: dict) -> dict:
 def write_summary(out: Path) -> None:
     files = [out / "audit" / f"{name}.json" for name in ALL]
     records = [summary(json.loads(path.read_text())) for path in files if path.exists()]
+    if not records:
+        raise SystemExit("Nothing was measured, here or before.")
     columns = {
         "target": "{target}",
         "version": "{version}",
@@ -143,6 +145,8 @@ def main() -> None:
     parser.add_argument("--more", action="store_true", help="keep what was measured of the same version, add the rest")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
+    if unknown := [name for name in arguments.targets if name not in ALL]:
+        parser.error(f"expected targets among {', '.join(ALL)}, found {', '.join(unknown)}")
     for name in arguments.targets:
         measured(name, arguments.scenes, arguments.out, arguments.more)
     write_summary(arguments.out)

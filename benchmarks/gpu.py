@@ -75,7 +75,7 @@ def check(results: Results, device: str, case: tuple[int, int, int], expected: d
 def check_mode(results: Results, device: str, mode: str, case: tuple[int, int, int], expected: dict) -> None:
     first, second = (differentiate(*case, device, mode) for _ in range(2))
     same = all(map(torch.equal, first, second))
-    results.judge(f"{mode}: two runs", "the same bits" if same else "differ", same)
+    results.judge(f"{mode}: two runs, {case[0]} Gaussians", "the same bits" if same else "differ", same)
     found = dict(zip(NAMES, first, strict=True))
     for name, truth in expected.items():
         difference = found[name] - truth
@@ -85,7 +85,7 @@ def check_mode(results: Results, device: str, mode: str, case: tuple[int, int, i
             size = difference.abs().amax(2)
             error, share = float(size.max()), float((size > LIMIT).float().mean())
             right = error < DECISION and share < RARE
-        results.judge(f"{mode}: {name} against the CPU", f"{error:.1e}", right)
+        results.judge(f"{mode}: {name} against the CPU, {case[0]} Gaussians", f"{error:.1e}", right)
 
 
 def expectation(file: Path | None, case: tuple[int, int, int]) -> dict[str, torch.Tensor]:

@@ -21,6 +21,7 @@ from newton.sensors import SensorCamera
 from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
 from warp_splat.compare.oracle import Render, exact_render
+from warp_splat.errors import InputError
 from warp_splat.newton import SensorSplatCamera, camera_of_fov
 from warp_splat.runtime import pool
 from warp_splat.runtime.launch import prepare
@@ -83,7 +84,10 @@ def main() -> None:
     where = option("--device", choices=("cpu", "cuda"), default="cpu")
     arguments = parse(__doc__, option("--worlds", type=int, default=64), where)
     device = arguments.device
-    prepare(device, 0)
+    try:
+        prepare(device, 0)
+    except InputError as error:
+        raise SystemExit(str(error)) from None
     wp.set_device(device)
     model, parts = worlds_of(arguments.worlds, device)
     state, eyes = model.state(), wp.array([EYE] * arguments.worlds, dtype=wp.transform)

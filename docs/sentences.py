@@ -299,7 +299,7 @@ def _cuda() -> list[tuple]:
         ("at most {} of float64's", max((row["error"] for row in errors), key=float)),
         ("which draws {} pictures a second without it", round(float(f.on_card("Orbit")[0]["frames per second"]))),
         (
-            "forward {} ms, gsplat {}; both passes {}, gsplat {}. That was",
+            "forward {} ms, gsplat {}; both passes {}, gsplat {}. What",
             *(row[what] for what in ("forward ms", "forward + backward ms") for row in (ours, theirs)),
         ),
         (
@@ -313,7 +313,10 @@ def _cuda() -> list[tuple]:
         ("The adjoint of the blend takes {} ms;", f.two(float(adjoint_of_blend["ms"]))),
         ("its longest tile, alone, {} % of the time of all. Adam reaches {} % of", shares[0], adam["% of bandwidth"]),
         ("the longest tile of the ball takes {} % of the adjoint's time, that of the crowd {} %;", *shares),
-        ("it draws {} pictures a second, where Newton's own sensor draws {} ([table]", *map(f.thousands, (own, other))),
+        (
+            "it draws {} pictures a second (after the first change), where Newton's own sensor draws {} ([table]",
+            *map(f.thousands, (own, other)),
+        ),
         ("the blend has {} registers and", f.registers("blend")[0]),
         ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),
         (

@@ -126,7 +126,7 @@ def test_a_device_that_errs_is_found(wrong):
     results = gpu.Results(None, "cpu", seconds=60)
     gpu.check(results, "cpu", case, expected)
     assert len(results.tables["Checks"]) == 4 * (1 + len(gpu.NAMES))
-    assert results.wrong == [f"{mode}: {wrong} against the CPU" for mode in ADJOINTS if wrong]
+    assert results.wrong == [f"{mode}: {wrong} against the CPU, 300 Gaussians" for mode in ADJOINTS if wrong]
     assert sum(found.startswith("WRONG") for _, found in results.tables["Checks"]) == len(results.wrong)
 
 

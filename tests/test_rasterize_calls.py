@@ -13,6 +13,7 @@ from common import using
 from hostile import refusal
 from scenes import PARAMETERS, SCENES
 from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, relative_error, run, truth
+from torch.utils.checkpoint import checkpoint
 
 import warp_splat
 from warp_splat import InputError, RasterOptions
@@ -314,6 +315,22 @@ def test_ends_of_the_ranges_are_good(device):
     assert not call(device, opacities=lambda t: t.clone().fill_(0)).alpha.any()
     rounded, exact = (call(device, opacities=lambda t, value=value: t.clone().fill_(value)) for value in (1.0000001, 1))
     assert torch.allclose(rounded.image, exact.image, atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_forgotten_between_the_passes(mode, device):
+    """By torch's checkpoints, which render again for the adjoint and let it read what was kept but once."""
+    leaves = [getattr(SCENE, name).detach().to(device).requires_grad_() for name in PARAMETERS]
+    draw = lambda *given: warp_splat.rasterize(*given, SCENE.camera, adjoint=mode).image  # noqa: E731
+    images = draw(*leaves), checkpoint(draw, *leaves, use_reentrant=False)
+    found = [torch.autograd.grad(image.square().sum(), leaves) for image in images]
+    assert all(map(torch.equal, *found))
+
+
+@pytest.mark.parametrize("name", [*PARAMETERS, "background"])
+def test_signs_that_torch_has_not_written_yet(name, device):
+    plain, lazy = call(device), call(device, **{name: lambda t: torch._neg_view(-t)})
+    assert torch.equal(plain.image, lazy.image)
 
 
 @pytest.mark.parametrize(

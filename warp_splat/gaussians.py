@@ -55,7 +55,7 @@ class Activate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *adj_outputs):
-        outputs = [torch.empty_like(tensor) for tensor in ctx.saved_tensors]
+        outputs = [adj.new_empty(adj.shape) for adj in adj_outputs]
         _launch_activation(make_adj_activate, [*ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs)], outputs)
         return tuple(outputs)
 

@@ -9,7 +9,7 @@ from gsplat import rasterization
 from audit_targets.own import matrices_of
 
 if not torch.cuda.is_available():
-    raise ImportError("it needs CUDA, and there is no such device")
+    raise ImportError("no CUDA device, which it needs")
 
 
 def draw(means, quats, scales, opacities, sh, camera, background):

@@ -7,7 +7,7 @@ import torch
 from audit_targets import own
 
 if not torch.cuda.is_available():
-    raise ImportError("it needs CUDA, and there is no such device")
+    raise ImportError("no CUDA device, which it needs")
 
 
 def _on_gpu(draw, *given):

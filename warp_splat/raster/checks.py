@@ -196,7 +196,7 @@ def check_background(background, device: torch.device) -> torch.Tensor:
             f"background: expected three finite numbers (a tensor: float32 [3]), got {background.dtype} "
             f"{list(background.shape)}: {background.tolist()}."
         )
-    return background if given else send(background, device)
+    return _dense(background) if given else send(background, device)
 
 
 def check_opacities(opacities: torch.Tensor) -> None:
@@ -216,7 +216,7 @@ def _dense(tensor: torch.Tensor) -> torch.Tensor:
     """Row after row, as kernels read it; here, so that several views share the copy."""
     if tensor.numel() == 0:  # which torch calls contiguous, whatever its strides
         return tensor.clone(memory_format=torch.contiguous_format)
-    return tensor.contiguous()
+    return tensor.contiguous().resolve_neg()
 
 
 def _check_finite(name: str, tensor: torch.Tensor) -> None:

@@ -215,9 +215,9 @@ class Project(torch.autograd.Function):
     def backward(ctx, *adj_outputs):
         with stage("adjoint of project"):
             it: Projecting = ctx.it
-            given = Gaussians(*ctx.saved_tensors[: len(Gaussians._fields)])
-            splats = Splats2D(*ctx.saved_tensors[len(given) : -4])
-            twist, intrinsics, last_twist, coefficients = ctx.saved_tensors[-4:]
+            *saved, twist, intrinsics, last_twist, coefficients = ctx.saved_tensors  # once: checkpoints forbid more
+            given = Gaussians(*saved[: len(Gaussians._fields)])
+            splats = Splats2D(*saved[len(given) :])
             wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
             wants_pose = wants_twist or wants_last
             adj_splats = [

@@ -269,7 +269,7 @@ def view(tensor: torch.Tensor, dtype):
     In half of the time of ``wp.from_torch``; a step asks for over a hundred of these.
     """
     shape, strides, size, inner = tensor.shape, tensor.stride(), tensor.element_size(), getattr(dtype, "_shape_", ())
-    dims = len(shape) - len(inner)
+    dims = len(shape) - len(inner) if ctypes.sizeof(dtype._type_) == size else 0
     if dims < 1 or shape[dims:] != inner or strides[dims:] not in ((), (*inner[1:], 1)):  # it says what is wrong
         return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     array = _Array(tensor.data_ptr(), 0, dims, shape, [size * stride for stride in strides])
