@@ -310,11 +310,17 @@ def _cuda() -> list[tuple]:
             "the first to mend: {} ms, at {} % of the card's bandwidth",
             *(f.two(float(adjoint_of_colors["ms"])), adjoint_of_colors["% of bandwidth"]),
         ),
-        ("The adjoint of the blend takes {} ms;", f.two(float(adjoint_of_blend["ms"]))),
-        ("its longest tile, alone, {} % of the time of all. Adam reaches {} % of", shares[0], adam["% of bandwidth"]),
+        ("The adjoint of the blend takes {} ms by ncu", f.two(float(adjoint_of_blend["ms"]))),
+        (
+            "By events it is {} ms, and the longest tile, alone, takes {} % of that. Adam reaches {} % of",
+            f.two(float(f.on_card("Longest tile")[0]["adjoint ms"])),
+            shares[0],
+            adam["% of bandwidth"],
+        ),
         ("the longest tile of the ball takes {} % of the adjoint's time, that of the crowd {} %;", *shares),
         (
-            "it draws {} pictures a second (after the first change), where Newton's own sensor draws {} ([table]",
+            "it draws {} pictures a second (after the first of the two changes), where Newton's own sensor "
+            "draws {} ([table]",
             *map(f.thousands, (own, other)),
         ),
         ("the blend has {} registers and", f.registers("blend")[0]),

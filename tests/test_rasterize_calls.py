@@ -333,6 +333,18 @@ def test_signs_that_torch_has_not_written_yet(name, device):
     assert torch.equal(plain.image, lazy.image)
 
 
+def test_signs_of_upstream_and_of_a_surface(device):
+    leaf, depths = SCENE.means.detach().to(device).requires_grad_(), call(device).depths
+    surface = depths.median().expand(18, 20).contiguous()
+    options = [RasterOptions(hidden_from=depth) for depth in (surface, torch._neg_view(-surface))]
+    images = [call(device, means=leaf, options=one).image for one in options]
+    weight = torch.rand(images[0].shape, device=device)
+    found = [
+        torch.autograd.grad(images[0], leaf, up, retain_graph=True)[0] for up in (weight, torch._neg_view(-weight))
+    ]
+    assert torch.equal(*images) and torch.equal(*found) and found[0].any()
+
+
 @pytest.mark.parametrize(
     "cameras", [SCENE.camera, None, iter(()), [SCENE.camera, None]], ids=["one", "None", "iterator", "list"]
 )
