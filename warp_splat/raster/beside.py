@@ -209,7 +209,7 @@ def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blendin
     By all that a pixel blends: ``channels`` [N, C] of one group, with their upstream gradients [H, W, C].
     """
     ((_, rows),) = _groups(blending.bins, channels, blending.driver)
-    adj_pixels = adj_pixels.contiguous()
+    adj_pixels = adj_pixels.contiguous().resolve_neg()
     (means2d, *_), _ = _differentiate(blending, rows, None, 0, channels.shape[1], adj_pixels, "absolute")
     return means2d
 
@@ -253,7 +253,7 @@ def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
 
 def _without_bad(adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:
     """Upstream gradients [H, W, C]; those of a pixel are dropped and counted, where one of them is not finite."""
-    adj_pixels = adj_pixels.contiguous()
+    adj_pixels = adj_pixels.contiguous().resolve_neg()
     if blending.driver.peeks and bool(adj_pixels.sum().isfinite()):
         return adj_pixels
     bad = ~adj_pixels.isfinite().all(2)

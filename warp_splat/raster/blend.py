@@ -69,7 +69,7 @@ class Blend(torch.autograd.Function):
     def backward(ctx, *adj_pixels):
         with stage("adjoint of blend"):
             (background, *saved), it = ctx.saved_tensors, ctx.blending
-            adj_pixels = Pixels(*(adj.contiguous() for adj in adj_pixels))
+            adj_pixels = Pixels(*(adj.contiguous().resolve_neg() for adj in adj_pixels))
             slots, adj_background, dropped = it.driver.adjoint(
                 it.adjoint, it.bins, it.options, background, Saved(*saved), adj_pixels
             )

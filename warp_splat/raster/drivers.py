@@ -98,7 +98,7 @@ class Driver:
         saved = Saved(final, count, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
         limits = new(0 if options.hidden_from is None else tile_count, *shape)
         if options.hidden_from is not None:
-            inputs = [bins.view(), view(options.hidden_from, wp.float32), self.lanes]
+            inputs = [bins.view(), view(options.hidden_from.resolve_neg(), wp.float32), self.lanes]
             outputs = [view(limits.view(-1, THREADS), wp.float32)]
             launch(count_in_front, tile_count, inputs, outputs, bounds=bins.slices, device=background.device)
         kernel = self.kernels.blend(variant_of(options, keep, options.bound, options.hidden_from is not None))

@@ -221,7 +221,7 @@ class Project(torch.autograd.Function):
             wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
             wants_pose = wants_twist or wants_last
             adj_splats = [
-                torch.zeros_like(found) if adj is None else adj.contiguous()
+                torch.zeros_like(found) if adj is None else adj.contiguous().resolve_neg()
                 for found, adj in zip(splats[:5], adj_outputs[:5], strict=True)
             ]
             adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)

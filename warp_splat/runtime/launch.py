@@ -270,9 +270,8 @@ def view(tensor: torch.Tensor, dtype):
     """
     shape, strides, size, inner = tensor.shape, tensor.stride(), tensor.element_size(), getattr(dtype, "_shape_", ())
     dims = len(shape) - len(inner) if ctypes.sizeof(dtype._type_) == size else 0
-    if dims < 1 or shape[dims:] != inner or strides[dims:] not in ((), (*inner[1:], 1)) or tensor.is_neg():
-        # it says what is wrong, if it is not a sign that torch has not written yet
-        return wp.from_torch(tensor.detach().resolve_neg(), dtype=dtype, requires_grad=False, return_ctype=True)
+    if dims < 1 or shape[dims:] != inner or strides[dims:] not in ((), (*inner[1:], 1)):  # it says what is wrong
+        return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     array = _Array(tensor.data_ptr(), 0, dims, shape, [size * stride for stride in strides])
     array._ref = tensor  # a copy, say, that nobody else has
     return array
