@@ -117,8 +117,11 @@ def test_clamped_as_by_torch(size, driver):
 def test_images_that_lie_otherwise_in_memory():
     image, target = torch.rand(2, 30, 20, 3, generator=torch.Generator().manual_seed(4)).transpose(1, 2)
     flat = torch.full((3,), 0.5).expand(20, 30, 3)
+    dense = image.contiguous()
     for other in (target, flat):
-        assert image_loss(image, other).item() == image_loss(image.contiguous(), other.contiguous()).item()
+        assert image_loss(image, other).item() == image_loss(dense, other.contiguous()).item()
+    signed = image_loss(torch._neg_view(-dense), torch._neg_view(-target))
+    assert signed.item() == image_loss(dense, target).item()
 
 
 def test_smooth_images_match_as_well():

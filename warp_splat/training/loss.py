@@ -96,7 +96,7 @@ class ImageLoss(torch.autograd.Function):
             groups, centers = -(-length // LANES), _centers(image, target).tolist()
             if target.is_inference():  # which autograd does not keep
                 target = target.clone()
-            image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
+            image, target = (p.detach().reshape(height, length).contiguous().resolve_neg() for p in (image, target))
             bounds, bands = _bands(height)
             padded, ring = _lanes(bands, 2, groups + 2), _lanes(bands, RING, groups, MOMENTS)
             blurred, slopes = _lanes(bands, ROWS, groups, MOMENTS), _lanes(height, SLOPES, groups + 2)
@@ -135,7 +135,7 @@ class LossInBlocks(torch.autograd.Function):
     def forward(ctx, image, target, lambda_dssim, limits):
         with stage("loss"):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
-            image, target = (picture.detach().reshape(height, length).contiguous() for picture in (image, target))
+            image, target = (p.detach().reshape(height, length).contiguous().resolve_neg() for p in (image, target))
             ctx.pictures = (image, target, _centers(image, target), limits)
             shares = ((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel(), lambda_dssim)
             ctx.weights = wp.vec3(*shares)
