@@ -41,7 +41,9 @@ class Lanes:
     def forward(self) -> None:
         slices = balanced_slices(self.scene.ranges[:, 1])
         count = len(self.scene.splats)
-        bins = Bins(count, self.order, self.splats, *self.lists, slices, self.scene.tiles_x, invalid=0)
+        bins = Bins(
+            count, self.order, self.splats, *self.lists, slices, self.scene.tiles_x, self.scene.height, invalid=0
+        )
         self.image = blend_splats(self.projected, bins, torch.zeros(3), self.camera, RasterOptions(), self.mode).image
 
     def adjoint(self) -> None:

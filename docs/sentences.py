@@ -225,10 +225,10 @@ def _simulation() -> list[tuple]:
     return [
         (
             "ours draws {} times as many pictures",
-            round(f.simulated("ours, 1 thread", 2) / f.simulated("Newton's", 2)),
+            round(f.simulated("ours, 1 thread", 3) / f.simulated("Newton's", 3)),
         ),
-        ("mean error of a color is {},", f.small(f.simulated("Newton's", 4))),
-        ("Ours errs by at most {}.", f.small(f.simulated("ours, 1 thread", 3))),
+        ("mean error of a color is {},", f.small(f.simulated("Newton's", 5))),
+        ("Ours errs by at most {}.", f.small(f.simulated("ours, 1 thread", 4))),
     ]
 
 

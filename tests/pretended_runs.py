@@ -106,6 +106,11 @@ def call_as_gsplat() -> None:
         image.square().sum().backward()
 
 
+def waited() -> Counter:
+    """Where the host did."""
+    return Counter(note["where"].split(" < ")[0] for note in notes)
+
+
 def in_simulation() -> None:
     """Newton's sensor and its adjoint in a stream of Warp's: all of it there, and the host's picture and gradients.
 
@@ -129,16 +134,25 @@ def in_simulation() -> None:
         sensor, state = SensorSplatCamera(model), model.state()
         eyes = wp.array([(0, 0, 3, 0, 0, 0, 1)] * 2, dtype=wp.transform, device=device, requires_grad=True)
         rgb = wp.zeros((2, 24, 40), dtype=wp.vec3, device=device, requires_grad=True)
-        notes.clear(), used.clear()
+        again, camera, waits = wp.zeros_like(rgb), camera_of_fov(40, 24, 0.8), []
         stream = wp.ScopedStream(Stream(7, card) if Stream else wp.Stream(card)) if device is card else nullcontext()
-        with wp.ScopedDevice(device), stream, wp.Tape() as tape:
-            sensor.update(state, eyes, camera_of_fov(40, 24, 0.8), rgb_image=rgb)
-            tape.backward(grads={rgb: wp.full_like(rgb, wp.vec3(1.0))})
+        used.clear()
+        with wp.ScopedDevice(device), stream:
+            notes.clear()
+            with wp.Tape() as tape:
+                sensor.update(state, eyes, camera, rgb_image=rgb)
+                tape.backward(grads={rgb: wp.full_like(rgb, wp.vec3(1.0))})
+            waits.append(waited())
+            notes.clear()
+            sensor.update(state, eyes, camera, rgb_image=again)
+            waits.append(waited())
         seen = device is card and Stream
-        assert used == ({7} if seen else set())
-        waits = Counter(note["where"].split(" < ")[0] for note in notes)
-        places = ("raster/checks.py:check_gaussians", "raster/bin.py:bin_by_sorting", "raster/api.py:invalid")
-        assert waits == (dict.fromkeys(places, len(eyes)) if seen else {}), waits
+        assert used == ({7} if seen else set()) and np.array_equal(again.numpy(), rgb.numpy())
+        places = ("raster/checks.py:check_gaussians", "raster/bin.py:bin_by_sorting")
+        each = dict.fromkeys((*places, "raster/api.py:invalid"), len(eyes))
+        for_all = {"newton/sensor.py:_draw_together": 1, "raster/worlds.py:_merge": 1}
+        for_all |= dict.fromkeys((*places, "raster/worlds.py:__init__"), 2)  # of what is shared, and of all worlds
+        assert waits == ([each, for_all] if seen else [{}, {}]), waits
         found.append([array.numpy() for array in (rgb, eyes.grad, state.body_q.grad)])
     for one, other in zip(*found, strict=True):
         assert other.any() and np.linalg.norm(one - other) <= 1e-4 * np.linalg.norm(other)

@@ -128,7 +128,7 @@ def crowded(count, width):
     rows = torch.from_numpy(random.standard_normal((total, width), np.float32))
     nothing = torch.empty(0, dtype=torch.int32)
     gaussians = wp.array(order, dtype=int, device="cpu")
-    return Bins(count, gaussians, None, nothing, places, begins, nothing, [], 1, 0), rows, counts
+    return Bins(count, gaussians, None, nothing, places, begins, nothing, [], 1, 16, 0), rows, counts
 
 
 def test_depths_are_sorted_in_bands(monkeypatch, threads):

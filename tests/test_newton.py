@@ -110,6 +110,45 @@ def test_pictures_are_those_of_the_float64_renderer(simulation):
         assert (made["forward_depth_image"].numpy()[view][exact.alpha > 0.1] > 1).all()
 
 
+@pytest.mark.parametrize("at_once", [1, 60, 2**20])
+@pytest.mark.parametrize("meshes", [False, True])
+def test_views_are_drawn_together_with_the_bits_of_each(simulation, meshes, at_once, monkeypatch):
+    """Whether they see from the same place, one after the other, or not; and with two cameras."""
+    monkeypatch.setattr("warp_splat.newton.sensor.AT_ONCE", at_once)
+    camera = camera_of_fov(WIDTH, HEIGHT, FOV)
+    worlds, eyes = [1, 0, 0, 1, 1, 0], [0, 0, 1, 0, 0, 0]
+    cameras = [*[camera] * 4, *[replace(camera, fx=30.0)] * 2]
+    transforms = wp.array([CAMERAS[eye] for eye in eyes], dtype=wp.transform)
+    surfaces = np.random.default_rng(0).uniform(-3, 7, (6, HEIGHT, WIDTH)).astype(np.float32)
+    found = []
+    for together in (True, False):
+        made = images(6, rgb_image=wp.vec3, forward_depth_image=float, shape_index_image=wp.uint32)
+        more = {"mesh_depth": wp.array(surfaces, dtype=float)} if meshes else {}
+        with monkeypatch.context() as patch:
+            patch.setattr("warp_splat.newton.sensor.takes", lambda *_, chosen=together: chosen)
+            simulation.sensor.update(state_of(simulation), transforms, cameras, world_indices=worlds, **made, **more)
+        found.append([array.numpy() for array in made.values()])
+    assert all(map(np.array_equal, *found)) and found[0][0].std() > 0.05
+
+
+def test_a_world_without_gaussians_shows_those_of_all(simulation):
+    """Or nothing, if there are none."""
+    for shared in (True, False):
+        world, scene = newton.ModelBuilder(), newton.ModelBuilder()
+        ball = newton.Gaussian([[0.0, 0, 0]], None, [[0.5] * 3], [0.9], np.full((1, 3), 1.0))
+        if shared:
+            scene.add_shape_gaussian(-1, gaussian=ball, cfg=UNSEEN)
+        body = world.add_body(mass=1.0, inertia=wp.mat33(np.eye(3)))
+        scene.add_world(world)
+        world.add_shape_gaussian(body, gaussian=ball, cfg=UNSEEN)
+        scene.add_world(world)
+        model, made = scene.finalize(device="cpu"), images(2, rgb_image=wp.vec3)
+        same = wp.array([CAMERAS[1]] * 2, dtype=wp.transform)
+        SensorSplatCamera(model).update(model.state(), same, camera_of_fov(WIDTH, HEIGHT, FOV), **made)
+        first, second = made["rgb_image"].numpy()
+        assert (first.max() > 0.3) == shared and second.max() > 0.3
+
+
 @pytest.mark.parametrize(
     ("lens", "shutter"),
     [

@@ -18,6 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.raster import api
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped
+from warp_splat.raster.worlds import Worlds
 from warp_splat.runtime.launch import open_tape
 from warp_splat.runtime.timers import stage
 
@@ -127,6 +128,43 @@ def rasterize(
     return TapeOutput(**{"depth": None} | pixels, **others)
 
 
+def draw_worlds(
+    *gaussians: wp.array,
+    counts: Sequence[int],
+    camera: Camera,
+    options: RasterOptions,
+    hidden_from: wp.array | None = None,
+    backdrop: Worlds | None = None,
+) -> tuple[dict[str, wp.array], Worlds]:
+    """Pictures of W worlds through one camera, forward only, with the bits of :func:`rasterize` and in less time.
+
+    Args:
+        gaussians: means, quats, scales, opacities and sh of all worlds, one after the other, as :func:`rasterize`
+            takes them.
+        counts: of each world's Gaussians.
+        camera: of all worlds; any but a panorama.
+        options: what to compute: the color, depth, the strongest; neither bound nor tolerance.
+        hidden_from: as in :func:`rasterize`, [W, H, W].
+        backdrop: what was drawn of a world that stands behind and among each of these, and is numbered first.
+
+    Returns:
+        Image, alpha and what else is asked for, by their names, with one more dimension in front, on black; and what
+        others take for their backdrop.
+
+    Raises:
+        InputError: as :func:`rasterize` does.
+    """
+    names = ("means", "quats", "scales", "opacities", "sh")
+    with _torch_on(gaussians[0].device, False):
+        given = [wp.to_torch(_checked(*pair), requires_grad=False) for pair in zip(names, gaussians, strict=True)]
+        given[1] = _w_first(given[1], gaussians[1])
+        if hidden_from is not None:
+            surfaces = wp.to_torch(hidden_from, requires_grad=False).reshape(-1, camera.width)
+            options = replace(options, hidden_from=surfaces)
+        worlds = Worlds(given, counts, camera, options, backdrop)
+        return {name: wp.from_torch(tensor, PIXELS.get(name)) for name, tensor in worlds.pictures.items()}, worlds
+
+
 def _checked(name: str, array: Any) -> wp.array:
     """``array``. Raises InputError if it is none of Warp's of real numbers; shapes are checked later."""
     kinds = (wp.float32, wp.float64) if name in ("twist", "intrinsics") else (wp.float32,)
@@ -143,9 +181,7 @@ def _checked(name: str, array: Any) -> wp.array:
 
 def _render(leaves: dict[str, torch.Tensor], named: dict[str, wp.array], camera, background, adjoint, options):
     """:func:`warp_splat.rasterize` of the tensors behind the arrays."""
-    quats = leaves["quats"]
-    if issubclass(named["quats"].dtype, wp.quatf):
-        quats = quats.roll(1, 1)  # w first
+    quats = _w_first(leaves["quats"], named["quats"])
     sh = leaves["sh"] if "sh" in leaves else (leaves["sh[0]"], leaves["sh[1]"])
     if "background" in leaves:
         background = leaves["background"].flatten()
@@ -154,6 +190,11 @@ def _render(leaves: dict[str, torch.Tensor], named: dict[str, wp.array], camera,
         camera = CameraParameters(camera, **learned)
     gaussians = (leaves["means"], quats, leaves["scales"], leaves["opacities"], sh)
     return api.rasterize(*gaussians, camera, background, adjoint, options, leaves.get("features"))
+
+
+def _w_first(quats: torch.Tensor, array: wp.array) -> torch.Tensor:
+    """Quaternions of an array, in our order."""
+    return quats.roll(1, 1) if issubclass(array.dtype, wp.quatf) else quats
 
 
 def _adjoint(

@@ -62,6 +62,12 @@ def make_place(coefficients: int) -> wp.Kernel:
 
 
 @wp.func
+def pixel_at(index: int, height: int, width: int):
+    """View, line and column."""
+    return index // (height * width), index // width % height, index % width
+
+
+@wp.func
 def channel_of(color: wp.uint32, channel: int):
     return float((color >> wp.uint32(8 * channel)) & wp.uint32(255)) / 255.0
 
@@ -74,60 +80,59 @@ def byte_of(value: float, channel: int):
 @wp.kernel
 def put_among_meshes(
     first: int,
-    image: wp.array2d[wp.vec3],  # [H, W] of the Gaussians in front of the meshes, on black
-    alpha: wp.array2d[float],  # [H, W]
-    depth: wp.array2d[float],  # [H, W]
+    image: wp.array3d[wp.vec3],  # [V, H, W] of the Gaussians in front of the meshes, on black
+    alpha: wp.array3d[float],  # [V, H, W]
+    depth: wp.array3d[float],  # [V, H, W]
     background: wp.vec3,
-    mesh_color: wp.array2d[wp.uint32],  # [H, W] of the meshes, packed; empty without any, as what follows
-    mesh_depth: wp.array2d[float],  # [H, W] not positive where there is none
+    mesh_color: wp.array3d[wp.uint32],  # [V, H, W] of the meshes, packed; empty without any, as what follows
+    mesh_depth: wp.array3d[float],  # [V, H, W] not positive where there is none
     # out
-    rgb_out: wp.array2d[wp.vec3],  # [H, W] as is packed below
-    color_out: wp.array2d[wp.uint32],  # [H, W] or empty, as what follows
-    depth_out: wp.array2d[float],  # [H, W]
+    rgb_out: wp.array3d[wp.vec3],  # [V, H, W] as is packed below; or empty, as what follows
+    color_out: wp.array3d[wp.uint32],
+    depth_out: wp.array3d[float],
 ):
-    y = (first + wp.tid()) // image.shape[1]
-    x = (first + wp.tid()) % image.shape[1]
-    through = 1.0 - alpha[y, x]
+    v, y, x = pixel_at(first + wp.tid(), alpha.shape[1], alpha.shape[2])
+    through = 1.0 - alpha[v, y, x]
     behind = background
     far = float(0.0)
     if mesh_depth.shape[0] > 0:
-        if mesh_depth[y, x] > 0.0:
-            far = mesh_depth[y, x]
+        if mesh_depth[v, y, x] > 0.0:
+            far = mesh_depth[v, y, x]
             if mesh_color.shape[0] > 0:
-                packed = mesh_color[y, x]
+                packed = mesh_color[v, y, x]
                 behind = wp.vec3(channel_of(packed, 0), channel_of(packed, 1), channel_of(packed, 2))
-    rgb = image[y, x] + through * behind
-    rgb_out[y, x] = rgb
+    rgb = image[v, y, x] + through * behind
+    if rgb_out.shape[0] > 0:
+        rgb_out[v, y, x] = rgb
     if color_out.shape[0] > 0:
         alike = byte_of(rgb[0], 0) | byte_of(rgb[1], 1) | byte_of(rgb[2], 2)
-        color_out[y, x] = alike | byte_of(1.0, 3)
+        color_out[v, y, x] = alike | byte_of(1.0, 3)
     if depth_out.shape[0] > 0:
-        seen = depth[y, x]
+        seen = depth[v, y, x]
         if far > 0.0:
-            seen = alpha[y, x] * depth[y, x] + through * far
-        depth_out[y, x] = seen
+            seen = alpha[v, y, x] * depth[v, y, x] + through * far
+        depth_out[v, y, x] = seen
 
 
 @wp.kernel
 def name_shapes(
     first: int,
-    strongest: wp.array3d[wp.int64],  # [H, W, 1]
-    weights: wp.array3d[float],  # [H, W, 1]
-    alpha: wp.array2d[float],  # [H, W]
-    owners: wp.array[wp.uint32],  # [all] shape of each Gaussian
-    mesh_depth: wp.array2d[float],  # [H, W] or empty
-    mesh_index: wp.array2d[wp.uint32],  # [H, W] or empty
+    strongest: wp.array4d[wp.int64],  # [V, H, W, 1]
+    weights: wp.array4d[float],  # [V, H, W, 1]
+    alpha: wp.array3d[float],  # [V, H, W]
+    owners: wp.array2d[wp.uint32],  # [V, most] shape of each Gaussian
+    mesh_depth: wp.array3d[float],  # [V, H, W] or empty
+    mesh_index: wp.array3d[wp.uint32],  # [V, H, W] or empty
     # out
-    index_out: wp.array2d[wp.uint32],  # [H, W] shape that is seen most
+    index_out: wp.array3d[wp.uint32],  # [V, H, W] shape that is seen most
 ):
-    y = (first + wp.tid()) // alpha.shape[1]
-    x = (first + wp.tid()) % alpha.shape[1]
+    v, y, x = pixel_at(first + wp.tid(), alpha.shape[1], alpha.shape[2])
     index = NOTHING
     share = float(0.0)
     if mesh_index.shape[0] > 0:
-        if mesh_depth[y, x] > 0.0:
-            index = mesh_index[y, x]
-            share = 1.0 - alpha[y, x]
-    if weights[y, x, 0] > share:
-        index = owners[int(strongest[y, x, 0])]
-    index_out[y, x] = index
+        if mesh_depth[v, y, x] > 0.0:
+            index = mesh_index[v, y, x]
+            share = 1.0 - alpha[v, y, x]
+    if weights[v, y, x, 0] > share:
+        index = owners[v, int(strongest[v, y, x, 0])]
+    index_out[v, y, x] = index

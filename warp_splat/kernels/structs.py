@@ -33,9 +33,11 @@ class Splats2DView:
 
 @wp.struct
 class BinsView:
-    """Tile lists."""
+    """Tile lists; several pictures of one size stand below each other."""
 
     tiles_x: int
+    tiles: int  # of a picture
+    height: int  # px of a picture
     ranges: wp.array[wp.vec2i]  # [T] first and last instance of a tile
     instances: wp.array[int]  # [M] splats, by tile, front to back
     splats: wp.array[Splat2D]  # [V]

@@ -96,6 +96,13 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
 
 
 @wp.func
+def first_pixel_of(bins: BinsView, tile: int):
+    """Column and line of a tile's first pixel in its picture [px], and the line at which that begins."""
+    own = tile % bins.tiles
+    return (own % bins.tiles_x) * TILE, (own // bins.tiles_x) * TILE, (tile // bins.tiles) * bins.height
+
+
+@wp.func
 def outline(x_extent: Any, y_extent: Any, root0: Any, root1: Any, root2: Any):
     """The ellipse q <= reach / 2, at height dy: dx = slope dy +- half sqrt(1 - (dy / extent y)^2).
 
@@ -140,14 +147,15 @@ def count_in_front(
 ):
     tile = first + wp.tid()
     start = bins.ranges[tile][0]
+    column, line, begin = first_pixel_of(bins, tile)
     for place in range(TILE * TILE):
         x = place % TILE
         y = place // TILE
         if lanes > 1:
             x = 4 * (place // lanes % 4) + place % 4
             y = 4 * (place // lanes // 4) + place % lanes // 4
-        x = wp.min(tile % bins.tiles_x * TILE + x, surface.shape[1] - 1)
-        y = wp.min(tile // bins.tiles_x * TILE + y, surface.shape[0] - 1)
+        x = wp.min(column + x, surface.shape[1] - 1)
+        y = begin + wp.min(line + y, bins.height - 1)
         low = int(start)
         high = int(bins.ranges[tile][1])
         if not surface[y, x] > 0.0:
@@ -159,3 +167,28 @@ def count_in_front(
             else:
                 high = middle
         limits_out[tile, place] = float(low - start)
+
+
+@wp.kernel
+def merge_lists(
+    first: int,
+    back: BinsView,  # of T tiles
+    front: BinsView,  # of as many tiles of each of several pictures; splats that are numbered after those
+    ranges: wp.array[wp.vec2i],  # likewise, of the merged lists; empty where nothing of `front` is
+    # out
+    instances_out: wp.array[int],  # [M] nearest first, of equal ones those of `back`
+):
+    tile = first + wp.tid()
+    i = back.ranges[tile % back.ranges.shape[0]][0]
+    end = back.ranges[tile % back.ranges.shape[0]][1]
+    k = front.ranges[tile][0]
+    for place in range(ranges[tile][0], ranges[tile][1]):
+        behind = k == front.ranges[tile][1]
+        if i < end and not behind:
+            behind = not front.splats[front.instances[k]].depth < back.splats[back.instances[i]].depth
+        if behind:
+            instances_out[place] = back.instances[i]
+            i += 1
+        else:
+            instances_out[place] = back.splats.shape[0] + front.instances[k]
+            k += 1

@@ -4,9 +4,10 @@ The tape of Warp has all of it: :mod:`warp_splat.kernels.place` around :mod:`war
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial, partialmethod
+from functools import cache, lru_cache, partial, partialmethod
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,12 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.stored import sigmoid, unit_quats
 from warp_splat.kernels.place import ShapeView, make_place, name_shapes, put_among_meshes
+from warp_splat.raster.worlds import takes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
+AT_ONCE = 2**20  # Gaussians of views that are drawn together, or 16 times as many pixels
+LAYOUTS = 8  # that are kept: of the worlds that are asked for, again and again
+Seen = tuple[slice, dict[str, wp.array]]  # views, and their pixels by their names, on black
 #: Of what images are; others are of uint32.
 KINDS = {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}
 
@@ -37,9 +42,26 @@ class Piece:
     view: ShapeView  # of it, in this size
 
 
+def count_of(pieces: Sequence[Piece]) -> int:
+    """How many Gaussians they have."""
+    return sum(piece.source.count for piece in pieces)
+
+
+@dataclass
+class Call:
+    """What is to be drawn: V views."""
+
+    state: Any  # newton.State
+    camera_transforms: wp.array  # [V] transform
+    cameras: list[Camera]  # [V] without their poses
+    worlds: list[int]  # [V]
+    options: RasterOptions
+    mesh_depth: wp.array | None  # [V, H, W]
+
+
 @dataclass
 class Layout:
-    """What worlds of the same Gaussians share, and room for one view of them."""
+    """What the same Gaussians in the same order share, and room for what a camera sees of them."""
 
     scales: wp.array  # [N] vec3
     opacities: wp.array  # [N]
@@ -72,23 +94,20 @@ class SensorSplatCamera:
     ):
         self.model, self.device, self.adjoint = model, model.device, adjoint
         self.background, self.options = wp.vec3(*background), options or RasterOptions()
-        self._room, self._owners_of = cache(self._new_room), cache(self._find_owners)  # made once
+        self._layout_of, self._owners_of = lru_cache(LAYOUTS)(self._layout), lru_cache(LAYOUTS)(self._find_owners)
         bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()
-        sizes, view, layout = model.shape_scale.numpy(), cache(self._view), cache(self._layout)
-        own: dict[int, list[Piece]] = {world: [] for world in range(-1, model.world_count)}
+        sizes, view = model.shape_scale.numpy(), cache(self._view)
+        self._pieces: dict[int, list[Piece]] = {world: [] for world in range(-1, max(model.world_count, 1))}
         for shape, source in enumerate(model.shape_source):
             if not hasattr(source, "sh_coeffs"):
                 continue
             size = float(sizes[shape][0])
             if not (size > 0 and np.allclose(sizes[shape], size)):
                 raise InputError(f"shape {shape}: expected a scale that is positive and the same along all axes.")
-            own[int(worlds[shape])].append(Piece(shape, int(bodies[shape]), size, source, view(source, size)))
-        if not any(own.values()):
+            piece = Piece(shape, int(bodies[shape]), size, source, view(source, size))
+            self._pieces[int(worlds[shape])].append(piece)
+        if not any(self._pieces.values()):
             raise InputError("model: expected a Gaussian shape (ModelBuilder.add_shape_gaussian), found none.")
-        self._worlds = []
-        for world in range(max(model.world_count, 1)):
-            pieces = own[-1] + own.get(world, [])
-            self._worlds.append((pieces, layout(*((piece.source, piece.size) for piece in pieces))))
 
     def allocate_image(self, view_count: int, width: int, height: int, dtype: Any) -> wp.array:
         """An image for :meth:`update`; those below are of one kind, by Newton's names."""
@@ -159,44 +178,78 @@ class SensorSplatCamera:
         views, shape = shape[0], shape[1:]
         worlds = world_indices.numpy() if isinstance(world_indices, wp.array) else world_indices
         chosen = np.arange(views) if worlds is None else np.asarray(worlds)
-        whole = chosen.shape == (views,) and chosen.dtype.kind in "iu"
-        if not whole or not all(0 <= world < len(self._worlds) for world in chosen):
-            raise InputError(f"world_indices: expected {views} of 0..{len(self._worlds) - 1}, got {chosen.tolist()}.")
-        cameras = [replace(one, rotation=np.eye(3), translation=np.zeros(3)) for one in cameras]
+        whole, count = chosen.shape == (views,) and chosen.dtype.kind in "iu", len(self._pieces) - 1
+        if not whole or not all(0 <= world < count for world in chosen):
+            raise InputError(f"world_indices: expected {views} of 0..{count - 1}, got {chosen.tolist()}.")
         asked = {"depth": forward_depth_image is not None, "strongest": int(shape_index_image is not None)}
-        options = replace(self.options, **asked)
-        recorded = open_tape() is not None
-        for view, world in enumerate(chosen.tolist()):
-            pieces, layout = self._worlds[world]
-            means, quats, sh = self._place(view, pieces, layout, state, camera_transforms, recorded)
-            of = lambda array: None if array is None else array[view]  # noqa: B023, E731 - called at once
-            surface = of(mesh_depth)
-            room = {} if recorded else {name: self._room(name, shape) for name in ("image", "alpha", "depth")}
-            seen = tape.rasterize(
-                *(means, quats, layout.scales, layout.opacities, sh, cameras[view]),
-                **{"adjoint": self.adjoint, "options": options, "hidden_from": surface, "out": room},
-            )
-            rgb = of(rgb_image) if rgb_image is not None else self._room("rgb", shape)
-            inputs = [seen.image, seen.alpha, seen.depth, self.background, of(mesh_color), surface]
-            made = [rgb, of(color_image), of(forward_depth_image)]
-            launch_on_tape(put_among_meshes, rgb.size, inputs, made, self.device)
+        options, poseless = replace(self.options, **asked), {"rotation": np.eye(3), "translation": np.zeros(3)}
+        lenses = {id(one): replace(one, **poseless) for one in cameras}
+        call = Call(
+            state, camera_transforms, [lenses[id(one)] for one in cameras], chosen.tolist(), options, mesh_depth
+        )
+        together = (
+            open_tape() is None and options.hidden_from is None and all(takes(one, options) for one in lenses.values())
+        )
+        for views, seen in (self._draw_together if together else self._draw_each)(call):
+            of = lambda array: None if array is None else array[views]  # noqa: B023, E731 - called at once
+            surfaces, size = of(mesh_depth), seen["alpha"].size
+            inputs = [seen["image"], seen["alpha"], seen.get("depth"), self.background, of(mesh_color), surfaces]
+            made = [of(rgb_image), of(color_image), of(forward_depth_image)]
+            launch_on_tape(put_among_meshes, size, inputs, made, self.device)
             if shape_index_image is not None:
-                inputs = [seen.strongest, seen.strongest_weights, seen.alpha, self._owners_of(world), surface]
-                launch_on_tape(name_shapes, rgb.size, [*inputs, of(mesh_index)], [of(shape_index_image)], self.device)
+                owners = self._owners_of(*call.worlds[views])
+                inputs = [seen["strongest"], seen["strongest_weights"], seen["alpha"], owners, surfaces, of(mesh_index)]
+                launch_on_tape(name_shapes, size, inputs, [of(shape_index_image)], self.device)
 
-    def _place(self, view: int, pieces: list[Piece], layout: Layout, state, camera_transforms, recorded: bool) -> tuple:
-        """Means, quats and colors of a world's Gaussians in the camera's frame; on a tape, in arrays of their own."""
-        made = layout.room
-        if recorded:
+    def _draw_each(self, call: Call) -> Iterator[Seen]:
+        """One view after the other, with gradients on a tape."""
+        for view, world in enumerate(call.worlds):
+            given = self._place(call, view, [self._pieces[-1] + self._pieces[world]])
+            surface = None if call.mesh_depth is None else call.mesh_depth[view]
+            more = {"adjoint": self.adjoint, "options": call.options, "hidden_from": surface}
+            seen = vars(tape.rasterize(*given, call.cameras[view], **more))
+            seen = {name: array for name, array in seen.items() if isinstance(array, wp.array) and array.ndim > 1}
+            yield slice(view, view + 1), {name: array.reshape((1, *array.shape)) for name, array in seen.items()}
+
+    def _draw_together(self, call: Call) -> Iterator[Seen]:
+        """Without gradients: views of one camera in a row at once; from one place, what is shared once."""
+        shared, keys = self._pieces[-1], [(id(camera),) for camera in call.cameras]
+        if shared and call.mesh_depth is None:
+            poses = call.camera_transforms.numpy().tolist()
+            eyes = [(*key, *pose) for key, pose in zip(keys, poses, strict=True)]
+            same = [before == eye for before, eye in pairwise([None, *eyes, None])]
+            keys = [eye if same[view] or same[view + 1] else keys[view] for view, eye in enumerate(eyes)]
+        for key, group in groupby(range(len(keys)), keys.__getitem__):
+            views, backdrop = list(group), None
+            more = {"camera": call.cameras[views[0]], "options": call.options}
+            if len(key) > 1:
+                _, backdrop = tape.draw_worlds(
+                    *self._place(call, views[0], [shared]), counts=[count_of(shared)], **more
+                )
+            most = max(count_of(shared + self._pieces[call.worlds[view]]) for view in views)
+            size = max(AT_ONCE // max(most, more["camera"].width * more["camera"].height // 16), 1)
+            for first in range(views[0], views[-1] + 1, size):
+                part = slice(first, min(first + size, views[-1] + 1))
+                table = [([] if backdrop else shared) + self._pieces[world] for world in call.worlds[part]]
+                more["hidden_from"] = None if call.mesh_depth is None else call.mesh_depth[part]
+                given, counts = self._place(call, first, table), [count_of(pieces) for pieces in table]
+                yield part, tape.draw_worlds(*given, counts=counts, backdrop=backdrop, **more)[0]
+
+    def _place(self, call: Call, first: int, table: Sequence[list[Piece]]) -> tuple[wp.array, ...]:
+        """The Gaussians of pieces, view after view, in the camera's frame; on a tape, in arrays of their own."""
+        layout = self._layout_of(*((piece.source, piece.size) for pieces in table for piece in pieces))
+        made, begin = layout.room, 0
+        if open_tape():
             made = tuple(wp.empty_like(array, requires_grad=True) for array in layout.room)
-        begin = 0
-        for piece in pieces:
-            where = wp.vec4i(view, piece.body, piece.shape, begin)
-            inputs = [where, piece.view, self.model.shape_transform, state.body_q, camera_transforms]
-            count, coefficients = piece.view.sh.shape
-            launch_on_tape(make_place(coefficients), count, inputs, made, self.device)
-            begin += count
-        return made
+        for view, pieces in enumerate(table, first):
+            for piece in pieces:
+                where = wp.vec4i(view, piece.body, piece.shape, begin)
+                inputs = [where, piece.view, self.model.shape_transform, call.state.body_q, call.camera_transforms]
+                count, coefficients = piece.view.sh.shape
+                launch_on_tape(make_place(coefficients), count, inputs, made, self.device)
+                begin += count
+        means, quats, sh = made
+        return means, quats, layout.scales, layout.opacities, sh
 
     def _view(self, source: Any, size: float) -> ShapeView:
         """The arrays of a ``newton.Gaussian``, whose coefficients are in the order of PLY files."""
@@ -210,9 +263,9 @@ class SensorSplatCamera:
         return view
 
     def _layout(self, *parts: tuple[Any, float]) -> Layout:
-        """Of the Gaussians of a world, each in its size."""
-        scales = np.concatenate([size * source.scales for source, size in parts])
-        opacities = np.concatenate([source.opacities for source, _ in parts])
+        """Of the Gaussians of sources, each in its size."""
+        scales = np.concatenate([np.empty((0, 3)), *(size * source.scales for source, size in parts)])
+        opacities = np.concatenate([np.empty(0), *(source.opacities for source, _ in parts)])
         new = partial(wp.empty, len(opacities), device=self.device)
         return Layout(
             wp.array(scales, dtype=wp.vec3, device=self.device),
@@ -220,15 +273,16 @@ class SensorSplatCamera:
             (new(dtype=wp.vec3), new(dtype=wp.quat), new(dtype=wp.vec3).reshape((-1, 1))),
         )
 
-    def _new_room(self, name: str, shape: tuple[int, ...]) -> wp.array:
-        """An image that is used again."""
-        return wp.empty(shape, dtype=wp.vec3 if name in ("image", "rgb") else wp.float32, device=self.device)
-
-    def _find_owners(self, world: int) -> wp.array:
-        """The shape of each Gaussian."""
-        pieces, _ = self._worlds[world]
-        shapes = np.repeat([piece.shape for piece in pieces], [piece.source.count for piece in pieces])
-        return wp.array(shapes, dtype=wp.uint32, device=self.device)
+    def _find_owners(self, *worlds: int) -> wp.array:
+        """The shape of each Gaussian of these worlds, [W, most]."""
+        rows = []
+        for world in worlds:
+            pieces = self._pieces[-1] + self._pieces[world]
+            rows.append(np.repeat([piece.shape for piece in pieces], [piece.source.count for piece in pieces]))
+        table = np.zeros((len(rows), max(map(len, rows))))
+        for row, shapes in zip(table, rows, strict=True):
+            row[: len(shapes)] = shapes
+        return wp.array(table, dtype=wp.uint32, device=self.device)
 
 
 def camera_of_fov(width: int, height: int, camera_fov: float) -> Camera:

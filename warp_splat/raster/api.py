@@ -23,7 +23,6 @@ from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.raster.seam import around, find_crossing
 from warp_splat.raster.tolerance import Painted, only, paint_within
-from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.timers import stage
 
 
@@ -151,9 +150,7 @@ def rasterize_views(
     outputs, bases = [], [camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras]
     for base in bases:
         checks.check_hidden_from(options, base, means.device)
-    sizes = ((base.width, base.height) for base in bases)
-    advice = "render smaller images (Camera.resized) or fewer Gaussians"
-    with checks.own_explained(options), memory_explained(means.device, means, sizes, advice):
+    with checks.explained(options, means, bases):
         for camera in cameras:
             outputs.append(render(gaussians, camera, background, options, adjoint, features))
             outputs[-1].invalid_count = outputs[-1].invalid  # a GPU is waited for once

@@ -11,7 +11,6 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
-from warp_splat.config import TILE
 from warp_splat.kernels.slots import CHANNEL
 from warp_splat.raster.blend import Blending
 from warp_splat.raster.camera_parameters import CameraParameters
@@ -108,8 +107,7 @@ def _launch(
 
 def _gaussians_of(bins: Bins, camera: Camera, ranks: torch.Tensor) -> torch.Tensor:
     """Gaussians [H, W, k] of places in the lists of the pixels' tiles; -1 stays."""
-    begins = bins.ranges[:, 0].view(-1, bins.tiles_x).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
-    begins = begins[: camera.height, : camera.width, None]
+    begins = bins.by_pixel(bins.ranges[:, 0], camera.width)[..., None]
     none = torch.full_like(ranks, -1).long()
     if not len(bins.instances):
         return none

@@ -1,5 +1,6 @@
 """From 2D Gaussians to lists: which Gaussians touch which tile of the image, in depth order. No gradient."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -16,7 +17,7 @@ from warp_splat.kernels.cuda.lists import make_count_tiles, make_gather_tiles, m
 from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
-from warp_splat.runtime.launch import check_memory, empty, launch, read_later, view
+from warp_splat.runtime.launch import check_memory, empty, launch, read_later, send, view
 from warp_splat.runtime.pool import even_slices, in_slices, slice_count, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
@@ -27,10 +28,17 @@ SMALLEST_BAND = 2**14  # splats of a thread that are ordered by depth; below, la
 BITS = DIGITS.bit_length() - 1  # of such a sort, at once
 
 
-def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, room: Room | None = None) -> Bins:
+def bin_by_counting(
+    splats2d: Splats2D,
+    camera: Camera,
+    options: RasterOptions,
+    room: Room | None = None,
+    worlds: Sequence[int] = (),
+) -> Bins:
     """The Gaussians of each tile by depth (ties by index) on the CPU: a counting sort by tile, a band per thread.
 
-    A CPU knows their number in time, and needs no ``room``.
+    A CPU knows their number in time, and needs no ``room``. With ``worlds``, how many of the Gaussians belong to each
+    of several pictures, one after the other, lists are those of the tiles of the first picture, then of the next.
 
     Raises:
         InputError: if the tile instances are more than the kernels can number, or than fit.
@@ -44,23 +52,35 @@ def bin_by_counting(splats2d: Splats2D, camera: Camera, options: RasterOptions, 
     launch(tiles.make_pack(falloff_of(options).reach_of), count, inputs, [splats, in_place(rows)])
     order = order_by_depth(_taken(splats2d.depths.detach().numpy(), drawn))
     row_ends, begins = _sums(_taken(rows, order))
-    _check_count(_last(row_ends), camera, count, splats2d.radii.device)
+    check_count(_last(row_ends), camera, count, splats2d.radii.device)
     begins = _put(begins, order)
     spans, counts = empty(_last(row_ends), wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, _boxes(options)]
     groups = -(-count // LANES)
     launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=even_slices(groups, each=LANES))
+    pictures = max(len(worlds), 1)
+    if worlds:
+        first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
+        wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
     place_ends, begins = _sums(counts)
-    _check_count(_last(place_ends), camera, count, splats2d.radii.device)
+    check_count(_last(place_ends), camera, count, splats2d.radii.device)
     instances, places, ends = _sort_by_tile(
-        order, _taken(begins, order), row_ends, spans, _last(place_ends), tiles_x * tiles_y
+        order, _taken(begins, order), row_ends, spans, _last(place_ends), tiles_x * tiles_y * pictures
     )
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges)
-    return Bins(len(splats2d.radii), gaussians, splats, *found, balanced_slices(ends), tiles_x, invalid)
+    return Bins(
+        len(splats2d.radii), gaussians, splats, *found, balanced_slices(ends), tiles_x, camera.height, invalid, pictures
+    )
 
 
-def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions, room: Room | None = None) -> Bins:
+def bin_by_sorting(
+    splats2d: Splats2D,
+    camera: Camera,
+    options: RasterOptions,
+    room: Room | None = None,
+    worlds: Sequence[int] = (),
+) -> Bins:
     """:func:`bin_by_counting` for a GPU: the host waits for the number of tile instances, unless there is ``room``.
 
     Lists and gradients are the same whatever the room. Where instances are so many that one tile might hold too many,
@@ -73,23 +93,29 @@ def bin_by_sorting(splats2d: Splats2D, camera: Camera, options: RasterOptions, r
         count, room.counted = room.instances, read_later(ends[-1:])
     else:
         count = int(ends[-1]) if total else 0
-        _check_count(count, camera, total, device)
+        check_count(count, camera, total, device)
         if room:
             room.learn(count)
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    narrow = tiles_x * tiles_y < 2**15  # the fewer bits, the fewer passes of the sort
+    pictures = max(len(worlds), 1)
+    narrow = tiles_x * tiles_y * pictures < 2**15  # the fewer bits, the fewer passes of the sort
     listed = torch.empty(count, dtype=torch.int16 if narrow else torch.int32, device=device)
     begins, ranks = _list_tiles(splats, ends, listed, torch.empty(0, dtype=torch.int32, device=device), camera, options)
+    if worlds:
+        first = _first_tiles(worlds, tiles_x * tiles_y, device).to(listed.dtype)
+        listed += first[wp.to_torch(gaussians)[ranks]]
     listed, numbers = torch.sort(listed, stable=True)
     new = partial(torch.empty, dtype=torch.int32, device=device)
-    instances, places, ranges = new(count), new(count), new(tiles_x * tiles_y, 2)
+    instances, places, ranges = new(count), new(count), new(tiles_x * tiles_y * pictures, 2)
     inputs = [_listed(listed), view(numbers, wp.int64), view(ranks, wp.int32)]
     outputs = [view(numbers, wp.int32) for numbers in (instances, places, ranges)]
     launch(make_gather_tiles(narrow), count + 1, inputs, outputs, device=device)
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
         _check_longest(int((ranges[:, 1] - ranges[:, 0]).max()))
     invalid = torch.count_nonzero(splats2d.radii < 0)
-    return Bins(total, gaussians, splats, instances, places, begins, ranges, [], tiles_x, invalid)
+    return Bins(
+        total, gaussians, splats, instances, places, begins, ranges, [], tiles_x, camera.height, invalid, pictures
+    )
 
 
 def _count_tiles(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> tuple[wp.array, wp.array, torch.Tensor]:
@@ -117,6 +143,12 @@ def _list_tiles(
     outputs = [view(begins, wp.int32), _listed(listed), view(ranks, wp.int32), view(counts, wp.int32)]
     launch(make_list_tiles(listed.dtype == torch.int16), len(begins), inputs, outputs, device=ends.device)
     return begins, ranks
+
+
+def _first_tiles(worlds: Sequence[int], tiles: int, device: torch.device) -> torch.Tensor:
+    """The first tile of the picture that each Gaussian belongs to, [N] int32."""
+    firsts, counts = torch.arange(0, tiles * len(worlds), tiles), torch.tensor(worlds)
+    return torch.repeat_interleave(*(send(t, device) for t in (firsts.int(), counts)), output_size=sum(worlds))
 
 
 def _boxes(options: RasterOptions) -> int:
@@ -216,7 +248,8 @@ def _last(ends: np.ndarray) -> int:
     return int(ends[-1]) if len(ends) else 0
 
 
-def _check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:
+def check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:
+    """Raise InputError if so many tile instances are more than kernels can number, or than fit."""
     touch = f"rasterize: {drawn} Gaussians on {camera.width} x {camera.height} pixels touch tiles {count} times"
     if count > MAX_INSTANCES:
         raise InputError(f"{touch}, more than the {MAX_INSTANCES} that fit; {LESS}.")

@@ -1,7 +1,7 @@
 """What :func:`warp_splat.rasterize` demands of its arguments, said in one sentence when it is not met."""
 
 import numbers
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -16,6 +16,7 @@ from warp_splat.kernels.project import Projection
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import DRIVERS
+from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.launch import send
 
 ROUNDING = 1e-5  # by which an opacity may lie above 1; alpha is clamped anyway
@@ -33,10 +34,13 @@ def check_camera(camera: Camera | CameraParameters) -> None:
 
 
 @contextmanager
-def own_explained(options: RasterOptions) -> Iterator[None]:
-    """Turn Warp's words on functions of the user's own that do not compile into an InputError."""
+def explained(options: RasterOptions, means: torch.Tensor, cameras: Iterable[Camera]) -> Iterator[None]:
+    """Turn into an InputError what memory that runs out says, and Warp of functions of the user's own."""
+    advice = "render smaller images (Camera.resized) or fewer Gaussians"
+    sizes = ((camera.width, camera.height) for camera in cameras)
     try:
-        yield
+        with memory_explained(means.device, means, sizes, advice):
+            yield
     except Exception as error:
         words, functions = str(error.args[:1]), {"projection": options.projection, "falloff": options.falloff}
         own = [f"options.{name}" for name, value in functions.items() if not isinstance(value, str | None)]

@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from warp_splat.camera import Camera
-from warp_splat.config import T_LEAST, RasterOptions
+from warp_splat.config import T_LEAST, TILE, RasterOptions
 from warp_splat.kernels.bound import BoundView
 from warp_splat.kernels.falloff import FalloffFunctions, make_falloff
 from warp_splat.kernels.splat import BlendVariant
@@ -66,14 +66,21 @@ class Bins:
     ranges: torch.Tensor  # [T, 2] int32, first and last instance
     slices: list[int]  # bounds of slices of tiles with about equal work, for the threads of the CPU; on a GPU empty
     tiles_x: int
+    height: int  # px of a picture
     invalid: int | torch.Tensor  # Gaussians left out because an input was not finite or a quaternion was zero
+    pictures: int = 1  # below each other, with their tiles one after another
     bound: BoundView = field(default_factory=BoundView)  # filled in where the blend finds the bound
 
     def view(self) -> BinsView:
         """What every blend kernel reads first."""
-        return pack_struct(
-            BinsView, tiles_x=self.tiles_x, ranges=self.ranges, instances=self.instances, splats=self.splats
-        )
+        size = {"tiles_x": self.tiles_x, "tiles": len(self.ranges) // self.pictures, "height": self.height}
+        return pack_struct(BinsView, **size, ranges=self.ranges, instances=self.instances, splats=self.splats)
+
+    def by_pixel(self, values: torch.Tensor, width: int) -> torch.Tensor:
+        """Of each tile [T] to its pixels, [H, W]."""
+        tiles = values.view(self.pictures, -1, self.tiles_x)
+        pixels = tiles.repeat_interleave(TILE, 1).repeat_interleave(TILE, 2)[:, : self.height, :width]
+        return pixels.reshape(-1, width)
 
     def new_gradients(self, slots: torch.Tensor) -> list[torch.Tensor]:
         """Room for what slots sum up to, [N, width] each; zeros for depths, if slots have none."""

@@ -62,7 +62,7 @@ def paint_within(
             break
         cut = max(cut * LOWER / float(worst[tiles].quantile(0.9)), FAINT) if left > 1 else FAINT
         found = paint(replace(options, bound=True, **_cuts(options, cut), **by_polynomial), tiles)
-        done = _merged(done, found, _pixels_of(tiles, camera))
+        done = _merged(done, found, found.blending.bins.by_pixel(tiles, camera.width))
     return done
 
 
@@ -78,12 +78,6 @@ def _worst_of_tiles(pixels: torch.Tensor) -> torch.Tensor:
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     whole = torch.nn.functional.pad(pixels, (0, TILE * tiles_x - width, 0, TILE * tiles_y - height))
     return whole.view(tiles_y, TILE, tiles_x, TILE).amax((1, 3)).flatten()
-
-
-def _pixels_of(tiles: torch.Tensor, camera: Camera) -> torch.Tensor:
-    """Of each tile to its pixels, [H, W]."""
-    pixels = tiles.view(-1, -(-camera.width // TILE)).repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
-    return pixels[: camera.height, : camera.width]
 
 
 def _merged(done: Painted, found: Painted, mask: torch.Tensor) -> Painted:

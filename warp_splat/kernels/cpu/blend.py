@@ -43,6 +43,7 @@ from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, total, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
+from warp_splat.kernels.tiles import first_pixel_of
 
 BLOCKS = TILE * TILE // LANES  # per tile
 AHEAD = 32  # instances that are copied, and their boxes found, together; then, whether the whole tile has stopped
@@ -91,7 +92,8 @@ def aligned(address: wp.uint64):
 @wp.func
 def corner(bins: BinsView, tile: int):
     """Center of a tile's first pixel [px]."""
-    return float((tile % bins.tiles_x) * TILE) + 0.5, float((tile // bins.tiles_x) * TILE) + 0.5
+    column, line, _begin = first_pixel_of(bins, tile)
+    return float(column) + 0.5, float(line) + 0.5
 
 
 def walk(bins, near, start, count, way, out, begin, step, finish, tile):
@@ -207,8 +209,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        column = (tile % bins.tiles_x) * TILE
-        line = (tile // bins.tiles_x) * TILE
+        column, line, begins = first_pixel_of(bins, tile)
         room = mat_room()
         # rows of lanes: T, instances walked, sums of w color and of w z
         s = wp.array(ptr=aligned(wp.address_of(room)), shape=(STATE,), dtype=vec16)
@@ -234,7 +235,8 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             for lane in range(LANES):
                 x = left + lane % 4
                 y = top + lane // 4
-                if y < pixels_out.image.shape[0] and x < pixels_out.image.shape[1]:
+                if y < bins.height and x < pixels_out.image.shape[1]:
+                    y += begins
                     final = s[T + block][lane]
                     for channel in range(3):
                         light = s[RGB + channel * BLOCKS + block][lane] + final * background[channel]

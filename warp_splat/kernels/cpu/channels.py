@@ -143,8 +143,9 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
         numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=((STATE - SUMS) * LANES,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
-            x, y = pixel_of(tile, bins.tiles_x, pixel)
-            if y < pixels_out.shape[0] and x < pixels_out.shape[1]:
+            x, y = pixel_of(tile % bins.tiles, bins.tiles_x, pixel)
+            if y < bins.height and x < pixels_out.shape[1]:
+                y += (tile // bins.tiles) * bins.height
                 if wp.static(most is None):
                     place = (pixel // LANES) * WIDTH * LANES + pixel % LANES
                     for channel in range(channels):

@@ -17,6 +17,7 @@ from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
+from warp_splat.kernels.tiles import first_pixel_of
 
 THREADS = wp.constant(TILE * TILE)  # of a block of other kernels: one per pixel
 EACH = wp.constant(4)  # pixels of a lane of the blend, each in a block of 8 x 4
@@ -64,8 +65,8 @@ def going_of(ts: vec_each, thread: int):
 
 @wp.func
 def write_pixel(pixels_out: PixelsView, background: wp.array[float], y: int, x: int, sums: wp.vec4, t: float):
-    """Write a pixel, if it is one of the image: sums of color and depth, and what shines through."""
-    if y < pixels_out.image.shape[0] and x < pixels_out.image.shape[1]:
+    """Write a pixel, if the image has its column: sums of color and depth, and what shines through."""
+    if x < pixels_out.image.shape[1]:
         for channel in range(3):
             pixels_out.image[y, x, channel] = sums[channel] + t * background[channel]
         pixels_out.alpha[y, x] = 1.0 - t
@@ -103,8 +104,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         tile, thread = wp.tid()
         lane = thread % warps.WARP
         half = (thread // warps.WARP) * EACH  # the first of the warp's blocks
-        column = (tile % bins.tiles_x) * TILE
-        line = (tile // bins.tiles_x) * TILE
+        column, line, above = first_pixel_of(bins, tile)
         left = float(column) + 0.5
         top = float(line) + 0.5
         start = bins.ranges[tile][0]
@@ -120,7 +120,7 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
         for p in range(EACH):
             y = line + warps.down_of(lane, half + p)
             x = column + warps.across_of(lane, half + p)
-            if y >= pixels_out.image.shape[0] or x >= pixels_out.image.shape[1]:
+            if y >= bins.height or x >= pixels_out.image.shape[1]:
                 ts[p] = -1.0  # stopped from the beginning
                 counts[p] = 0.0
         going = going_of(ts, thread)
@@ -182,7 +182,9 @@ def make_blend_block(variant: BlendVariant) -> wp.Kernel:
             final_out[tile, place] = wp.abs(ts[p])
             count_out[tile, place] = int(counts[p])
             shown = wp.vec4(reds[p], greens[p], blues[p], fars[p])
-            write_pixel(pixels_out, background, line + place // TILE, column + place % TILE, shown, wp.abs(ts[p]))
+            y = line + place // TILE
+            if y < bins.height:
+                write_pixel(pixels_out, background, above + y, column + place % TILE, shown, wp.abs(ts[p]))
             if wp.static(variant.bound):
                 conclude(settled, p, shown, ts[p], background, bound, since, bins, tile, lane, half, length)
 

@@ -17,6 +17,7 @@ from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, Y
 from warp_splat.kernels.splat import BlendVariant, exponent
 from warp_splat.kernels.step import make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
+from warp_splat.kernels.tiles import first_pixel_of
 
 
 @functools.cache
@@ -40,8 +41,9 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
         median_out: wp.array2d[int],  # [H, W] -1: half of the light comes through
     ):
         tile, thread = wp.tid()
-        column = (tile % bins.tiles_x) * TILE + thread % TILE
-        line = (tile // bins.tiles_x) * TILE + thread // TILE
+        column, line, above = first_pixel_of(bins, tile)
+        column += thread % TILE
+        line += thread // TILE
         x = float(column) + 0.5
         y = float(line) + 0.5
         start = bins.ranges[tile][0]
@@ -84,7 +86,8 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
                         ranks[place] = here
                         w = best
                         here = rank
-        if line < pixels_out.shape[0] and column < pixels_out.shape[1]:
+        if line < bins.height and column < pixels_out.shape[1]:
+            line += above
             if wp.static(most is None):
                 for channel in range(WIDTH):
                     if channel < channels:

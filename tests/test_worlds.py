@@ -1,0 +1,79 @@
+"""Many worlds in one pass, and what they share drawn once: the bits of a call for each, on the CPU and in fibers."""
+
+import pytest
+import torch
+from scenes import cloud, make_camera
+
+from warp_splat import InputError, RasterOptions, rasterize
+from warp_splat.raster.worlds import Worlds, takes
+
+COUNTS = (30, 0, 25)  # one has none of its own
+CAMERA = make_camera(69, 45, fx=60.0)  # whose last tiles are cut
+
+
+def gaussians(seed, count, **more):
+    """A third of them stand where others of all worlds do."""
+    means, *rest = cloud(seed, count or 1, CAMERA, degree=1, **more).parameters()
+    means[::3] = cloud(99, len(means[::3]), CAMERA, frame=-0.35).parameters()[0]
+    return [tensor[:count] for tensor in (means, *rest)]
+
+
+def together(parts):
+    return [torch.cat(tensors) for tensors in zip(*parts, strict=True)]
+
+
+OWN = [gaussians(seed, count, sigma=(0.6, 2), frame=-0.35) for seed, count in enumerate(COUNTS)]
+SHARED = gaussians(7, 40)
+
+
+def check(pictures, worlds, options):
+    """Against a call for each."""
+    for world, own in enumerate(worlds):
+        out = rasterize(*own, CAMERA, options=options(world))
+        for name, table in pictures.items():
+            assert torch.equal(table[world], getattr(out, name)), (world, name)
+
+
+@pytest.mark.parametrize("asked", [{}, {"depth": True, "strongest": 2}, {"antialiasing": True, "extent": "square"}])
+def test_the_bits_are_those_of_a_call_for_each(asked, driver):
+    options = RasterOptions(**asked)
+    backdrop = Worlds(SHARED, [40], CAMERA, options)
+    check(backdrop.pictures, [SHARED], lambda _world: options)
+    alone = Worlds(together(OWN), COUNTS, CAMERA, options)
+    check(alone.pictures, OWN, lambda _world: options)
+    among = Worlds(together(OWN), COUNTS, CAMERA, options, backdrop)
+    check(among.pictures, [together([SHARED, own]) for own in OWN], lambda _world: options)
+    assert among.touched.any() and not among.touched.all() and among.pictures["alpha"][1].max() > 0.1
+    assert set(among.pictures) >= {"image", "alpha", *{"depth", "strongest"}.intersection(asked)}
+
+
+def test_what_hides_is_each_worlds_own(driver):
+    surfaces = torch.stack([torch.full((45, 69), depth) for depth in (4.0, 0.0, 5.0)])
+    surfaces[:, :, 40:] = 0.0  # nothing there
+    options = RasterOptions(hidden_from=surfaces.view(-1, 69))
+    worlds = [together([SHARED, own]) for own in OWN]
+    pictures = Worlds(together(worlds), [40 + count for count in COUNTS], CAMERA, options).pictures
+    check(pictures, worlds, lambda world: RasterOptions(hidden_from=surfaces[world]))
+    assert not torch.equal(pictures["image"][0], rasterize(*worlds[0], CAMERA).image)
+
+
+def test_threads_change_no_byte(same_by_threads):
+    def run():
+        backdrop = Worlds(SHARED, [40], CAMERA, RasterOptions(depth=True))
+        return Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(depth=True), backdrop).pictures.values()
+
+    same_by_threads(run)
+
+
+def test_what_is_wrong_is_said():
+    means, *rest = together(OWN)
+    means[40, 1] = torch.nan
+    with pytest.raises(InputError, match=r"means: expected finite numbers, got 1 .* the first in Gaussian 40"):
+        Worlds([means, *rest], COUNTS, CAMERA, RasterOptions())
+    with pytest.raises(InputError, match="counts: expected 55 Gaussians in all, got 54"):
+        Worlds(together(OWN), [30, 24], CAMERA, RasterOptions())
+    with pytest.raises(InputError, match="neither bound nor tolerance"):
+        Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(bound=True))
+    with pytest.raises(InputError, match=r"options.hidden_from: expected shape \[135, 69\]"):
+        Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(hidden_from=torch.ones(45, 69)))
+    assert not takes(CAMERA, RasterOptions(bound=True)) and not takes(CAMERA, RasterOptions(tolerance=0.01))

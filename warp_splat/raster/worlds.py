@@ -1,0 +1,125 @@
+"""Pictures of several worlds through one camera, all at once: so many small ones cost little.
+
+What stands still in all of them is a backdrop, drawn once. The others draw only the tiles that they touch, of lists
+that are merged. Pixels are those of a call for each world, bit for bit. No gradient.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import accumulate
+
+import torch
+import warp as wp
+
+from warp_splat.camera import Camera
+from warp_splat.config import RasterOptions
+from warp_splat.errors import InputError
+from warp_splat.kernels.splat import Splat2D
+from warp_splat.kernels.tiles import merge_lists
+from warp_splat.raster import checks
+from warp_splat.raster.beside import find_strongest
+from warp_splat.raster.bin import balanced_slices, check_count
+from warp_splat.raster.blend import Blending
+from warp_splat.raster.data import Bins, Splats2D
+from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.project import project
+from warp_splat.runtime.launch import empty, launch, send, view
+
+
+def takes(camera: Camera, options: RasterOptions) -> bool:
+    """Whether :class:`Worlds` do: in a panorama splats show twice, and a tolerance asks for more passes."""
+    around = camera.lens is not None and camera.lens.family.around
+    return not (around or options.bound or options.tolerance is not None)
+
+
+class Worlds:
+    """W worlds before one camera.
+
+    Args:
+        gaussians: means, quats, scales, opacities and sh, of all worlds.
+        counts: of each world's Gaussians.
+        camera: of all worlds.
+        options: what to compute: the color, depth and the strongest; see :func:`takes`. What hides is [W, H, W].
+        backdrop: one world that stands behind and among each of these; its Gaussians are numbered first.
+
+    Raises:
+        InputError: as :func:`warp_splat.rasterize` does; if they do not take that, or ``counts`` are of others.
+    """
+
+    def __init__(
+        self,
+        gaussians: Sequence[torch.Tensor],
+        counts: Sequence[int],
+        camera: Camera,
+        options: RasterOptions,
+        backdrop: "Worlds | None" = None,
+    ):
+        self.driver, self.counts, self.options, self.backdrop = (
+            driver_of(gaussians[0].device),
+            counts,
+            options,
+            backdrop,
+        )
+        self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
+        if not takes(camera, options):
+            raise InputError("options: expected neither bound nor tolerance for several worlds, and no panorama.")
+        with checks.explained(options, gaussians[0], [self.camera]):
+            checks.check_hidden_from(options, self.camera, gaussians[0].device)
+            checked = checks.check_gaussians(*gaussians)
+            if sum(counts) != len(checked.means):
+                raise InputError(f"counts: expected {len(checked.means)} Gaussians in all, got {sum(counts)}.")
+            self.splats = project(checked, camera, options)
+            self.bins = self.driver.bin(self.splats, camera, options, worlds=counts)
+            if invalid := int(self.bins.invalid):
+                checks.explain_invalid(invalid, checked.quats)
+            self.touched = self.bins.ranges[:, 1] > self.bins.ranges[:, 0]
+            if backdrop:
+                self._merge(backdrop)
+
+    @cached_property
+    def pictures(self) -> dict[str, torch.Tensor]:
+        """By the names of RenderOutput, with one more dimension in front, on black."""
+        with checks.explained(self.options, self.splats.means2d, [self.camera]):
+            return self._draw()
+
+    def _draw(self) -> dict[str, torch.Tensor]:
+        blending, black = Blending(self.bins, self.camera, self.options, self.driver), self.splats.depths.new_zeros(3)
+        (image, alpha, depth), saved = self.driver.blend(self.bins, self.camera, black, self.options, False)
+        blending.final, blending.count, _ = saved
+        shown = {"image": image, "alpha": alpha}
+        if self.options.depth:
+            shown["depth"] = depth / alpha.clamp_min(1e-10)
+        if self.options.strongest:
+            shown["strongest"], shown["strongest_weights"], _ = find_strongest(self.splats, blending)
+        shown = {
+            name: table.view(len(self.counts), self.bins.height, *table.shape[1:]) for name, table in shown.items()
+        }
+        if self.options.strongest:  # numbered by world
+            first = len(self.backdrop.splats.radii) if self.backdrop else 0
+            begins = send(torch.tensor([0, *accumulate(self.counts[:-1])]), image.device)
+            shown["strongest"] -= torch.where(shown["strongest"] < first, 0, begins[:, None, None, None])
+        if self.backdrop:
+            own = self.bins.by_pixel(self.touched, self.camera.width).view_as(shown["alpha"])
+            for name, behind in self.backdrop.pictures.items():
+                shown[name] = torch.where(own if behind.dim() == 3 else own[..., None], shown[name], behind)
+        return shown
+
+    def _merge(self, backdrop: "Worlds") -> None:
+        """Add the backdrop's lists to those of the tiles that are touched."""
+        back, own, device = backdrop.bins, self.bins, self.touched.device
+        behind, lengths = ((bins.ranges[:, 1] - bins.ranges[:, 0]).long() for bins in (back, own))
+        lengths += torch.where(self.touched, behind.repeat(own.pictures), 0)
+        ends = lengths.cumsum(0)
+        check_count(count := int(ends[-1]), self.camera, len(own.splats), device)
+        ranges, instances = torch.stack([ends - lengths, ends], 1).int(), own.instances.new_empty(count)
+        slices = balanced_slices(ends.numpy()) if own.slices else []
+        inputs = [back.view(), own.view(), view(ranges, wp.vec2i)]
+        launch(merge_lists, len(ranges), inputs, [view(instances, wp.int32)], bounds=slices, device=device)
+        splats = empty(len(back.splats) + len(own.splats), Splat2D, device)
+        wp.copy(splats, back.splats)
+        wp.copy(splats, own.splats, len(back.splats))
+        numbers = torch.cat([wp.to_torch(back.gaussians), wp.to_torch(own.gaussians) + back.gaussian_count])
+        self.splats = Splats2D(*map(torch.cat, zip(backdrop.splats, self.splats, strict=True)))
+        listed = {"gaussians": wp.from_torch(numbers), "splats": splats, "instances": instances}
+        self.bins: Bins = replace(own, ranges=ranges, slices=slices, **listed)
