@@ -21,7 +21,7 @@ from warp_splat.raster import checks
 from warp_splat.raster.beside import find_strongest
 from warp_splat.raster.bin import balanced_slices, check_count
 from warp_splat.raster.blend import Blending
-from warp_splat.raster.data import Bins, Splats2D
+from warp_splat.raster.data import Bins
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
 from warp_splat.runtime.launch import empty, launch, send, view
@@ -55,12 +55,8 @@ class Worlds:
         options: RasterOptions,
         backdrop: "Worlds | None" = None,
     ):
-        self.driver, self.counts, self.options, self.backdrop = (
-            driver_of(gaussians[0].device),
-            counts,
-            options,
-            backdrop,
-        )
+        self.counts, self.options, self.backdrop = counts, options, backdrop
+        self.driver = driver_of(gaussians[0].device)
         self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
         if not takes(camera, options):
             raise InputError("options: expected neither bound nor tolerance for several worlds, and no panorama.")
@@ -87,14 +83,13 @@ class Worlds:
         blending, black = Blending(self.bins, self.camera, self.options, self.driver), self.splats.depths.new_zeros(3)
         (image, alpha, depth), saved = self.driver.blend(self.bins, self.camera, black, self.options, False)
         blending.final, blending.count, _ = saved
-        shown = {"image": image, "alpha": alpha}
+        found = {"image": image, "alpha": alpha}
         if self.options.depth:
-            shown["depth"] = depth / alpha.clamp_min(1e-10)
-        if self.options.strongest:
-            shown["strongest"], shown["strongest_weights"], _ = find_strongest(self.splats, blending)
-        shown = {
-            name: table.view(len(self.counts), self.bins.height, *table.shape[1:]) for name, table in shown.items()
-        }
+            found["depth"] = depth / alpha.clamp_min(1e-10)
+        if self.options.strongest:  # that takes numbers and weights from the lists, nothing from the splats
+            found["strongest"], found["strongest_weights"], _ = find_strongest(self.splats, blending)
+        shape = len(self.counts), self.bins.height
+        shown = {name: table.view(*shape, *table.shape[1:]) for name, table in found.items()}
         if self.options.strongest:  # numbered by world
             first = len(self.backdrop.splats.radii) if self.backdrop else 0
             begins = send(torch.tensor([0, *accumulate(self.counts[:-1])]), image.device)
@@ -120,6 +115,5 @@ class Worlds:
         wp.copy(splats, back.splats)
         wp.copy(splats, own.splats, len(back.splats))
         numbers = torch.cat([wp.to_torch(back.gaussians), wp.to_torch(own.gaussians) + back.gaussian_count])
-        self.splats = Splats2D(*map(torch.cat, zip(backdrop.splats, self.splats, strict=True)))
         listed = {"gaussians": wp.from_torch(numbers), "splats": splats, "instances": instances}
         self.bins: Bins = replace(own, ranges=ranges, slices=slices, **listed)
