@@ -75,6 +75,7 @@ def save_exr(path: Path, values: np.ndarray) -> None:
         InputError: if the file cannot be written.
     """
     spec = oiio.ImageSpec(values.shape[1], values.shape[0], 1, "float")
+    spec.attribute("DateTime", "1970:01:01 00:00:00")  # else that of writing, and other bytes
     output = oiio.ImageOutput.create(str(path))
     if not (output and output.open(str(path), spec) and output.write_image(values[..., None]) and output.close()):
         raise InputError(f"{path}: it cannot be written: {oiio.geterror() or output.geterror()}; name another folder.")
