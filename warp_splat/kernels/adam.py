@@ -22,15 +22,12 @@ RATE, EPS, PER_ROOT, BETA1, REST1, BETA2, REST2 = (wp.constant(column) for colum
 
 
 @wp.func
-def adam_step_of(
-    value: Any, grad: Any, before: Any, before2: Any,
-    rate: float, eps: float, per_root: float, beta1: float, rest1: float, beta2: float, rest2: float,
-):  # fmt: skip
-    """A number, its mean gradient and the mean of its square, after the step."""
-    m = before * beta1 + grad * rest1
-    v = before2 * beta2 + times(grad * rest2, grad)
-    spread = root(v) * per_root + fill(eps, v)
-    return value - over(m * rate, spread), m, v
+def adam_step_of(value: Any, grad: Any, before: Any, before2: Any, numbers: Any, table: int):
+    """A number, its mean gradient and the mean of its square, after the step; ``numbers``: its table's, see RATE."""
+    m = before * numbers[table, BETA1] + grad * numbers[table, REST1]
+    v = before2 * numbers[table, BETA2] + times(grad * numbers[table, REST2], grad)
+    spread = root(v) * numbers[table, PER_ROOT] + fill(numbers[table, EPS], v)
+    return value - over(m * numbers[table, RATE], spread), m, v
 
 
 @functools.cache
@@ -80,11 +77,7 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
                 grad = grads[i]
                 before = widened(firsts[i])
                 before2 = widened(seconds[i])
-                value, m, v = adam_step_of(
-                    values[i], grad, before, before2,
-                    numbers[table, RATE], numbers[table, EPS], numbers[table, PER_ROOT],
-                    numbers[table, BETA1], numbers[table, REST1], numbers[table, BETA2], numbers[table, REST2],
-                )  # fmt: skip
+                value, m, v = adam_step_of(values[i], grad, before, before2, numbers, table)
                 if wp.static(sparse):
                     mask = drawn(radii, lanes * group, lanes * i, width)
                     m = pick(mask, m, before)

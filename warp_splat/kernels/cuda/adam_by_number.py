@@ -7,7 +7,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.adam import BETA1, BETA2, EPS, PER_ROOT, RATE, REST1, REST2, adam_step_of
+from warp_splat.kernels.adam import adam_step_of
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.halves import HALF, noise, rounded, widened
 
@@ -50,11 +50,7 @@ def make_adam_by_number(sparse: bool, halves: bool = False) -> wp.Kernel:
                 grads = wp.array(ptr=tables_out[table, GRADIENTS], shape=(i + 1,), dtype=float)
                 firsts = wp.array(ptr=tables_out[table, FIRSTS], shape=(i + 1,), dtype=moment)
                 seconds = wp.array(ptr=tables_out[table, SECONDS], shape=(i + 1,), dtype=moment)
-                value, m, v = adam_step_of(
-                    values[i], grads[i], widened(firsts[i]), widened(seconds[i]),
-                    numbers[table, RATE], numbers[table, EPS], numbers[table, PER_ROOT],
-                    numbers[table, BETA1], numbers[table, REST1], numbers[table, BETA2], numbers[table, REST2],
-                )  # fmt: skip
+                value, m, v = adam_step_of(values[i], grads[i], widened(firsts[i]), widened(seconds[i]), numbers, table)
                 values[i] = value
                 if wp.static(halves):
                     bits = noise(start * width + i, keys[table], value)
