@@ -164,23 +164,18 @@ def of_sums(
     return (send(torch.from_numpy(matrix), sums.device) * sums).sum(1).to(like)
 
 
-def intrinsics_gradient(
-    camera: Camera,
-    cam: CameraView,
-    lanes: int,
-    intrinsics: torch.Tensor,
-    opacities: torch.Tensor,
-    splats: Splats2D,
-    adj: Splats2D,
-    time: np.ndarray,
-    peeks: bool,
+def intrinsics_sums(
+    cam: CameraView, lanes: int, opacities: torch.Tensor, splats: Splats2D, adj: Splats2D
 ) -> torch.Tensor:
-    """Of the intrinsics, like them; ``time`` [2]: what they get through the time of a row."""
+    """What :func:`intrinsics_gradient` needs; ``opacities``: before antialiasing."""
     inputs = [cam, opacities, splats.means2d, splats.conics, splats.opacities]
     inputs += [adj.means2d, adj.conics, adj.opacities]
-    sums = _sums(make_adj_intrinsics, lanes, 4, opacities, inputs)
-    by_time = np.array([0.0, time[0], 0.0, time[1]]) / camera.height
-    return of_sums(lambda sums: sums / [camera.fx, camera.fy, 1.0, 1.0] + by_time, sums, peeks, intrinsics)
+    return _sums(make_adj_intrinsics, lanes, 4, opacities, inputs)
+
+
+def intrinsics_gradient(camera: Camera, time: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """Of the intrinsics [4], from the sums over all Gaussians [4]; ``time`` [2]: what comes through that of a row."""
+    return sums / [camera.fx, camera.fy, 1.0, 1.0] + np.array([0.0, time[0], 0.0, time[1]]) / camera.height
 
 
 def coefficients_gradient(lens: Lens, found: list[torch.Tensor], coefficients: torch.Tensor) -> torch.Tensor:

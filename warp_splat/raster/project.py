@@ -250,9 +250,9 @@ class Project(torch.autograd.Function):
                 adj_twist = cameras.of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
                 adj_last = cameras.of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
             if wants_intrinsics:
-                adj_intrinsics = cameras.intrinsics_gradient(
-                    it.camera, it.cam, lanes, intrinsics, given.opacities, splats, adj_splats, adj_motion[:, 3], peeks
-                )
+                sums = cameras.intrinsics_sums(it.cam, lanes, given.opacities, splats, adj_splats)
+                by_intrinsics = partial(cameras.intrinsics_gradient, it.camera, adj_motion[:, 3])
+                adj_intrinsics = cameras.of_sums(by_intrinsics, sums, peeks, intrinsics)
             if it.bend:
                 adj_coefficients = cameras.coefficients_gradient(it.camera.lens, found, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
