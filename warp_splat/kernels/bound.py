@@ -192,18 +192,13 @@ def add_box(maps: wp.array4d[int], band: int, depth: int, box: wp.vec4i, amount:
 
 
 @wp.func
-def short_axis(conic: wp.vec3):
-    """Variance along the short axis [px^2]."""
-    return 2.0 / (conic[0] + conic[2] + wp.length(wp.vec2(conic[0] - conic[2], 2.0 * conic[1])))
-
-
-@wp.func
 def conditions(rules: Rules, mean: wp.vec2, conic: wp.vec3, spread: wp.vec2, size: float, z: float):
     """How much rounding changes the exponent, relative, and the place, in standard deviations (docs/tolerance.md).
 
     ``spread``: standard deviations along x and y [px]; ``size``: the largest scale; ``z``: depth.
     """
-    short = short_axis(conic)
+    # variance along the short axis [px^2]
+    short = 2.0 / (conic[0] + conic[2] + wp.length(wp.vec2(conic[0] - conic[2], 2.0 * conic[1])))
     u = wp.cw_div(mean - rules.principal, rules.focal)
     aside = 1.0 + wp.dot(u, u)
     most = wp.max(rules.focal[0], rules.focal[1])
