@@ -86,6 +86,7 @@ PIECES = {
         lambda x, y, z: np.where(y < z, x * x, y * z),
     ),
     "fraction": ("simd.fraction(x, simd.whole(y))", lambda x, y, z: x - np.trunc(y)),
+    "negative": ("simd.negative(x)", lambda x, y, z: -x),
     "inverse": ("simd.inverse(x)", lambda x, y, z: 1 / x),
     "root": ("simd.root(x)", lambda x, y, z: np.sqrt(x)),
     "halved": ("simd.halved(x, simd.whole(y))", lambda x, y, z: x * 0.5 ** np.trunc(y)),

@@ -162,15 +162,10 @@ def fma(a: vec16, b: float, c: vec16):
     return fma(a, vec16(b), c)  # not fill: it is no constant
 
 
-@wp.func
+@in_lanes("-x", "adj_x -= adj_ret;")
 def negative(x: float):
     """-x, which the code for a GPU has as a part of what reads it; Warp's is 0 - x."""
     return x * -1.0
-
-
-@wp.func
-def negative(x: vec16):
-    return -x
 
 
 @in_lanes("a / b", "V q = adj_ret / b; adj_a += q; adj_b = fused(-(a / b), q, adj_b);")
