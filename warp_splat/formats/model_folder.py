@@ -250,15 +250,6 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     return read_json(path, "a list of cameras as training writes it", parse) if path.exists() else []
 
 
-def read_refined(folder: str | Path, iteration: int) -> dict[str, Camera]:
-    """By name, the cameras that were learned with the Gaussians of an iteration; none if they were not.
-
-    Raises:
-        InputError: if the file is damaged.
-    """
-    return dict(read_cameras(ply_path(folder, iteration).parent))
-
-
 def write_environment(ply: Path, harmonics: np.ndarray | None) -> None:
     """Beside a model's Gaussians, write what lies behind them: coefficients as those of a Gaussian, [16, 3], or None.
 

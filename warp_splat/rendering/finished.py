@@ -13,7 +13,7 @@ from warp_splat.color import to_bytes
 from warp_splat.config import PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import open_model, read_environment, read_refined
+from warp_splat.formats.model_folder import open_model, ply_path, read_cameras, read_environment
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
@@ -111,7 +111,7 @@ class Finished:
         Raises:
             InputError: if the scene has changed since the training.
         """
-        cameras = read_refined(self.path, self.iteration)
+        cameras = dict(read_cameras(ply_path(self.path, self.iteration).parent))
         if not cameras:
             return scene
         train, test = ([self._refined(view, cameras) for view in views] for views in (scene.train, scene.test))
