@@ -243,7 +243,8 @@ def test_the_sharpest_frame_of_each_span_is_taken(tmp_path):
     save_video(tmp_path / "clip.mp4", mixed, 25)
     (tmp_path / "frames").mkdir()
     shares = []
-    written = sample_frames(tmp_path / "clip.mp4", tmp_path / "frames", 6, 2, pytest.fail, shares.append)
+    config = SfmConfig("", "", frames=6, threads=2)
+    written = sample_frames(tmp_path / "clip.mp4", tmp_path / "frames", config, pytest.fail, shares.append)
     taken = sorted(int(re.search(r"\d+", path.name)[0]) for path in (tmp_path / "frames").iterdir())
     assert written == 6 and taken == sharp and shares == sorted(shares)
 
@@ -258,7 +259,8 @@ def test_a_video_that_is_cut_off_is_told(tmp_path, keep, said):
         container.mux(stream.encode())
     data, told = (tmp_path / "clip.mkv").read_bytes(), []
     (tmp_path / "clip.mkv").write_bytes(data[: int(keep * len(data))])
-    sample_frames(tmp_path / "clip.mkv", tmp_path, 2, 1, told.append, lambda share: None)
+    config = SfmConfig("", "", frames=2, threads=1)
+    sample_frames(tmp_path / "clip.mkv", tmp_path, config, told.append, lambda share: None)
     assert said in "".join(told) and len(told) == bool(said)
 
 

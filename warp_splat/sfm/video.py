@@ -13,6 +13,7 @@ from av.error import FFmpegError, InvalidDataError
 from PIL import Image
 from scipy.ndimage import laplace
 
+from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.files import atomic_write
 
@@ -21,20 +22,14 @@ QUALITY = 97  # of the JPEG files, 0 to 100
 
 
 def sample_frames(
-    path: Path,
-    folder: Path,
-    count: int,
-    threads: int,
-    report: Callable[[str], object],
-    advance: Callable[[int], object],
+    path: Path, folder: Path, config: SfmConfig, report: Callable[[str], object], advance: Callable[[int], object]
 ) -> int:
-    """Write the sharpest frame of each of ``count`` equal spans of a video, as JPEG named by its number.
+    """Write the sharpest frame of each of ``config.frames`` equal spans of a video, as JPEG named by its number.
 
     Args:
         path: the video; the first video stream is read, and turned as its display matrix says.
         folder: where to write; must exist.
-        count: how many frames; all, if the video has fewer.
-        threads: of the decoder.
+        config: says how many frames (all, if the video has fewer), and the threads of the decoder.
         report: called with a line for each thing that the user should know.
         advance: called with the share of the video that is read, in percent, as it grows.
 
@@ -44,7 +39,7 @@ def sample_frames(
     Raises:
         InputError: if the file is not a video that PyAV (FFmpeg) can decode.
     """
-    written, damaged = 0, []
+    written, damaged, count = 0, [], config.frames
     try:
         with av.open(str(path)) as container:
             if not container.streams.video:
@@ -55,7 +50,7 @@ def sample_frames(
             if end < 0.9 * told:
                 report(f"warning: the video's pictures end after {end:.1f} of {told:.1f} s: is the file cut off?")
         with av.open(str(path)) as container:
-            frames = enumerate(_decode(container, threads, damaged))
+            frames = enumerate(_decode(container, config.threads, damaged))
             span_of = lambda numbered: min(numbered[0] * count // max(total, 1), count - 1)  # noqa: E731
             for span, numbered in groupby(frames, span_of):
                 index, frame = max(numbered, key=lambda each: _sharpness_of(each[1]))
