@@ -12,7 +12,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, Since
 from warp_splat.kernels.cuda import warps
-from warp_splat.kernels.cuda.settle import at_start, blend_ideal, conclude, expect
+from warp_splat.kernels.cuda.settle import EACH, at_start, blend_ideal, conclude, expect
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
@@ -20,11 +20,10 @@ from warp_splat.kernels.structs import BinsView, PixelsView
 from warp_splat.kernels.tiles import first_pixel_of
 
 THREADS = wp.constant(TILE * TILE)  # of a block of other kernels: one per pixel
-EACH = wp.constant(4)  # pixels of a lane of the blend, each in a block of 8 x 4
 BATCH = wp.constant(TILE * TILE // 4)  # Gaussians that the blend stages at once, and its threads
 TOUCHED = wp.constant(10)  # which blocks: behind a slot's columns, of what is staged
 vec12 = wp.types.vector(length=12, dtype=float)
-vec_each = wp.types.vector(length=4, dtype=float)
+vec_each = wp.types.vector(length=EACH, dtype=float)
 
 #: Of modules whose kernels run in blocks. No regrouping of sums: it would change what CPU fibers check.
 BLOCK_OPTIONS = {"enable_backward": False, "block_dim": TILE * TILE}

@@ -9,11 +9,10 @@ from warp_splat.kernels.cuda.warps import across_of, down_of
 from warp_splat.kernels.simd import where_less
 from warp_splat.kernels.structs import BinsView
 
-EACH = 4  # pixels of a lane
+EACH = 4  # pixels of a lane of the blend, each in a block of 8 x 4
 T, BEFORE, TOTAL, TAKEN, ADDED, ROUNDING, LIGHT = (wp.constant(row) for row in range(7))
 SEEN = wp.constant(9)
 mat_settled = wp.types.matrix(shape=(12, EACH), dtype=float)
-vec_each = wp.types.vector(length=EACH, dtype=float)
 
 
 @wp.func
