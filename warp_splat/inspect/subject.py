@@ -1,7 +1,5 @@
 """What is examined: all of a scene that can be read, and a finding for each thing that cannot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -43,7 +41,7 @@ class Subject:
     root: Path  # of the images
     photos: list[Photo] = field(default_factory=list)  # whose file and camera fit each other
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [P, 3] float64, finite
-    model: pycolmap.Reconstruction | None = None  # of a COLMAP scene
+    model: "pycolmap.Reconstruction | None" = None  # of a COLMAP scene
     random_points: bool = False  # not measured, but drawn: of a nerf-synthetic scene
     thumbnails: dict[str, np.ndarray] = field(default_factory=dict)  # by name, [h, w, 3] uint8
     alpha: list[str] = field(default_factory=list)  # names of images with an alpha channel

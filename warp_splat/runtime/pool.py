@@ -1,7 +1,5 @@
 """The threads of the CPU: who is free takes the next slice of the work. Results do not depend on their number."""
 
-from __future__ import annotations
-
 import atexit
 import itertools
 import os
@@ -23,7 +21,7 @@ WIDTH = 64  # numbers: a multiple of what torch computes at once on any processo
 
 _threads = CORES
 _helpers: list[threading.Thread] = []
-_jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+_jobs: "queue.SimpleQueue[_Job | None]" = queue.SimpleQueue()
 
 
 class _Job:

@@ -1,7 +1,5 @@
 """Photographs without cameras: which files of a folder they are, and what to tell who trains on them."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from pathlib import Path

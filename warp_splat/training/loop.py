@@ -5,8 +5,6 @@ A step is two methods of the trainer. ``update`` changes the model by the gradie
 are written, and the viewer draws. This page and those two methods are the whole of a training.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -32,7 +30,7 @@ PREVIEW_SECONDS = 5.0
 KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 
 
-def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
+def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "TrainingViewer | None") -> None:
     """Train until the last step, or until Ctrl-C has put a signal into ``interrupted``."""
     report, processes = trainer.config.report, trainer.processes
     deadline = Deadline(trainer.config.learn, trainer.photographs.full_size_from, processes.images)

@@ -8,8 +8,6 @@ to 1.13 of them over its sweeps. Tried:
   live in pieces of the heap that are there anyhow; it took 0.3 to 1.3 s.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import psutil
@@ -65,7 +63,7 @@ def step_memory(
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
 
-def describe(trainer: Trainer) -> str:
+def describe(trainer: "Trainer") -> str:
     """What to tell the user once kernels are loaded: memory and the Gaussians assumed, and whether that can be had."""
     scene, config, processes = trainer.scene, trainer.config, trainer.processes.local_count
     pixels = max(view.camera.width * view.camera.height for view in scene.train)

@@ -1,7 +1,5 @@
 """Event files for TensorBoard, written by the package tensorboardX, which needs neither TensorFlow nor TensorBoard."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +34,7 @@ class EventLog:
             self.writer.close()
 
 
-def writer_class() -> type[SummaryWriter]:
+def writer_class() -> "type[SummaryWriter]":
     """What writes event files.
 
     Raises:

@@ -1,7 +1,5 @@
 """A browser that looks on: its controls, its camera, and what it has been shown."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
@@ -56,7 +54,7 @@ class Watcher:
 
     def __init__(
         self,
-        client: viser.ClientHandle,
+        client: "viser.ClientHandle",
         views: Mapping[str, View],
         subject: np.ndarray,
         unit: str,
