@@ -6,7 +6,7 @@ sliced so that the Gaussian is computed at one place of a kernel (:mod:`warp_spl
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -41,25 +41,25 @@ def conic_from_root(adj_root: wp.vec3, root: wp.vec3):
 
 
 @wp.func
-def geometry_from_root(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
+def geometry_from_root(sums: Any, root: wp.vec3, opacity: float):
     """dL/d(mean, conic) from sums over pixels of the gradients of mean and root."""
-    return s, conic_from_root(wp.vec3(xx, xy, yy), root)
+    return wp.vec2(sums[MEAN_X], sums[MEAN_Y]), conic_from_root(wp.vec3(sums[XX], sums[XY], sums[YY]), root)
 
 
 @wp.func
-def geometry_from_magnitudes(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
+def geometry_from_magnitudes(sums: Any, root: wp.vec3, opacity: float):
     """Sums over pixels of |dL/dmean|, from their shares by dL/dq; nothing of the conic."""
-    return 2.0 * LN_2 * opacity * s, wp.vec3(0.0)
+    return 2.0 * LN_2 * opacity * wp.vec2(sums[MEAN_X], sums[MEAN_Y]), wp.vec3(0.0)
 
 
 @wp.func
-def geometry_from_moments(s: wp.vec2, xx: float, xy: float, yy: float, root: wp.vec3, opacity: float):
+def geometry_from_moments(sums: Any, root: wp.vec3, opacity: float):
     """dL/d(mean, conic) from sums over pixels of d and d d', weighted by dL/dopacity."""
-    adj_u = -2.0 * LN_2 * opacity * (root[0] * s[0] + root[1] * s[1])
-    adj_v = -2.0 * LN_2 * opacity * root[2] * s[1]
+    adj_u = -2.0 * LN_2 * opacity * (root[0] * sums[MEAN_X] + root[1] * sums[MEAN_Y])
+    adj_v = -2.0 * LN_2 * opacity * root[2] * sums[MEAN_Y]
     return (
         wp.vec2(root[0] * adj_u, root[1] * adj_u + root[2] * adj_v),
-        wp.vec3(-0.5 * opacity * xx, -opacity * xy, -0.5 * opacity * yy),
+        wp.vec3(-0.5 * opacity * sums[XX], -opacity * sums[XY], -0.5 * opacity * sums[YY]),
     )
 
 
@@ -70,8 +70,8 @@ class ReverseStep(NamedTuple):
         t: transmittance behind. adj_t: dL/dT behind, by hand times T. lit: what the pixel's gradient says of the
         channels, color . u.
         -> T in front, that in front, the weight, and what to sum over pixels, in the columns before the channels'.
-    geometry(s, xx, xy, yy, root, opacity):
-        What these sums, the first two in one, say of mean and conic.
+    geometry(sums, root, opacity):
+        What these sums say of mean and conic.
     """
 
     pixel: wp.Function

@@ -11,7 +11,7 @@ from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, fma, times, vec16
-from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
+from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D
 from warp_splat.kernels.step import make_reverse_step
 from warp_splat.kernels.structs import BinsView
@@ -71,9 +71,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
         while grad < GRADS:  # as a range, which Warp unrolls, 10 % of the loop slower
             sums[grad] = folded(s, SUMS + grad)
             grad += 1
-        mean, conic = geometry(
-            wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], splat.root, splat.opacity
-        )
+        mean, conic = geometry(sums, splat.root, splat.opacity)
         write_geometry(slots_out, k, mean, conic)
         for grad in range(OPACITY, GRADS):
             slots_out[k, grad] = sums[grad]

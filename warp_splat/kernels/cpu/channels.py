@@ -16,7 +16,7 @@ from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, wal
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, equal, fma, pick, some, times, vec16, where_less
-from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
+from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
 from warp_splat.kernels.step import make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
@@ -217,9 +217,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             grad += 1
         for grad in range(CHANNEL):
             sums[grad] = folded(s, SUMS + grad)
-        mean, conic = geometry(
-            wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], splat.root, splat.opacity
-        )
+        mean, conic = geometry(sums, splat.root, splat.opacity)
         write_geometry(slots_out, k, mean, conic)
         slots_out[k, OPACITY] = sums[OPACITY]
         return False

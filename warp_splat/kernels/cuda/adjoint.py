@@ -137,10 +137,7 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
         ts = warps.vec_pixels(0.0)
         adj_ts = warps.vec_pixels(0.0)
         walked = warps.vec_pixels(0.0)
-        reds = warps.vec_pixels(0.0)
-        greens = warps.vec_pixels(0.0)
-        blues = warps.vec_pixels(0.0)
-        fars = warps.vec_pixels(0.0)
+        ups = warps.mat_pixels(0.0)
         for p in range(warps.PIXELS):
             place = warps.down_of(lane, p) * TILE + warps.across_of(lane, p)
             u = up[tile, place]
@@ -149,11 +146,8 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
             adj_ts[p] = adj_final[tile, place]
             if wp.static(mode == "manual"):
                 adj_ts[p] = adj_ts[p] * ts[p]
-            reds[p] = u[0]
-            greens[p] = u[1]
-            blues[p] = u[2]
-            if wp.static(CHANNELS > 3):
-                fars[p] = u[3]
+            for channel in range(CHANNELS):
+                ups[channel, p] = u[channel]
         for batch in range((steps[tile] + warps.WARP - 1) // warps.WARP):
             last = steps[tile] - 1 - batch * warps.WARP
             mine = warps.vec10(0.0)
@@ -175,21 +169,19 @@ def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
                     if (touched & (1 << p)) != 0:  # the same for all lanes
                         dx = g[MEAN_X] - (left + float(warps.across_of(lane, p)))
                         dy = g[MEAN_Y] - (top + float(warps.down_of(lane, p)))
-                        lit = reds[p] * g[CHANNEL] + greens[p] * g[CHANNEL + 1] + blues[p] * g[CHANNEL + 2]
+                        lit = ups[0, p] * g[CHANNEL] + ups[1, p] * g[CHANNEL + 1] + ups[2, p] * g[CHANNEL + 2]
                         if wp.static(CHANNELS > 3):
-                            lit += fars[p] * g[CHANNEL + 3]
+                            lit += ups[3, p] * g[CHANNEL + 3]
                         front, adj_front, w, part = pixel(
                             dx, dy, root, g[OPACITY], ts[p], adj_ts[p], alphas, here, walked[p], lit
                         )
                         sums += warps.vec10(
                             part[MEAN_X], part[MEAN_Y], part[XX], part[XY], part[YY], part[OPACITY],
-                            w * reds[p], w * greens[p], w * blues[p], w * fars[p],
+                            w * ups[0, p], w * ups[1, p], w * ups[2, p], w * ups[3, p],
                         )  # fmt: skip
                         ts[p] = front
                         adj_ts[p] = adj_front
-                mean, conic = geometry(
-                    wp.vec2(sums[MEAN_X], sums[MEAN_Y]), sums[XX], sums[XY], sums[YY], root, g[OPACITY]
-                )
+                mean, conic = geometry(sums, root, g[OPACITY])
                 row = row_of(mean, conic, sums)
                 total = warps.lane_sum(row, lane)
                 k = start + last - j

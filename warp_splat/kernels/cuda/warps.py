@@ -18,6 +18,7 @@ COLUMNS, AT_ONCE = wp.constant(10), wp.constant(16)  # of a slot; channels besid
 vec10 = wp.types.vector(length=10, dtype=float)
 vec_channels = wp.types.vector(length=16, dtype=float)
 vec_pixels = wp.types.vector(length=TILE * TILE // 32, dtype=float)
+mat_pixels = wp.types.matrix(shape=(4, TILE * TILE // 32), dtype=float)  # for red, green, blue, and depth
 
 WARP_OPTIONS = {"enable_backward": False, "block_dim": 32}
 
