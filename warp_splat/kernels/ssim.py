@@ -111,8 +111,12 @@ def between(values: vec16, limits: wp.vec2):
 
 
 @wp.func
-def similarity(mx: Any, my: Any, squares: Any, product: Any, outside: Any, p: float, q: float):
-    """SSIM, and its derivatives by m1, e11 and e12, from the moments: e11 + e22, e12; ``outside`` is 1 - s."""
+def similarity(moments: Any, outside: Any, p: float, q: float):
+    """SSIM, and its derivatives by m1, e11 and e12, from the moments m1, m2, e11, e22, e12; ``outside`` is 1 - s."""
+    mx = moments[0]
+    my = moments[1]
+    squares = moments[2] + moments[3]
+    product = moments[4]
     one = fill(1.0, mx)
     inner = one - outside
     mu_x = mx + inner * p
@@ -158,15 +162,7 @@ def compare_row(
     sums = zero
     for group in range(groups):
         outside = missing[group] * (1.0 - above) + vec16(above)  # 1 - s, exactly 0 where the window fits
-        ssim, mean, square, product = similarity(
-            moments[group, 0],
-            moments[group, 1],
-            moments[group, 2] + moments[group, 3],
-            moments[group, 4],
-            outside,
-            p,
-            q,
-        )
+        ssim, mean, square, product = similarity(moments[group], outside, p, q)
         start = LANES * group
         sums = sums + inside(ssim, start, length)
         slopes_out[0, group + 1] = inside(mean, start, length)

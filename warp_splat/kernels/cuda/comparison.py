@@ -112,9 +112,7 @@ def compare_block(
             for tap in range(WINDOW):
                 sums += ring[tap] * WEIGHTS[tap]
             above = outside(row, 1, height)
-            ssim, mean, square, product = similarity(
-                sums[0], sums[1], sums[2] + sums[3], sums[4], missing * (1.0 - above) + above, p, q
-            )
+            ssim, mean, square, product = similarity(sums, missing * (1.0 - above) + above, p, q)
             loss += weights[1] * ssim
             slopes_out[0, row, place] = mean
             slopes_out[1, row, place] = square
