@@ -125,8 +125,7 @@ def test_the_package_compares_with_what_was_measured():
 
 def taken(learn: LearnOptions, pace, spent: float = 0.0) -> tuple[float, int, int]:
     """Seconds at the end, the step before the cooldown and its length, where step k takes pace(k) seconds."""
-    full_size = learn.coarse_until_iter * TASK.shares[-1]
-    deadline, iteration, end, settled = Deadline(learn, full_size), 0, np.inf, (0, 0)
+    deadline, iteration, end, settled = Deadline(learn, TASK.shares), 0, np.inf, (0, 0)
     while iteration < end:
         iteration += 1
         spent += pace(iteration)

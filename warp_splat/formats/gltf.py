@@ -87,7 +87,8 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         if not 0 < len(placed) <= MOST_PIECES:
             raise Unexpected(f"{len(placed)} meshes of them in its scene, at most {MOST_PIECES} are read")
         notes: list[str] = []
-        parts, room = [], document.data_bytes // LEAST_BYTES
+        lengths = {buffer.path: buffer.length for buffer in document.buffers}  # those that are one file counted once
+        parts, room = [], sum(lengths.values()) // LEAST_BYTES
         for piece, world in placed:
             splats = _read_primitive(document, piece, notes.append)
             room -= len(splats.means)

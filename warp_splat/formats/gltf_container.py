@@ -59,11 +59,6 @@ class Document:
         entries = [self.entry("buffers", index) for index in range(count)]
         self.buffers = [self._open(entry, chunk if index == 0 else None) for index, entry in enumerate(entries)]
 
-    @property
-    def data_bytes(self) -> int:
-        """Bytes of all buffers, those that are one file counted once."""
-        return sum({buffer.path: buffer.length for buffer in self.buffers}.values())
-
     def entry(self, kind: str, index: Any) -> dict:
         """The object ``index`` of the list ``kind`` of the JSON."""
         entries = self.json.get(kind)

@@ -5,7 +5,7 @@ import math
 import statistics
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -33,13 +33,13 @@ class Deadline:
 
     Args:
         learn: as planned.
-        full_size: the step from which photographs have it.
+        shares: of --coarse_until_iter, where sizes of photographs end.
         count: images in a step.
     """
 
-    def __init__(self, learn: LearnOptions, full_size: float = 0.0, count: int = 1):
+    def __init__(self, learn: LearnOptions, shares: Sequence[float] = (), count: int = 1):
         self.seconds, self.cooldown = 60.0 * learn.minutes, learn.cooldown
-        self.full_size = full_size
+        self.full_size = learn.coarse_until_iter * shares[-1] if shares else 0.0  # the step from which they have it
         self.past: deque[tuple[int, float]] = deque(maxlen=max(learn.iterations // (WINDOW * count), FEWEST))
         self.near = math.inf  # the step since which the end is near by each pace that was seen
 

@@ -33,7 +33,7 @@ KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "TrainingViewer | None") -> None:
     """Train until the last step, or until Ctrl-C has put a signal into ``interrupted``."""
     report, processes = trainer.config.report, trainer.processes
-    deadline = Deadline(trainer.config.learn, trainer.photographs.full_size_from, processes.images)
+    deadline = Deadline(trainer.config.learn, trainer.photographs.shares, processes.images)
     unprofiled = None  # iteration and seconds before the last --profile steps
     trainer.check_identical(run.iteration)
     with _progress_bar(trainer, run) as bar, timers.profile(report.profile > 0) as stages:

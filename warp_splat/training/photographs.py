@@ -92,7 +92,7 @@ class Photographs:
         self.config, self.device, self.with_alpha = config, device, with_alpha
         self.shares = shares_of_size(config.learn, scene.train)
         self.kept: dict[View, Photograph] = {}
-        self._count, self._limit = len(scene.train), scene.memory.limit
+        self._limit = scene.memory.limit
         folder = config.report.model_path
         self._file = PhotoFile(prepare_folder(folder)) if folder and self._limit < math.inf else None
         self._size = 0  # bytes of those that are kept
@@ -100,16 +100,6 @@ class Photographs:
         self._pool = ThreadPoolExecutor(THREADS)
         self._expected: deque[tuple[View, int]] = deque()
         self._coming: dict[tuple[View, int], Future[Photograph]] = {}  # by their shrink
-
-    @property
-    def full_size_from(self) -> float:
-        """The step from which photographs have their full size."""
-        return self.config.learn.coarse_until_iter * self.shares[-1] if self.shares else 0.0
-
-    @property
-    def lacking(self) -> bool:
-        """Whether some are not kept."""
-        return len(self.kept) < self._count
 
     def expect(self, views: Iterable[tuple[View, int]]) -> None:
         """Say which come next, and in which iterations, so that threads decode them ahead."""

@@ -130,7 +130,7 @@ class Trainer:
         self._radii = self._radii.new_zeros(len(self.model))  # largest in any view
         steps = [Step(iteration, view, place) for place, view in enumerate(self.deck.deal(self.processes.images))]
         own = slice(self.processes.rank, None, self.processes.count)
-        if self.photographs.lacking and not self.blocks:
+        if len(self.photographs.kept) < len(self.scene.train) and not self.blocks:
             coming = enumerate([[step.view for step in steps], *self.deck.coming(len(steps), AHEAD)])
             self.photographs.expect((view, iteration + k * len(steps)) for k, views in coming for view in views[own])
         losses = self.blocks.differentiate(steps) if self.blocks else [self.differentiate_view(s) for s in steps[own]]
