@@ -1,10 +1,8 @@
 """The options of training, in groups, with units and sources. Standard library only: ``--help`` answers at once."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, get_type_hints
 
 from warp_splat.config import ADJOINTS, LAST_PORT, LENSES, LPIPS_HELP, PORT, PORT_HELP, PROJECTIONS
 from warp_splat.errors import InputError
@@ -161,12 +159,6 @@ class MachineOptions:
     )
 
 
-GROUPS: dict[str, type] = {
-    **{"data": DataOptions, "model": ModelOptions, "learn": LearnOptions},
-    **{"grow": GrowOptions, "report": ReportOptions, "machine": MachineOptions},
-}
-
-
 @dataclass(frozen=True, init=False)
 class TrainConfig:
     """All options of a training. Flags, files and ``TrainConfig(NAME=VALUE, ...)`` know them by their names alone."""
@@ -217,10 +209,12 @@ class TrainConfig:
         groups = [*(getattr(self, name) for name in GROUPS), *self.plugins.values()]
         return {name: value for group in groups for name, value in vars(group).items()}
 
-    def changed(self, **values: Any) -> TrainConfig:
+    def changed(self, **values: Any) -> "TrainConfig":
         """The same but for these options."""
         return TrainConfig(**{**self.flat(), **values})
 
+
+GROUPS = {name: kind for name, kind in get_type_hints(TrainConfig).items() if name != "plugins"}
 
 #: What cannot change when a training is continued, and why.
 FIXED_OPTIONS = {
