@@ -1,7 +1,9 @@
 """The one exception that a user's mistake may raise: its text is all they see."""
 
+import importlib
 import os
 import sys
+from typing import Any
 
 REASON_MOST = 300  # characters of a library's own words: on a damaged file, OpenImageIO may list all that it met
 
@@ -16,6 +18,14 @@ def tell(error: InputError | OSError) -> None:
         raise error
     text = f"{error.filename or 'file'}: {error.strerror or error}." if isinstance(error, OSError) else error
     print(f"warp-splat: error: {text}", file=sys.stderr, flush=True)
+
+
+def imported(package: str, problem: str) -> Any:
+    """A package that not everybody has. Raises InputError with this sentence where it is not installed."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(problem) from error
 
 
 def reason_of(error: object) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, imported, reason_of
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import camera_entry
 from warp_splat.formats.png import load_png
@@ -108,11 +108,8 @@ class _Handler(SimpleHTTPRequestHandler):
 @functools.cache
 def _playwright():
     """Started once: after a browser that could not be started, a second start would raise something else."""
-    try:
-        from playwright.sync_api import sync_playwright  # noqa: PLC0415 - seldom there
-    except ImportError as error:
-        raise InputError("playwright: it drives the browser, and is not there; pip install playwright.") from error
-    return sync_playwright().start()
+    problem = "playwright: it drives the browser, and is not there; pip install playwright."
+    return imported("playwright.sync_api", problem).sync_playwright().start()
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from warp_splat.color import to_srgb
 from warp_splat.config import STRONGEST_MOST, MeshConfig
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, imported
 from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
@@ -85,10 +85,7 @@ def mesh(config: MeshConfig) -> int:
 
 def needed(package: str) -> Any:
     """The module of a package that meshes need. Raises InputError if it is not installed."""
-    try:
-        return __import__(package)
-    except ImportError as error:
-        raise InputError(f"{package}: a mesh needs this package; pip install 'warp-splat[mesh]'.") from error
+    return imported(package, f"{package}: a mesh needs this package; pip install 'warp-splat[mesh]'.")
 
 
 def drawn_views(opened: Opened, memory: float) -> list[Drawn]:

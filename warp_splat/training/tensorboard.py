@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warp_splat.errors import InputError
+from warp_splat.errors import imported
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
@@ -40,8 +40,5 @@ def writer_class() -> "type[SummaryWriter]":
     Raises:
         InputError: if tensorboardX is not installed.
     """
-    try:
-        from tensorboardX import SummaryWriter  # noqa: PLC0415 - optional
-    except ImportError as error:
-        raise InputError("--tensorboard: expected the package tensorboardX; `pip install tensorboardX`.") from error
-    return SummaryWriter
+    problem = "--tensorboard: expected the package tensorboardX; `pip install tensorboardX`."
+    return imported("tensorboardX", problem).SummaryWriter
