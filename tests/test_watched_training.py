@@ -68,7 +68,7 @@ class Paused:
         self.interrupted, self.waits = [], 0
         self.training._toggle()
 
-        def wait(seconds):
+        def wait():
             self.waits += 1
             if self.waits == 3:
                 happens(self)
@@ -105,7 +105,7 @@ def test_a_pause_while_a_frame_is_drawn_is_told(fake_viser, monkeypatch):
         return draw()
 
     monkeypatch.setattr(viewer, "draw", draw_and_click)
-    monkeypatch.setattr(viewer, "wait", lambda seconds: interrupted.append(2))
+    monkeypatch.setattr(viewer, "wait", lambda: interrupted.append(2))
     training.between_steps(interrupted)
     assert training.paused and "paused" in training._facts.content
 
@@ -152,7 +152,7 @@ def visited(monkeypatch, folder):
     monkeypatch.setattr(server, "DESERTED", 0.0)
     monkeypatch.setattr("warp_splat.training.live.REFRESH", 0.0)
     monkeypatch.setattr("warp_splat.training.live.SHARE", 1e9)
-    monkeypatch.setattr(server.Viewer, "wait", lambda viewer, seconds: viewer.server.wait())
+    monkeypatch.setattr(server.Viewer, "wait", lambda viewer: viewer.server.wait())
     at_rest(monkeypatch)
     return ["train", "-s", str(root), "-m", str(folder / "model"), "--viewer", "--iterations", "3"]
 

@@ -15,7 +15,6 @@ from warp_splat.training.record import Run
 from warp_splat.training.trainer import Trainer
 from warp_splat.viewer.server import Viewer
 
-IDLE = 0.2  # seconds between two looks at Ctrl-C
 REFRESH = 1.0  # seconds between two frames of what nobody moves, at least
 SHARE = 0.1  # of the time goes into those frames, at most
 
@@ -61,7 +60,7 @@ class TrainingViewer:
             if not self.paused and not self.viewer.moving:
                 return
             if not drawn:
-                self.viewer.wait(IDLE)
+                self.viewer.wait()
 
     @timers.profile(False)
     def show_end(self) -> None:
@@ -82,7 +81,7 @@ class TrainingViewer:
             print(f"The viewer stays at {self.viewer.address} until its page is closed, or Ctrl-C.", flush=True)
             while not interrupted and not self.viewer.deserted:
                 if not self._draw():
-                    self.viewer.wait(IDLE)
+                    self.viewer.wait()
 
     def _draw(self) -> bool:
         resting, start = not self.viewer.moving, time.monotonic()

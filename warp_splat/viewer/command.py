@@ -16,7 +16,6 @@ from warp_splat.viewer.server import Viewer, free_port
 from warp_splat.viewer.watcher import LARGEST
 
 AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
-IDLE = 0.2  # seconds between two looks at Ctrl-C
 
 
 def view_model(config: ViewConfig) -> int:
@@ -52,7 +51,7 @@ def view_model(config: ViewConfig) -> int:
             print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
             while not interrupted:
                 if not viewer.draw():
-                    viewer.wait(IDLE)
+                    viewer.wait()
     return 0
 
 

@@ -5,8 +5,6 @@ one that calls :meth:`Viewer.draw`, because two must not launch kernels. What is
 order: a browser must not leave before it has entered.
 """
 
-from __future__ import annotations
-
 import errno
 import socket
 import threading
@@ -33,6 +31,7 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"  # only this machine; from another, through ssh -L
 PORTS = 100  # that are tried, from the one asked for
+IDLE = 0.2  # seconds between two looks at Ctrl-C
 DESERTED = 10.0  # seconds after the last browser has left; one that loads the page again takes less
 MOVING_QUALITY, SHARP_QUALITY = 75, 95  # of JPEG
 
@@ -98,7 +97,7 @@ class Viewer:
             paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
         self.draw_camera(camera, median=True)
 
-    def __enter__(self) -> Viewer:
+    def __enter__(self) -> "Viewer":
         return self
 
     def __exit__(self, *_) -> None:
@@ -112,10 +111,10 @@ class Viewer:
     def _describe(self) -> str:
         return f"{len(self.means()):,} Gaussians"
 
-    async def _enter(self, client: viser.ClientHandle) -> None:
+    async def _enter(self, client: "viser.ClientHandle") -> None:
         self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.unit, self.wake)
 
-    async def _leave(self, client: viser.ClientHandle) -> None:
+    async def _leave(self, client: "viser.ClientHandle") -> None:
         self.watchers.pop(client.client_id, None)
         self.left_at = time.monotonic()
         self.wake()
@@ -124,9 +123,9 @@ class Viewer:
         """End :meth:`wait`."""
         self._woken.set()
 
-    def wait(self, seconds: float) -> None:
-        """Wait until something changes, at most ``seconds``."""
-        self._woken.wait(seconds)
+    def wait(self) -> None:
+        """Wait until something changes, or until one looks at Ctrl-C again."""
+        self._woken.wait(IDLE)
         self._woken.clear()
 
     def refresh(self) -> None:
@@ -195,7 +194,7 @@ def free_port(port: int) -> int:
     raise InputError(f"--port {port}: expected a free port, but it and those after it are taken; choose another.")
 
 
-def _serve(port: int) -> viser.ViserServer:
+def _serve(port: int) -> "viser.ViserServer":
     """A server without its own messages."""
     import rich  # noqa: PLC0415 - of viser, which takes half a second to load
     import viser  # noqa: PLC0415
