@@ -1,7 +1,5 @@
 """Between linear light and what a screen shows, maps of colors, and harmonics. For NumPy and torch alike."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -29,7 +27,7 @@ def from_srgb(encoded: Any, where: Callable) -> Any:
     return where(encoded <= 12.92 * TOE, encoded / 12.92, ((encoded.clip(12.92 * TOE) + 0.055) / 1.055) ** 2.4)
 
 
-def to_bytes(image: torch.Tensor, linear: bool = False) -> np.ndarray:
+def to_bytes(image: "torch.Tensor", linear: bool = False) -> "np.ndarray":
     """[H, W, 3] float image, clamped to 0..1, as uint8 for a screen; ``linear``: it is in linear light."""
     import torch  # noqa: PLC0415 - whoever reads scenes only need not wait for it
 

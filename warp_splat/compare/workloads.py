@@ -1,7 +1,5 @@
 """What adjoints and knobs are measured on: layered scenes of known depth complexity, and scenes in training."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,7 +52,7 @@ class Workload:
         """Where it is rendered."""
         return self.background.device
 
-    def to(self, device: torch.device) -> Workload:
+    def to(self, device: torch.device) -> "Workload":
         """The same on ``device``."""
         gaussians = Gaussians(*(tensor.to(device) for tensor in self.gaussians))
         return replace(self, gaussians=gaussians, background=self.background.to(device))

@@ -1,7 +1,5 @@
 """A camera that is learned, or moves while its rows are read: what the projection is told, and its gradients."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -52,7 +50,7 @@ class CameraParameters:
             rolling shutter is given a last twist, or one with it, or without a lens, coefficients.
     """
 
-    here: CameraParameters | None = None
+    here: "CameraParameters | None" = None
 
     def __init__(
         self,

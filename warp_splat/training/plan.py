@@ -7,8 +7,6 @@ double. A clock decides on the end itself
 (:mod:`warp_splat.training.deadline`), so that a plan has to be good, but not exact.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,7 +45,7 @@ class Cost:
     pixel: float
 
     @classmethod
-    def of(cls, measured: Sequence[StepTime]) -> Cost:
+    def of(cls, measured: Sequence[StepTime]) -> "Cost":
         """The costs, none negative, with the least squared error relative to each measurement."""
         from scipy.optimize import nnls  # noqa: PLC0415 - slow to load, and only --minutes needs it
 

@@ -5,8 +5,6 @@ that draws it, and their gradients travel back. All sums go by view, in the orde
 changes no bit. Splats are projected again for their gradients, one view after another, rather than kept for all views.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -41,7 +39,7 @@ class Observed(NamedTuple):
     image: torch.Tensor  # [H, W, 3], of which there is but the shape
 
     @classmethod
-    def of_all(cls, out: RenderOutput, rows: torch.Tensor, count: int) -> Observed:
+    def of_all(cls, out: RenderOutput, rows: torch.Tensor, count: int) -> "Observed":
         """What ``out`` shows of ``rows`` alone, among ``count`` Gaussians."""
         means2d, radii = out.means2d.new_empty(count, 2), out.radii.new_zeros(count)
         means2d.grad = means2d.new_zeros(count, 2).index_copy_(0, rows, out.means2d.grad)
@@ -59,7 +57,7 @@ class Blocks:
         InputError: if an option needs all Gaussians in one process.
     """
 
-    def __init__(self, trainer: Trainer, processes: Shards):
+    def __init__(self, trainer: "Trainer", processes: Shards):
         self.trainer, self.processes = trainer, processes
         learn = trainer.config.learn
         refused = {

@@ -1,7 +1,5 @@
 """Measuring in the page: distances between clicked points, and a box whose numbers ``--crop`` takes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -46,7 +44,7 @@ class Ruler:
         touched: called when a click waits for its point.
     """
 
-    def __init__(self, client: viser.ClientHandle, subject: np.ndarray, unit: str, touched: Callable[[], None]):
+    def __init__(self, client: "viser.ClientHandle", subject: np.ndarray, unit: str, touched: Callable[[], None]):
         self.client, self.unit, self.touched = client, unit, touched
         self.clicks: list[tuple[float, float]] = []  # that wait for their points
         self.points: list[np.ndarray] = []
