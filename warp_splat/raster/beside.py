@@ -149,8 +149,8 @@ class Channels(torch.autograd.Function):
     def forward(ctx, means2d, conics, opacities, features, blending):
         camera, driver, features = blending.camera, blending.driver, features.contiguous()
         image = features.new_empty(camera.height, camera.width, features.shape[1])
-        for begin, rows in _groups(blending.bins, features, driver):
-            _launch(blending, image, rows, begin, min(features.shape[1] - begin, driver.channels.at_once))
+        for begin, group, rows in _groups(blending.bins, features, driver):
+            _launch(blending, image, rows, begin, group)
         ctx.save_for_backward(features)
         ctx.blending = blending
         return image
@@ -163,8 +163,7 @@ class Channels(torch.autograd.Function):
             adj_image = _without_bad(adj_image, ctx.blending)
             adj_features = torch.empty_like(features)
             total: list[torch.Tensor] = []
-            for begin, rows in _groups(ctx.blending.bins, features, ctx.blending.driver):
-                group = min(features.shape[1] - begin, ctx.blending.driver.channels.at_once)
+            for begin, group, rows in _groups(ctx.blending.bins, features, ctx.blending.driver):
                 geometry, part = _differentiate(ctx.blending, rows, None, begin, group, adj_image)
                 adj_features[:, begin : begin + group] = part
                 total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
@@ -198,7 +197,7 @@ def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
         part = features[:, begin : begin + size]
         rows = features.new_zeros(len(gaussians), size)
         rows[:, : part.shape[1]] = part[gaussians]
-        yield begin, rows
+        yield begin, part.shape[1], rows
 
 
 def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:
@@ -206,7 +205,7 @@ def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blendin
 
     By all that a pixel blends: ``channels`` [N, C] of one group, with their upstream gradients [H, W, C].
     """
-    ((_, rows),) = _groups(blending.bins, channels, blending.driver)
+    ((_, _, rows),) = _groups(blending.bins, channels, blending.driver)
     adj_pixels = adj_pixels.contiguous().resolve_neg()
     (means2d, *_), _ = _differentiate(blending, rows, None, 0, channels.shape[1], adj_pixels, "absolute")
     return means2d

@@ -20,10 +20,10 @@ from warp_splat.config import RenderConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.perceptual import choose_metrics
+from warp_splat.evaluation.report import save_figure
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
-from warp_splat.formats.files import atomic_write
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
@@ -64,8 +64,7 @@ def save_scaled(path: Path, values: np.ndarray) -> None:
     axes.set_axis_off()
     shown = axes.imshow(values.clip(*SCALE), norm=LogNorm(*SCALE), cmap="turbo", aspect="auto")
     figure.colorbar(shown, cax=figure.add_axes(((width + 0.1 * DPI) / (width + DPI), 0.05, 0.2 * DPI / width, 0.9)))
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, format="png")
+    save_figure(figure, path)
 
 
 def save_exr(path: Path, values: np.ndarray) -> None:

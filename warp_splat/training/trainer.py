@@ -210,7 +210,7 @@ class Trainer:
         view = self.scene.train[0]
         step = Step(0, view)
         camera = self._through("camera", view.camera.resized(2 * TILE, TILE), step)  # 2:1, as a panorama has to be
-        options = self._through("asks", self.options, step)
+        options = self.options_at(step)
         out = self._render(camera, self.behind, options, rows=self._shown(camera, options))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.zero_grad()
@@ -298,8 +298,7 @@ class Trainer:
     ) -> RenderOutput:
         with stage("project"):
             gaussians = self.model.activated(self.degree, rows)
-        adjoint, options = self.config.model.adjoint, replace(options, sh_degree=self.degree)
-        return render(gaussians, camera, background, options, adjoint, room=room, splats=splats)
+        return render(gaussians, camera, background, options, self.config.model.adjoint, room=room, splats=splats)
 
     @property
     def behind(self) -> torch.Tensor:

@@ -20,9 +20,8 @@ import functools
 
 import warp as wp
 
-from warp_splat.config import TILE
 from warp_splat.kernels.compiler import IN_LANES
-from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, reach
+from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, corner, reach
 from warp_splat.kernels.falloff import make_fall_value, make_falloff
 from warp_splat.kernels.simd import fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
@@ -136,8 +135,7 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     ):
         tile = first + wp.tid()
         start = bins.ranges[tile][0]
-        x0 = float((tile % bins.tiles_x) * TILE) + 0.5
-        y0 = float((tile // bins.tiles_x) * TILE) + 0.5
+        x0, y0 = corner(bins, tile)
         t = wp.zeros(shape=(BLOCKS,), dtype=vec16)
         c = wp.zeros(shape=(STATE,), dtype=vec16)
         m = wp.zeros(shape=(GRADS,), dtype=vec16)
