@@ -30,6 +30,7 @@ def make_harmonics(lanes: int) -> Harmonics:
     number = TYPES[lanes].number
     times = simd.times if lanes == 1 else wp.cw_mul  # the overload for lanes: an adjoint that takes 11 % longer
     table = wp.types.matrix(shape=(15, lanes), dtype=float)
+    table_of = table if lanes == 1 else wp.matrix_from_rows
 
     @wp.func
     def basis(x: number, y: number, z: number):
@@ -64,10 +65,7 @@ def make_harmonics(lanes: int) -> Harmonics:
     @wp.func
     def evaluate(x: number, y: number, z: number):
         b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14 = basis(x, y, z)
-        if wp.static(lanes == 1):
-            return table(b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14)
-        else:
-            return wp.matrix_from_rows(b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14)
+        return table_of(b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14)
 
     @wp.func
     def value_of(rows: table, k: int):

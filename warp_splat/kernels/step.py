@@ -87,6 +87,7 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
     vec_sums = wp.types.vector(length=CHANNEL, dtype=float)
     if number is vec16:
         vec_sums = wp.types.matrix(shape=(CHANNEL, LANES), dtype=float)
+    sums_of = wp.matrix_from_rows if number is vec16 else vec_sums
     fall_at, step = make_falloff(falloff).value, make_step(falloff, number)
 
     @func_of(number, root=wp.vec3, opacity=float, alphas=wp.vec2)
@@ -122,18 +123,11 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
         fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
         odds = odds_of(opaque(fall * opacity, alphas, here, walked))
         front = fma(t, odds, t)
-        sums = vec_sums()
         x, y, xx, xy, yy, adj_opacity, w, _fall, adj_front, _behind, _alphas, _here, _walked = wp.grad(step)(
             dx, dy, fill(root[0], dx), fill(root[1], dx), fill(root[2], dx), fill(opacity, dx), lit,
             fall, front, adj_t, alphas, here, walked,
         )  # fmt: skip
-        sums[MEAN_X] = x
-        sums[MEAN_Y] = y
-        sums[XX] = xx
-        sums[XY] = xy
-        sums[YY] = yy
-        sums[OPACITY] = adj_opacity
-        return front, adj_front, w, sums
+        return front, adj_front, w, sums_of(x, y, xx, xy, yy, adj_opacity)
 
     return {
         "manual": ReverseStep(by_hand, geometry_from_moments),

@@ -34,11 +34,10 @@ from warp_splat.kernels.structs import BinsView, PixelsView
 def row_of(mean: wp.vec2, conic: wp.vec3, rest: warps.vec10):
     """A slot: mean and conic, then opacity and channels as they are in ``rest``."""
     row = rest
-    row[MEAN_X] = mean[0]
-    row[MEAN_Y] = mean[1]
-    row[XX] = conic[0]
-    row[XY] = conic[1]
-    row[YY] = conic[2]
+    for i in range(2):
+        row[MEAN_X + i] = mean[i]
+    for i in range(3):
+        row[XX + i] = conic[i]
     return row
 
 
