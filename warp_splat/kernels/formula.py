@@ -159,9 +159,8 @@ def _sqrt(notes: Notes, a: Number) -> Number:
 
 
 def _arctan2(notes: Notes, a: Number, b: Number) -> Number:
-    per_square = notes.note(
-        "inverse", notes.real(notes.sum(notes.product(a.name, a.name), notes.product(b.name, b.name)))
-    )
+    square = notes.sum(notes.product(a.name, a.name), notes.product(b.name, b.name))
+    per_square = notes.note("inverse", notes.real(square))
     turns = (
         notes.difference(notes.product(b.name, da), notes.product(a.name, db))
         for da, db in zip(a.slopes, b.slopes, strict=True)

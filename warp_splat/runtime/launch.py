@@ -293,8 +293,7 @@ def empty(count: int, dtype, device: torch.device | str) -> wp.array:
     """A Warp array of ``count`` elements in memory of torch's that lives as long as the array."""
     wp.init()  # it may be the first that a process asks of Warp
     memory = torch.empty(count * wp.types.type_size_in_bytes(dtype), dtype=torch.uint8, device=device)
-    array = wp.array(
-        ptr=memory.data_ptr(), dtype=dtype, shape=count, device=wp.device_from_torch(memory.device), copy=False
-    )
+    where = wp.device_from_torch(memory.device)
+    array = wp.array(ptr=memory.data_ptr(), dtype=dtype, shape=count, device=where, copy=False)
     array._tensor = memory  # pyright: ignore[reportAttributeAccessIssue] - as wp.from_torch does
     return array

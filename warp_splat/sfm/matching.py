@@ -14,6 +14,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from warp_splat.config import SfmConfig
+from warp_splat.formats.files import write_text
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.sfm import looks
 from warp_splat.sfm.stages import BAR, SPACE, opened, rename, run_watched
@@ -125,9 +126,7 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
 
 def _match_pairs(database: Path, pairs: list[tuple[str, str]], total: int, config: SfmConfig) -> None:
     listed = database.with_name("pairs.txt")
-    listed.write_text(
-        "".join(" ".join(name.replace(" ", SPACE) for name in pair) + "\n" for pair in pairs), encoding="utf-8"
-    )
+    write_text(listed, "".join(" ".join(name.replace(" ", SPACE) for name in pair) + "\n" for pair in pairs))
     pairing = pycolmap.ImportedPairingOptions(block_size=BLOCK * BLOCK, match_list_path=listed)
     rename(database, " ", SPACE)
     try:
