@@ -3,8 +3,6 @@
 ``cfg_args``, ``cameras.json``, ``input.ply``, ``point_cloud/iteration_N/point_cloud.ply``.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os
@@ -202,7 +200,7 @@ def _parse_namespace(text: str, path: Path) -> dict[str, object]:
 
 
 def write_cameras(
-    folder: str | Path, views_test: Sequence[View], views_train: Sequence[View], coordinates: dict | None = None
+    folder: str | Path, views_test: "Sequence[View]", views_train: "Sequence[View]", coordinates: dict | None = None
 ) -> None:
     """Write ``cameras.json`` for viewers: test cameras first, then training cameras, at their original sizes.
 

@@ -74,10 +74,7 @@ def make_expose(family: Family, lanes: int, steps: int = STEPS) -> wp.Function:
     def expose(camera: CameraView, turns: wp.array2d[row4], g: int, ox: number, oy: number, oz: number):
         wx, wy, wz, per_slope = columns(turns[g, 1])
         dx, dy, dz, first = columns(turns[g, 2])
-        px, py, pz, n00, n01, n02, n10, n11, n12, n20, n21, n22 = formula(
-            camera, wx, wy, wz, per_slope, dx, dy, dz, first, ox, oy, oz
-        )
-        return px, py, pz, n00, n01, n02, n10, n11, n12, n20, n21, n22
+        return formula(camera, wx, wy, wz, per_slope, dx, dy, dz, first, ox, oy, oz)
 
     return expose
 
