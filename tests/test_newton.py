@@ -142,11 +142,13 @@ def test_a_world_without_gaussians_shows_those_of_all(simulation):
         scene.add_world(world)
         world.add_shape_gaussian(body, gaussian=ball, cfg=UNSEEN)
         scene.add_world(world)
-        model, made = scene.finalize(device="cpu"), images(2, rgb_image=wp.vec3)
+        model, made = scene.finalize(device="cpu"), images(2, rgb_image=wp.vec3, shape_index_image=wp.uint32)
         same = wp.array([CAMERAS[1]] * 2, dtype=wp.transform)
         SensorSplatCamera(model).update(model.state(), same, camera_of_fov(WIDTH, HEIGHT, FOV), **made)
         first, second = made["rgb_image"].numpy()
         assert (first.max() > 0.3) == shared and second.max() > 0.3
+        first, second = (set(np.unique(indices)) for indices in made["shape_index_image"].numpy())
+        assert first == ({0, 2**32 - 1} if shared else {2**32 - 1}) and 2**32 - 1 in second and len(second) > 1
 
 
 @pytest.mark.parametrize(

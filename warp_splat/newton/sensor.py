@@ -48,18 +48,6 @@ def count_of(pieces: Sequence[Piece]) -> int:
 
 
 @dataclass
-class Call:
-    """What is to be drawn: V views."""
-
-    state: Any  # newton.State
-    camera_transforms: wp.array  # [V] transform
-    cameras: list[Camera]  # [V] without their poses
-    worlds: list[int]  # [V]
-    options: RasterOptions
-    mesh_depth: wp.array | None  # [V, H, W]
-
-
-@dataclass
 class Layout:
     """What the same Gaussians in the same order share, and room for what a camera sees of them."""
 
@@ -184,58 +172,54 @@ class SensorSplatCamera:
         asked = {"depth": forward_depth_image is not None, "strongest": int(shape_index_image is not None)}
         options, poseless = replace(self.options, **asked), {"rotation": np.eye(3), "translation": np.zeros(3)}
         lenses = {id(one): replace(one, **poseless) for one in cameras}
-        call = Call(
-            state, camera_transforms, [lenses[id(one)] for one in cameras], chosen.tolist(), options, mesh_depth
-        )
-        together = (
-            open_tape() is None and options.hidden_from is None and all(takes(one, options) for one in lenses.values())
-        )
-        for views, seen in (self._draw_together if together else self._draw_each)(call):
-            of = lambda array: None if array is None else array[views]  # noqa: B023, E731 - called at once
-            surfaces, size = of(mesh_depth), seen["alpha"].size
-            inputs = [seen["image"], seen["alpha"], seen.get("depth"), self.background, of(mesh_color), surfaces]
-            made = [of(rgb_image), of(color_image), of(forward_depth_image)]
+        cameras, place = [lenses[id(one)] for one in cameras], partial(self._place, state, camera_transforms)
+        draw = self._draw_each
+        if open_tape() is None and all(takes(lens, options) for lens in lenses.values()):
+            draw = partial(self._draw_together, camera_transforms)
+        for views, seen in draw(place, cameras, chosen.tolist(), options, mesh_depth):
+            surfaces, size = _part(mesh_depth, views), seen["alpha"].size
+            inputs = [seen["image"], seen["alpha"], seen.get("depth"), self.background]
+            made = [_part(image, views) for image in (rgb_image, color_image, forward_depth_image)]
+            inputs += [_part(mesh_color, views), surfaces]
             launch_on_tape(put_among_meshes, size, inputs, made, self.device)
             if shape_index_image is not None:
-                owners = self._owners_of(*call.worlds[views])
-                inputs = [seen["strongest"], seen["strongest_weights"], seen["alpha"], owners, surfaces, of(mesh_index)]
-                launch_on_tape(name_shapes, size, inputs, [of(shape_index_image)], self.device)
+                inputs = [seen["strongest"], seen["strongest_weights"], seen["alpha"]]
+                inputs += [self._owners_of(*chosen[views].tolist()), surfaces, _part(mesh_index, views)]
+                launch_on_tape(name_shapes, size, inputs, [_part(shape_index_image, views)], self.device)
 
-    def _draw_each(self, call: Call) -> Iterator[Seen]:
+    def _draw_each(self, place, cameras, worlds, options, mesh_depth) -> Iterator[Seen]:
         """One view after the other, with gradients on a tape."""
-        for view, world in enumerate(call.worlds):
-            given = self._place(call, view, [self._pieces[-1] + self._pieces[world]])
-            surface = None if call.mesh_depth is None else call.mesh_depth[view]
-            more = {"adjoint": self.adjoint, "options": call.options, "hidden_from": surface}
-            seen = vars(tape.rasterize(*given, call.cameras[view], **more))
+        for view, world in enumerate(worlds):
+            given = place(view, [self._pieces[-1] + self._pieces[world]])
+            more = {"adjoint": self.adjoint, "options": options, "hidden_from": _part(mesh_depth, view)}
+            seen = vars(tape.rasterize(*given, cameras[view], **more))
             seen = {name: array for name, array in seen.items() if isinstance(array, wp.array) and array.ndim > 1}
             yield slice(view, view + 1), {name: array.reshape((1, *array.shape)) for name, array in seen.items()}
 
-    def _draw_together(self, call: Call) -> Iterator[Seen]:
+    def _draw_together(self, camera_transforms, place, cameras, worlds, options, mesh_depth) -> Iterator[Seen]:
         """Without gradients: views of one camera in a row at once; from one place, what is shared once."""
-        shared, keys = self._pieces[-1], [(id(camera),) for camera in call.cameras]
-        if shared and call.mesh_depth is None:
-            poses = call.camera_transforms.numpy().tolist()
+        shared, keys = self._pieces[-1], [(id(camera),) for camera in cameras]
+        if shared and mesh_depth is None:
+            poses = camera_transforms.numpy().tolist()
             eyes = [(*key, *pose) for key, pose in zip(keys, poses, strict=True)]
             same = [before == eye for before, eye in pairwise([None, *eyes, None])]
             keys = [eye if same[view] or same[view + 1] else keys[view] for view, eye in enumerate(eyes)]
         for key, group in groupby(range(len(keys)), keys.__getitem__):
-            views, backdrop = list(group), None
-            more = {"camera": call.cameras[views[0]], "options": call.options}
+            first, *others = group
+            camera, backdrop, end = cameras[first], None, first + 1 + len(others)
             if len(key) > 1:
-                _, backdrop = tape.draw_worlds(
-                    *self._place(call, views[0], [shared]), counts=[count_of(shared)], **more
-                )
-            most = max(count_of(shared + self._pieces[call.worlds[view]]) for view in views)
-            size = max(AT_ONCE // max(most, more["camera"].width * more["camera"].height // 16), 1)
-            for first in range(views[0], views[-1] + 1, size):
-                part = slice(first, min(first + size, views[-1] + 1))
-                table = [([] if backdrop else shared) + self._pieces[world] for world in call.worlds[part]]
-                more["hidden_from"] = None if call.mesh_depth is None else call.mesh_depth[part]
-                given, counts = self._place(call, first, table), [count_of(pieces) for pieces in table]
-                yield part, tape.draw_worlds(*given, counts=counts, backdrop=backdrop, **more)[0]
+                given = place(first, [shared])
+                _, backdrop = tape.draw_worlds(*given, counts=[count_of(shared)], camera=camera, options=options)
+            most = max(count_of(shared + self._pieces[world]) for world in worlds[first:end])
+            size = max(AT_ONCE // max(most, camera.width * camera.height // 16), 1)
+            for begin in range(first, end, size):
+                part = slice(begin, min(begin + size, end))
+                table = [([] if backdrop else shared) + self._pieces[world] for world in worlds[part]]
+                more = {"camera": camera, "options": options, "hidden_from": _part(mesh_depth, part)}
+                counts = [count_of(pieces) for pieces in table]
+                yield part, tape.draw_worlds(*place(begin, table), counts=counts, backdrop=backdrop, **more)[0]
 
-    def _place(self, call: Call, first: int, table: Sequence[list[Piece]]) -> tuple[wp.array, ...]:
+    def _place(self, state, camera_transforms, first: int, table: Sequence[list[Piece]]) -> tuple[wp.array, ...]:
         """The Gaussians of pieces, view after view, in the camera's frame; on a tape, in arrays of their own."""
         layout = self._layout_of(*((piece.source, piece.size) for pieces in table for piece in pieces))
         made, begin = layout.room, 0
@@ -244,7 +228,7 @@ class SensorSplatCamera:
         for view, pieces in enumerate(table, first):
             for piece in pieces:
                 where = wp.vec4i(view, piece.body, piece.shape, begin)
-                inputs = [where, piece.view, self.model.shape_transform, call.state.body_q, call.camera_transforms]
+                inputs = [where, piece.view, self.model.shape_transform, state.body_q, camera_transforms]
                 count, coefficients = piece.view.sh.shape
                 launch_on_tape(make_place(coefficients), count, inputs, made, self.device)
                 begin += count
@@ -275,14 +259,16 @@ class SensorSplatCamera:
 
     def _find_owners(self, *worlds: int) -> wp.array:
         """The shape of each Gaussian of these worlds, [W, most]."""
-        rows = []
-        for world in worlds:
-            pieces = self._pieces[-1] + self._pieces[world]
-            rows.append(np.repeat([piece.shape for piece in pieces], [piece.source.count for piece in pieces]))
-        table = np.zeros((len(rows), max(map(len, rows))))
-        for row, shapes in zip(table, rows, strict=True):
-            row[: len(shapes)] = shapes
-        return wp.array(table, dtype=wp.uint32, device=self.device)
+        table = [self._pieces[-1] + self._pieces[world] for world in worlds]
+        shapes = np.zeros((len(table), max(map(count_of, table))), dtype=np.uint32)
+        for row, pieces in zip(shapes, table, strict=True):
+            row[: count_of(pieces)] = np.repeat(*np.int64([(p.shape, p.source.count) for p in pieces]).reshape(-1, 2).T)
+        return wp.array(shapes, dtype=wp.uint32, device=self.device)
+
+
+def _part(array: wp.array | None, views: int | slice) -> Any:
+    """Of some views, if there is one."""
+    return None if array is None else array[views]
 
 
 def camera_of_fov(width: int, height: int, camera_fov: float) -> Camera:
