@@ -18,6 +18,7 @@ import torch
 import warp as wp
 from common import option, parse, synchronize, write_table
 from newton.sensors import SensorCamera
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
@@ -111,6 +112,27 @@ def timed(runs: dict, rgb: dict, device: str) -> tuple[dict, dict]:
     return {name: min(seconds[1:]) for name, seconds in times.items()}, shown
 
 
+class Counted(TorchDispatchMode):
+    """Counts the kernels that are launched meanwhile, and what torch is asked for."""
+
+    def __enter__(self):
+        self.launches = self.operations = 0
+        self.launch, wp.launch = wp.launch, self.launched
+        return super().__enter__()
+
+    def __exit__(self, *error):
+        wp.launch = self.launch
+        return super().__exit__(*error)
+
+    def launched(self, *arguments, **more):
+        self.launches += 1
+        return self.launch(*arguments, **more)
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.operations += 1
+        return function(*args, **(kwargs or {}))
+
+
 def main() -> None:
     where = option("--device", choices=("cpu", "cuda"), default="cpu")
     arguments = parse(__doc__, option("--worlds", type=int, default=64), where)
@@ -120,7 +142,8 @@ def main() -> None:
     except InputError as error:
         raise SystemExit(str(error)) from None
     wp.set_device(device)
-    runs, ours, (model, state, parts) = ways_of_ours(worlds, SIDE, device)
+    small, ours, (model, state, parts) = ways_of_ours(worlds, SIDE, device)
+    runs = dict(small)
     theirs, own, eyes = wp.zeros_like(ours), SensorCamera(model), wp.array([EYE] * worlds, dtype=wp.transform)
     rays = SensorCamera.compute_camera_rays_pinhole(SIDE, SIDE, camera_fov=FOV)
     quality = SensorCamera.RenderConfig(gaussians_mode=SensorCamera.GaussianRenderMode.QUALITY)
@@ -142,8 +165,18 @@ def main() -> None:
     for name, least in seconds.items():
         row = {"name": name, "size": f"{count} of {side} x {side}", "count": sum(part.count for part in parts)}
         records.append(row | {"speed": count / least})
+    counts = []
+    for name in ("ours" if device == "cuda" else "ours, 1 thread", "ours, a call for each"):
+        with Counted() as counted:
+            small[name]()
+        counts += [counted.launches, counted.operations]
     note = f"A view of each world, wall time, the best of {CALLS} calls. "
-    note += f"Gaussians cover {covered.mean():.0%} of the smaller pictures' pixels wholly."
+    note += f"Gaussians cover {covered.mean():.0%} of the smaller pictures' pixels wholly. "
+    note += (
+        "All views of these together take {} launches and {} operations of torch, a call for each {} and {}.".format(
+            *counts
+        )
+    )
     if device == "cuda":
         note += f" On {torch.cuda.get_device_name()}."
     write_table("simulation_cuda" if device == "cuda" else "simulation", arguments.out, COLUMNS, records, note)

@@ -319,7 +319,7 @@ def _cuda() -> list[tuple]:
         ),
         ("the longest tile of the ball takes {} % of the adjoint's time, that of the crowd {} %;", *shares),
         (
-            "it draws {} pictures a second (after the first of the two changes), where Newton's own sensor "
+            "it drew {} pictures a second (after the first of the two changes), where Newton's own sensor "
             "draws {} ([table]",
             *map(f.thousands, (own, other)),
         ),
