@@ -24,13 +24,13 @@ class ShapeView:
 
 @functools.cache
 def make_place(coefficients: int) -> wp.Kernel:
-    """The Gaussians of one shape, as one camera sees them; each with its color, as a harmonic of degree 0."""
+    """The Gaussians of shapes that are alike, as cameras see them; each with its color, as a harmonic of degree 0."""
     evaluate = make_harmonics(1).evaluate
 
     @wp.kernel(module="unique")
     def place(
         first: int,
-        where: wp.vec4i,  # view, body or -1, shape, and where its Gaussians begin
+        places: wp.array[wp.vec4i],  # [P] view, body or -1, shape, and where its Gaussians begin
         splats: ShapeView,
         shape_transform: wp.array[wp.transform],  # [S]
         body_q: wp.array[wp.transform],  # [B]
@@ -40,7 +40,8 @@ def make_place(coefficients: int) -> wp.Kernel:
         quats_out: wp.array[wp.quat],  # [all]
         sh_out: wp.array2d[wp.vec3],  # [all, 1]
     ):
-        i = first + wp.tid()
+        i = (first + wp.tid()) % splats.means.shape[0]
+        where = places[(first + wp.tid()) // splats.means.shape[0]]
         world = shape_transform[where[2]]
         if where[1] >= 0:
             world = wp.transform_multiply(body_q[where[1]], shape_transform[where[2]])

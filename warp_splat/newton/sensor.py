@@ -25,13 +25,13 @@ from warp_splat.raster.worlds import takes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
 AT_ONCE = 2**20  # Gaussians of views that are drawn together, or 16 times as many pixels
-LAYOUTS = 8  # that are kept: of the worlds that are asked for, again and again
+LAYOUTS, PLACES = 8, 1024  # that are kept: of the worlds and views that are asked for, again and again
 Seen = tuple[slice, dict[str, wp.array]]  # views, and their pixels by their names, on black
 #: Of what images are; others are of uint32.
 KINDS = {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}
 
 
-@dataclass
+@dataclass(eq=False)
 class Piece:
     """A Gaussian shape of a world."""
 
@@ -83,6 +83,7 @@ class SensorSplatCamera:
         self.model, self.device, self.adjoint = model, model.device, adjoint
         self.background, self.options = wp.vec3(*background), options or RasterOptions()
         self._layout_of, self._owners_of = lru_cache(LAYOUTS)(self._layout), lru_cache(LAYOUTS)(self._find_owners)
+        self._places_of = lru_cache(PLACES)(self._places)
         bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()
         sizes, view = model.shape_scale.numpy(), cache(self._view)
         self._pieces: dict[int, list[Piece]] = {world: [] for world in range(-1, max(model.world_count, 1))}
@@ -222,18 +223,25 @@ class SensorSplatCamera:
     def _place(self, state, camera_transforms, first: int, table: Sequence[list[Piece]]) -> tuple[wp.array, ...]:
         """The Gaussians of pieces, view after view, in the camera's frame; on a tape, in arrays of their own."""
         layout = self._layout_of(*((piece.source, piece.size) for pieces in table for piece in pieces))
-        made, begin = layout.room, 0
+        made = layout.room
         if open_tape():
             made = tuple(wp.empty_like(array, requires_grad=True) for array in layout.room)
-        for view, pieces in enumerate(table, first):
-            for piece in pieces:
-                where = wp.vec4i(view, piece.body, piece.shape, begin)
-                inputs = [where, piece.view, self.model.shape_transform, state.body_q, camera_transforms]
-                count, coefficients = piece.view.sh.shape
-                launch_on_tape(make_place(coefficients), count, inputs, made, self.device)
-                begin += count
+        for splats, where in self._places_of(first, *map(tuple, table)):
+            count, coefficients = splats.sh.shape
+            inputs = [where, splats, self.model.shape_transform, state.body_q, camera_transforms]
+            launch_on_tape(make_place(coefficients), count * len(where), inputs, made, self.device)
         means, quats, sh = made
         return means, quats, layout.scales, layout.opacities, sh
+
+    def _places(self, first: int, *table: tuple[Piece, ...]) -> list[tuple[ShapeView, wp.array]]:
+        """The Gaussians of each source, and where they are placed; see :func:`make_place`."""
+        begin, found = 0, {}
+        for view, pieces in enumerate(table, first):
+            for piece in pieces:
+                _, where = found.setdefault(id(piece.view), (piece.view, []))
+                where.append((view, piece.body, piece.shape, begin))
+                begin += piece.source.count
+        return [(splats, wp.array(where, dtype=wp.vec4i, device=self.device)) for splats, where in found.values()]
 
     def _view(self, source: Any, size: float) -> ShapeView:
         """The arrays of a ``newton.Gaussian``, whose coefficients are in the order of PLY files."""
