@@ -157,7 +157,7 @@ def test_differences_are_those_of_the_oracle(name):
     *geometry, background = leaves.values()
     truth = oracle.exact_render(*geometry, scene.camera, background)
     found.weights[truth.fragile] = 0
-    picture = found._stack(truth.image, truth.alpha, truth.depth)
+    picture = found._stack(truth)
     for key in INPUTS:
         found_slopes, exact = [], []
         for trial in differences.try_directions(found, key, 4, 2e-3):

@@ -15,10 +15,8 @@ import torch
 
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.behind import put_behind
-from warp_splat.raster.blend import Blending, blend
-from warp_splat.raster.data import Dropped, Gaussians, Splats2D
-from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.api import render
+from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.project import project
 from warp_splat.scene.types import View
 
@@ -55,20 +53,14 @@ def carried(gaussians: Gaussians, view: View, setting: ViewSetting, upstream: to
         setting: how it is rendered.
         upstream: gradient of the image, [H, W, 3].
     """
-    camera, upstream = view.camera, upstream.to(gaussians.means.device)
+    upstream = upstream.to(gaussians.means.device)
     if view.mask is not None:
         upstream = upstream * torch.from_numpy(view.mask).to(upstream)[..., None]
-    options, driver, dropped = setting.options, driver_of(gaussians.means.device), Dropped()
     with torch.no_grad():
-        splats = project(gaussians, camera, options, driver, dropped)
+        splats = project(gaussians, view.camera, setting.options)
     colors, opacities = (tensor.detach().requires_grad_() for tensor in (splats.colors, splats.opacities))
     splats = splats._replace(colors=colors, opacities=opacities)
-    bins = driver.bin(splats, camera, options)
-    background = setting.background
-    color = background if background.dim() == 1 else background.new_zeros(3)
-    image, alpha, _ = blend(splats, color, Blending(bins, camera, options, driver, dropped=dropped))
-    if background.dim() == 2:
-        image = put_behind(image, alpha, background, camera)
+    image = render(gaussians, view.camera, setting.background, setting.options, splats=splats).image
     return Carried(splats, *torch.autograd.grad(image, (colors, opacities), upstream))
 
 
@@ -91,14 +83,14 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
     whole = torch.zeros(len(model), dtype=torch.float64, device=model.device)
     harmonics = torch.zeros(len(model), degrees, dtype=torch.float64, device=model.device)
     for number, view in enumerate(setting.views):
-        camera, generator = view.camera, torch.Generator().manual_seed(number)
-        signs = 2.0 * torch.randint(0, 2, (camera.height, camera.width, 3), generator=generator) - 1.0
+        generator, size = torch.Generator().manual_seed(number), (view.camera.height, view.camera.width, 3)
+        signs = 2.0 * torch.randint(0, 2, size, generator=generator) - 1.0
         found = carried(gaussians, view, setting, signs)
         whole += (found.adj_opacities.double() * found.splats.opacities.detach()) ** 2
         squares = (found.adj_colors.double() ** 2).mean(1)
         for degree in range(degrees):
             with torch.no_grad():
                 fewer = replace(setting.options, sh_degree=degree)
-                colors = project(gaussians, camera, fewer, driver_of(model.device), Dropped()).colors
+                colors = project(gaussians, view.camera, fewer).colors
             harmonics[:, degree] += squares * ((colors - found.splats.colors.detach()).double() ** 2).sum(1)
     return Costs(whole, harmonics)

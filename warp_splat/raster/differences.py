@@ -29,11 +29,9 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.raster.api import RenderOutput, render
-from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.camera_parts import natural_size, parts_of, put_together
-from warp_splat.raster.data import Gaussians
-from warp_splat.raster.drivers import driver_of
+from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.project import project
 
 SHAPES = ("means", "quats", "scales", "opacities")
@@ -104,7 +102,7 @@ class MovableScene:
             # rounding of alpha is divided by alpha in the expected depth: times alpha, all channels round alike
             deepest = self.out.depths.detach().max() if len(self.out.depths) else 1.0
             self.depth_weight = (self.out.alpha / deepest).detach()
-            self.picture = self._stack(self.out.image, self.out.alpha, self.out.depth)
+            self.picture = self._stack(self.out)
         with torch.no_grad():
             self.splats = project(_gaussians(self.inputs), put_together(self.camera, self.inputs), options)
         self.generator = torch.Generator().manual_seed(seed)
@@ -127,25 +125,20 @@ class MovableScene:
         """The picture, [H, W, C] float64, with ``step`` added to a parameter."""
         moved = self.tensor(name) + step
         if name in self.inputs:
-            out = self._render(self.inputs | {name: moved})
-            return self._stack(out.image, out.alpha, out.depth).double()
+            return self._stack(self._render(self.inputs | {name: moved})).double()
         key = "opacities" if name == "opacities2d" else name
         extents = (self.splats.extents * _growth(self, name, step)).float()
         splats = self.splats._replace(extents=extents, **{key: moved})
-        driver = driver_of(moved.device)
-        bins = driver.bin(splats, self.camera, self.options)
-        blending = Blending(bins, self.camera, self.options, driver, self.adjoint)
-        image, alpha, depth = blend(splats, self.inputs["background"], blending)
-        return self._stack(image, alpha, depth / alpha.clamp_min(1e-10) if self.options.depth else None).double()
+        return self._stack(self._render(self.inputs, splats)).double()
 
-    def _render(self, inputs: dict[str, torch.Tensor]) -> RenderOutput:
-        camera = put_together(self.camera, inputs)
-        return render(_gaussians(inputs), camera, inputs["background"], self.options, self.adjoint)
+    def _render(self, inputs: dict[str, torch.Tensor], splats: Splats2D | None = None) -> RenderOutput:
+        given = _gaussians(inputs), put_together(self.camera, inputs), inputs["background"]
+        return render(*given, self.options, self.adjoint, splats=splats)
 
-    def _stack(self, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor | None) -> torch.Tensor:
+    def _stack(self, out: RenderOutput) -> torch.Tensor:
         """[H, W, 4 or 5], all of about the same size."""
-        channels = [image, alpha[..., None]]
-        return torch.cat(channels if depth is None else [*channels, (depth * self.depth_weight)[..., None]], 2)
+        channels = [out.image, out.alpha[..., None]]
+        return torch.cat(channels if out.depth is None else [*channels, (out.depth * self.depth_weight)[..., None]], 2)
 
 
 def _gaussians(inputs: dict[str, torch.Tensor]) -> Gaussians:
