@@ -75,9 +75,8 @@ def _draw_view(
     spare = max(3 - colors.shape[1], 0)
     first = torch.cat([colors[:, :3], colors.new_zeros(count, spare)], 1)
     background = torch.cat([behind[:3], behind.new_zeros(spare)])
-    radii = seen.radii.amax(1) if count else seen.radii.new_empty(0)
-    splats = Splats2D(seen.means2d, seen.conics, seen.opacities, first, seen.depths, seen.extents.contiguous(), radii)
-    splats = splats._replace(**{name: getattr(splats, name).contiguous() for name in splats._fields})
+    parts = (seen.means2d, seen.conics, seen.opacities, first, seen.depths, seen.extents, seen.radii.amax(1))
+    splats = Splats2D(*(part.contiguous() for part in parts))
     frame = Camera(request.width, request.height, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))  # its size counts
     driver, options = driver_of(device), RasterOptions(depth=wanted[-1] in ("D", "ED"), alpha_max=ALPHA_MAX)
     bins = driver.bin(splats, frame, options)

@@ -1,6 +1,7 @@
 """A set of Gaussians in fewer: which to leave out, of which harmonics, and training that makes up for it."""
 
 import math
+from bisect import bisect_right
 from dataclasses import replace
 
 import numpy as np
@@ -80,13 +81,9 @@ def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, squared_error: fl
     if not change.size:
         return splats
     allowed = squared_error * (10 ** (HARMONICS_LOSS / 10) - 1)
-    # the largest bound below which a Gaussian's change is accepted, so that their sum is allowed
-    low, high = 0.0, float(change.max())
-    for _ in range(50):
-        bound = 0.5 * (low + high)
-        _, spent = _degrees(change, bound)
-        low, high = (bound, high) if spent <= allowed else (low, bound)
-    degrees, _ = _degrees(change, low)
+    bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
+    larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # the first for which too much
+    degrees, _ = _degrees(change, bounds[larger - 1])
     sh = splats.sh.copy()
     for degree in range(change.shape[1]):
         sh[degrees == degree, COEFFICIENTS[degree] :] = 0.0

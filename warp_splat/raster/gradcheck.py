@@ -215,8 +215,9 @@ def _rms(values: Sequence[float]) -> float:
 
 def _judge(name: str, trials: list[Trial], tolerance: float) -> GradientRow:
     """A parameter's directions as a row."""
-    differences = [trial.quotient.value for trial in trials]
-    uncertainties = [trial.quotient.uncertainty for trial in trials]
+    analytic = tuple(trial.analytic for trial in trials)
+    differences = tuple(trial.quotient.value for trial in trials)
+    uncertainties = tuple(trial.quotient.uncertainty for trial in trials)
     scale, gap, doubt = _rms(differences), _rms([trial.gap for trial in trials]), _rms(uncertainties)
     if scale:
         error, uncertainty = gap / scale, doubt / scale
@@ -226,16 +227,8 @@ def _judge(name: str, trials: list[Trial], tolerance: float) -> GradientRow:
     unclear = uncertainty > 10 * tolerance or not pixels
     # of thousands of jumps the uncertainty sees fewer than there are
     off = error > tolerance + (3 if unclear else 1) * uncertainty
-    return GradientRow(
-        name,
-        tuple(trial.analytic for trial in trials),
-        tuple(differences),
-        tuple(uncertainties),
-        error,
-        uncertainty,
-        pixels,
-        "off" if off else "unclear" if unclear else "agrees",
-    )
+    verdict = "off" if off else "unclear" if unclear else "agrees"
+    return GradientRow(name, analytic, differences, uncertainties, error, uncertainty, pixels, verdict)
 
 
 def _find_worst(scene: MovableScene, name: str, trials: list[Trial]) -> WorstGaussian:

@@ -38,13 +38,12 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     ``limits``: the camera whose field of view limits the slopes, if it is another.
     """
     degree = {0: 0, 3: 1, 8: 2, 15: 3}[rest]
-    focal, principal = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     size = np.array([camera.width, camera.height])
     cam = CameraView()
     cam.rotation = wp.mat33(*camera.rotation.ravel())
     center = camera.center.astype(np.float32)
     cam.center, cam.center_low = wp.vec3(*center), wp.vec3(*(camera.center - center))
-    cam.focal, cam.principal, cam.size = wp.vec2(*focal), wp.vec2(*principal), wp.vec2(*size)
+    cam.focal, cam.principal, cam.size = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy), wp.vec2(*size)
     limits = limits or camera
     focal, principal = np.array([limits.fx, limits.fy]), np.array([limits.cx, limits.cy])
     margin = FRUSTUM_MARGIN * 0.5 * size / focal

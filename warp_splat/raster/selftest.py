@@ -81,22 +81,20 @@ def check_device(device: torch.device, adjoint: str = "manual") -> None:
         else:
             what = f"the kernels could not be run ({str(error).splitlines()[0]}); update the driver"
         raise InputError(f"--device {device.type}: {what}, or use another device.") from error
-    wrong = ~(np.abs(image - exact_image) <= TOLERANCE)  # NaN is wrong
-    if wrong.any():
-        place = tuple(np.argwhere(wrong)[0])
-        found, expected, what = image[place], exact_image[place], "a pixel"
-    elif not abs(gradient - exact_gradient) <= TOLERANCE * abs(exact_gradient):
-        found, expected, what = gradient, exact_gradient, "a gradient"
-    elif (counted != listed).any():
-        place = np.flatnonzero(counted != listed)[0]
-        found, expected, what = listed[place], counted[place], "a number of tiles"
-    else:
-        return
-    raise InputError(
-        f"--device {device.type}: the self-test expected {expected:.6g} as {what} and found {found:.6g}: the kernels "
-        "do nothing or answer wrongly there; update the driver, empty Warp's kernel cache (warp.clear_kernel_cache()), "
-        "or use another device."
-    )
+    answers = {
+        "a pixel": (image, exact_image, TOLERANCE),
+        "a gradient": (gradient, exact_gradient, TOLERANCE * abs(exact_gradient)),
+        "a number of tiles": (listed, counted, 0),
+    }
+    for what, (found, expected, allowed) in answers.items():
+        wrong = ~(np.abs(np.subtract(found, expected)) <= allowed)  # NaN is wrong
+        if wrong.any():
+            place = tuple(np.argwhere(wrong)[0])
+            raise InputError(
+                f"--device {device.type}: the self-test expected {np.asarray(expected)[place]:.6g} as {what} and found "
+                f"{np.asarray(found)[place]:.6g}: the kernels do nothing or answer wrongly there; update the driver, "
+                "empty Warp's kernel cache (warp.clear_kernel_cache()), or use another device."
+            )
 
 
 def _compute(device: torch.device, adjoint: str) -> tuple[np.ndarray, float]:

@@ -102,17 +102,17 @@ def _progress_bar(trainer: Trainer, run: Run) -> tqdm:
 def _check(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """Measure PSNR on the held-out views (a few of them, unless ``whole``), note it, show it, refresh the preview."""
     trainer.check_identical(run.iteration)
-    losses, run.losses = run.losses, []
     run.gaussians = trainer.processes.total(len(trainer.model))
-    trainer.lead(lambda: _measure(trainer, run, bar, whole, losses))
+    trainer.lead(lambda: _measure(trainer, run, bar, whole))
+    run.losses = []
 
 
-def _measure(trainer: Trainer, run: Run, bar: tqdm, whole: bool, losses: list[torch.Tensor]) -> None:
+def _measure(trainer: Trainer, run: Run, bar: tqdm, whole: bool) -> None:
     """What the first process does of :func:`_check`."""
     split, views = trainer.scene.evaluated
     if not whole:
         views = views[:: -(-len(views) // PROGRESS_VIEWS)]
-    values = torch.stack(losses).double().cpu().numpy()
+    values = torch.stack(run.losses).double().cpu().numpy()
     record = {
         "iteration": run.iteration,
         "loss": float(np.mean(values)),

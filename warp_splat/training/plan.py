@@ -144,12 +144,8 @@ def comparable(table: Sequence[Reached], config: TrainConfig, task: Task) -> str
     steps = config.learn.iterations
     if not table:
         return "No training was measured to compare this one with."
-    near = [
-        entry
-        for entry in table
-        if max(entry.pixels, task.pixels) <= LIKE * min(entry.pixels, task.pixels)
-        and max(entry.iterations, steps) <= LIKE * min(entry.iterations, steps)
-    ]
+    alike = lambda one, other: max(one, other) <= LIKE * min(one, other)  # noqa: E731
+    near = [entry for entry in table if alike(entry.pixels, task.pixels) and alike(entry.iterations, steps)]
     if near:
         told = (f"{entry.psnr:.1f} dB ({entry.scene}, {entry.iterations} steps)" for entry in near)
         return f"Comparable trainings reached {', '.join(told)} on held-out views; another scene is another matter."
