@@ -59,19 +59,12 @@ def see(request: Request) -> Seen:
         reaching = ((places + radii > 0) & (places - radii < size)).all(-1)
         drawn = ahead & reaching & (wide > 0) & (opacities >= ALPHA_MIN)
         drawn &= (radii > 0).all(-1) & (radii > request.radius_clip).any(-1)
-        extents = torch.where(drawn[..., None], extents, 0.0)
-        radii = torch.where(drawn[..., None], radii, 0.0).int()
     per_det = 1 / torch.where(drawn, wide, 1.0)
     conics = torch.stack([yy * per_det, -xy * per_det, xx * per_det], -1)
-    return Seen(
-        torch.where(drawn[..., None], places, 0.0),
-        torch.where(drawn[..., None], conics, 0.0),
-        torch.where(drawn, opacities, 0.0),
-        torch.where(drawn, z, 0.0),
-        extents,
-        radii,
-        drawn,
-    )
+    pairs = (places, conics, extents, radii)
+    places, conics, extents, radii = (torch.where(drawn[..., None], part, 0.0) for part in pairs)
+    opacities, depths = (torch.where(drawn, part, 0.0) for part in (opacities, z))
+    return Seen(places, conics, opacities, depths, extents, radii.int(), drawn)
 
 
 def colors_of(request: Request, seen: Seen) -> torch.Tensor:

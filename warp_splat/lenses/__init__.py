@@ -78,22 +78,23 @@ class Lens:
         start = np.interp(far, radii, angles) / np.where(far > 0, far, 1)
         bent = places * start[:, None]  # a direction as the angle from the axis, along x and y
 
-        def shown(bent):
-            with np.errstate(all="ignore"):
-                return np.stack(self.family.formula(self.numbers, *np.moveaxis(_ray(bent), -1, 0)), -1)
-
         step = 1e-6
         for _ in range(20):
-            here = shown(bent)
-            slopes = [(shown(bent + d) - shown(bent - d)) / (2 * step) for d in step * np.eye(2)]
+            here = self._shown(bent)
+            slopes = [(self._shown(bent + d) - self._shown(bent - d)) / (2 * step) for d in step * np.eye(2)]
             (a, c), (b, d) = (slope.T for slope in slopes)
             ex, ey = (places - here).T
             with np.errstate(all="ignore"):
                 move = np.stack([d * ex - b * ey, a * ey - c * ex], -1) / (a * d - b * c)[:, None]
             bent = bent + np.clip(np.nan_to_num(move, posinf=0, neginf=0), -0.2, 0.2)
-        off = np.abs(shown(bent) - places).max(-1)
+        off = np.abs(self._shown(bent) - places).max(-1)
         seen = (off < 1e-9 * (1 + far)) & (np.hypot(*bent.T) < self.limit)
         return np.where(seen[:, None], _ray(bent), np.nan)
+
+    def _shown(self, bent: np.ndarray) -> np.ndarray:
+        """Where angles from the axis, along x and y, are seen [..., 2], focal lengths from the principal point."""
+        with np.errstate(all="ignore"):
+            return np.stack(self.family.formula(self.numbers, *np.moveaxis(_ray(bent), -1, 0)), -1)
 
     @functools.cached_property
     def limit(self) -> float:
@@ -120,8 +121,7 @@ class Lens:
         angles = np.arange(self._most) * (math.pi / STEPS)
         around = np.arange(DIRECTIONS) * (2 * math.pi / DIRECTIONS)
         bent = angles[:, None, None] * np.stack([np.cos(around), np.sin(around)], -1)
-        with np.errstate(all="ignore"):
-            u, v = self.family.formula(self.numbers, *np.moveaxis(_ray(bent), -1, 0))
+        u, v = np.moveaxis(self._shown(bent), -1, 0)
         outward = u * np.cos(around) + v * np.sin(around)
         most = FARTHEST if self.family.wide else math.inf
         rises = ((np.diff(outward, axis=0) > 0) & (outward[1:] < most)).all(1)  # not, where it is no number

@@ -78,8 +78,6 @@ def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, squared_error: fl
             grow by HARMONICS_LOSS.
     """
     change = costs(model_of(splats, setting), setting).harmonics.cpu().numpy()
-    if not change.size:
-        return splats
     allowed = squared_error * (10 ** (HARMONICS_LOSS / 10) - 1)
     bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
     larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # the first for which too much

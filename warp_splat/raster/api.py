@@ -139,15 +139,14 @@ def rasterize_views(
     """
     if isinstance(cameras, (Camera, CameraParameters)) or not isinstance(cameras, Sequence):
         raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
-    for camera in cameras:
-        checks.check_camera(camera)
+    bases = [checks.check_camera(camera) for camera in cameras]
     options = checks.check_options(adjoint, options)
     gaussians = checks.check_gaussians(means, quats, scales, opacities, sh)
     background = checks.check_background(background, means.device)
     checks.check_tolerance(options, features)
     if features is not None:
         checks.check_features(features, means)
-    outputs, bases = [], [camera.base if isinstance(camera, CameraParameters) else camera for camera in cameras]
+    outputs = []
     for base in bases:
         checks.check_hidden_from(options, base, means.device)
     with checks.explained(options, means, bases):

@@ -184,13 +184,11 @@ def coefficients_gradient(lens: Lens, found: list[torch.Tensor], coefficients: t
 
 def _prepared(lens: Lens) -> np.ndarray:
     """Derivatives of the formula's coefficients by the model's, [K, C], by differences: most are one and the same."""
-    columns = []
-    for index, value in enumerate(lens.coefficients):
-        step = 1e-5 * max(1.0, abs(value))
-        ends = [list(lens.coefficients) for _ in range(2)]
-        ends[0][index], ends[1][index] = value + step, value - step
+    middle, columns = np.array(lens.coefficients), []
+    for step in np.diag(1e-5 * np.maximum(1.0, np.abs(middle))):
+        ends = np.stack([middle + step, middle - step])
         above, below = (np.array(Lens(lens.model, tuple(end)).numbers) for end in ends)
-        columns.append((above - below) / (ends[0][index] - ends[1][index]))
+        columns.append((above - below) / (ends[0] - ends[1]).sum())
     return np.stack(columns, 1)
 
 

@@ -23,14 +23,15 @@ ROUNDING = 1e-5  # by which an opacity may lie above 1; alpha is clamped anyway
 CAMERA_PIXELS_MOST = 2**32  # 80 GiB of image, alpha and what the adjoint reads; kernels number tiles with 32 bits
 
 
-def check_camera(camera: Camera | CameraParameters) -> None:
-    """Raise InputError if ``camera`` is something else, or its image absurdly large."""
+def check_camera(camera: Camera | CameraParameters) -> Camera:
+    """The camera, or the base of one that learns. Raises InputError if it is neither, or its image absurdly large."""
     camera = camera.base if isinstance(camera, CameraParameters) else camera
     if not isinstance(camera, Camera):
         raise InputError(f"camera: expected a warp_splat.Camera, got {type(camera).__name__}.")
     if camera.width * camera.height > CAMERA_PIXELS_MOST:
         most, size = CAMERA_PIXELS_MOST, f"{camera.width} x {camera.height}"
         raise InputError(f"camera: expected at most {most} pixels, got {size}; resize it with .resized().")
+    return camera
 
 
 @contextmanager

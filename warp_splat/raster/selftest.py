@@ -35,10 +35,7 @@ NEEDLES, FIELD = 20_000, Camera(1000, 700, 600.0, 600.0, 500.3, 350.6, np.eye(3)
 
 
 def settle_device(
-    device: torch.device,
-    requested: str,
-    adjoints: Sequence[str] = ("manual",),
-    say: Callable[[str], object] = print,
+    device: torch.device, requested: str, adjoints: Sequence[str] = ("manual",), say: Callable[[str], object] = print
 ) -> torch.device:
     """``device``, if it passes the self-test; a GPU that "auto" chose and that fails gives way to the CPU, with a word.
 

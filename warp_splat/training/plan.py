@@ -107,10 +107,8 @@ def plan_for(config: TrainConfig, cost: Cost, seconds: float, task: Task) -> Tra
     low, high = np.log(SHORTEST), np.log(LONGEST)
     for _ in range(40):
         middle = (low + high) / 2
-        if seconds_of(of_length(config, float(np.exp(middle)), task), cost, task) <= seconds:
-            low = middle
-        else:
-            high = middle
+        fits = seconds_of(of_length(config, float(np.exp(middle)), task), cost, task) <= seconds
+        low, high = (middle, high) if fits else (low, middle)
     return of_length(config, float(np.exp(low)), task)
 
 
