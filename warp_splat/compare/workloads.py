@@ -86,8 +86,7 @@ def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[st
         if iteration:
             trainer.differentiate(iteration)
         if iteration in STAGES:
-            with torch.no_grad():
-                gaussians = Gaussians(*(tensor.detach().clone() for tensor in trainer.model.activated()))
+            gaussians = Gaussians(*(tensor.detach().clone() for tensor in trainer.model.activated()))
             stage = f"{name}, step {iteration}"
             say(f"{stage}: {len(trainer.model)} Gaussians, {camera.width} x {camera.height} px")
             options = RasterOptions(sh_degree=trainer.degree)

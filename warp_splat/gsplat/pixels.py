@@ -1,5 +1,7 @@
 """From Gaussians on images to pixels: this package's lists and blend, view by view."""
 
+import itertools
+
 import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
@@ -50,18 +52,15 @@ def draw(
     scenes, cameras, count = seen.drawn.shape
     sizes = seen.drawn.sum(2).flatten().tolist() if request.packed else [count] * (scenes * cameras)
     into = [None] * len(sizes) if magnitudes is None else magnitudes.view(-1, 2).split(sizes)
-    images, alphas, lists = [], [], []
-    for scene in range(scenes):
-        for camera in range(cameras):
-            mine = colors[scene, camera % colors.shape[1]]
-            behind = None if request.backgrounds is None else request.backgrounds[scene, camera]
-            view = Seen(*(part[scene, camera] for part in seen))
-            image, alpha, bins = _draw_view(request, view, mine, behind, into[scene * cameras + camera])
-            images.append(image)
-            alphas.append(alpha)
-            lists.append(bins)
+    drawn = []
+    for (scene, camera), magnitudes_of_view in zip(itertools.product(range(scenes), range(cameras)), into, strict=True):
+        mine = colors[scene, camera % colors.shape[1]]
+        behind = None if request.backgrounds is None else request.backgrounds[scene, camera]
+        view = Seen(*(part[scene, camera] for part in seen))
+        drawn.append(_draw_view(request, view, mine, behind, magnitudes_of_view))
+    images, alphas, lists = zip(*drawn, strict=True)
     shape = (*request.batch, cameras)
-    return torch.stack(images).unflatten(0, shape), torch.stack(alphas).unflatten(0, shape), lists
+    return torch.stack(images).unflatten(0, shape), torch.stack(alphas).unflatten(0, shape), list(lists)
 
 
 def _draw_view(

@@ -153,8 +153,7 @@ def rasterize_views(
         for camera in cameras:
             outputs.append(render(gaussians, camera, background, options, adjoint, features))
             outputs[-1].invalid_count = outputs[-1].invalid  # a GPU is waited for once
-            if outputs[-1].invalid:
-                checks.explain_invalid(outputs[-1].invalid, gaussians.quats)
+            checks.explain_invalid(outputs[-1].invalid, gaussians.quats)
     return outputs
 
 

@@ -36,9 +36,7 @@ def blend_beside(
 
     ``splats`` have copies of the Gaussians that cross the seam of a panorama (:mod:`.seam`).
     """
-    channels, found, options = {}, {}, blending.options
-    if features is not None:
-        channels["features"] = features
+    channels, found, options = {} if features is None else {"features": features}, {}, blending.options
     if options.normals:
         channels["normals"] = normals_of(gaussians, camera.camera if isinstance(camera, CameraParameters) else camera)
     if channels:

@@ -237,7 +237,7 @@ def _check_finite(name: str, tensor: torch.Tensor) -> None:
 
 def explain_invalid(invalid: int, quats: torch.Tensor) -> None:
     """Raise InputError if Gaussians with good inputs could not be drawn (a zero quaternion is merely left out)."""
-    too_large = invalid - int((quats == 0).all(1).sum())
+    too_large = invalid - int((quats == 0).all(1).sum()) if invalid else 0
     if too_large > 0:
         raise InputError(
             f"scales, sh: {too_large} Gaussians are too large on this image for float32 (over about 4e9 px), or their "

@@ -141,8 +141,7 @@ def check_gradients(
         scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
     if options.falloff:
         _check_falloff(options.falloff, means.device)
-    if scene.out.invalid:
-        checks.explain_invalid(scene.out.invalid, quats)
+    checks.explain_invalid(scene.out.invalid, quats)
     trials = {name: differences.try_directions(scene, name, directions, tolerance) for name in names}
     rows = tuple(_judge(name, trials[name], tolerance) for name in names)
     of_gaussians = {*SHAPES, "sh", *INTERMEDIATES}
@@ -187,11 +186,8 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
     if not checks.is_one_of(adjoint, MODES):
         raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
     known = differences.inputs_of(camera) + INTERMEDIATES
-    if parameters is not None and not (
-        isinstance(parameters, (list, tuple))
-        and parameters
-        and all(checks.is_one_of(name, known) for name in parameters)
-    ):
+    given = parameters if isinstance(parameters, (list, tuple)) else ()
+    if parameters is not None and not (given and all(checks.is_one_of(name, known) for name in given)):
         raise InputError(f"parameters: expected a list of some of {', '.join(known)}, got {parameters!r}.")
     if not (isinstance(directions, int) and directions >= 1):
         raise InputError(f"directions: expected a whole number, at least 1, got {directions!r}.")

@@ -107,8 +107,7 @@ class Optimizer:
                 raise InputError(f"parameters of a part: expected dense float32, got {name} of {leaf.dtype}.")
         self.tables = {name: Table(leaf) for name, leaf in model.parameters.items()}
         if folder:
-            for name, leaf in model.parameters.items():
-                self._put(name, self._zeros(leaf.shape).copy_(leaf.detach()), [])
+            self.arrange(lambda rows: rows)  # into files
         self.tables |= {group["name"]: Table(group["params"][0], group["lr"]) for group in parts}
         self.betas, self.eps = tuple(power(beta, batch) for beta in BETAS), EPS / self.scale
         self.set_iteration(0)
@@ -247,8 +246,7 @@ class Optimizer:
         found: dict[str, torch.Tensor] = {}
         for name, table in self.tables.items():
             found[f"parameters.{name}"] = table.leaf.detach()
-            if table.leaf.grad is not None:
-                grad = table.leaf.grad
+            if (grad := table.leaf.grad) is not None:
                 if grad.is_sparse:
                     grad = self._zeros(grad.shape).index_copy_(0, grad._indices()[0], grad._values())
                 found[f"gradients.{name}"] = grad

@@ -48,20 +48,19 @@ def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = prin
     """
     rows = [Row(case, {mode: case.run(mode) for mode in modes_of(case, modes)}) for case in CASES]
     say(format_table(["case", "float64 says", "value", *modes, "limit", "counted", "verdict"], table(rows, modes)))
-    for row in rows:
-        for mode, outcome in row.outcomes.items():
-            if outcome.failures:
-                say(f"{row.case.name} {mode}: {'; '.join(outcome.failures)}")
     flat = [
         {"case": row.case.name, "group": row.case.group, "claim": row.case.claim, "mode": mode, **asdict(outcome)}
         for row in rows
         for mode, outcome in row.outcomes.items()
     ]
     write_json(out / "stability.json", {"verdicts": flat, "eps": EPS})  # nested; a line for each case and mode as CSV
-    write_csv(out / "stability.csv", [{**line, "failures": "; ".join(line["failures"])} for line in flat])
-    failed = sum(bool(outcome.failures) for row in rows for outcome in row.outcomes.values())
-    say(f"{failed} of {sum(len(row.outcomes) for row in rows)} verdicts failed.")
-    return failed
+    lines = [{**line, "failures": "; ".join(line["failures"])} for line in flat]
+    write_csv(out / "stability.csv", lines)
+    failed = [line for line in lines if line["failures"]]
+    for line in failed:
+        say(f"{line['case']} {line['mode']}: {line['failures']}")
+    say(f"{len(failed)} of {len(lines)} verdicts failed.")
+    return len(failed)
 
 
 def modes_of(case: Case, modes: Sequence[str]) -> Sequence[str]:

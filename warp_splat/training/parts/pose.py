@@ -84,11 +84,8 @@ class Pose:
         """If the points that structure from motion saw say that the median pose is off by what blurs."""
         if any(view.camera.lens and view.camera.lens.family.wide for view in scene.train):
             return Verdict(False, "poses of cameras that see beside themselves are not judged")
-        found = [
-            pose_error(view.camera, scene.tracks[view.name])
-            for view in scene.train
-            if view.name in scene.tracks and len(scene.tracks[view.name].ids) >= ENOUGH
-        ]
+        pairs = [(view.camera, scene.tracks[view.name]) for view in scene.train if view.name in scene.tracks]
+        found = [pose_error(camera, seen) for camera, seen in pairs if len(seen.ids) >= ENOUGH]
         if not found:
             return Verdict(False, "the scene keeps no keypoints of its points, by which poses could be judged")
         off = float(np.median(found))
