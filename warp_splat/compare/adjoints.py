@@ -160,12 +160,11 @@ def central_differences(workload: Workload, truth: Truth) -> Measurement:
         found.append((high - low) / (up - down))
         seconds.append(time.perf_counter() - start)
     count = sum(tensor.numel() for tensor in workload.gaussians)
-    if found:
-        error = float((torch.tensor(found, dtype=torch.float64) - exact[chosen]).norm() / exact[chosen].norm())
-        result.backward = [float(np.median(seconds)) * count]
-        result.extrapolated = True
-        result.note = f"{1e3 * float(np.median(seconds)):.1f} ms per parameter, times {count}: extrapolated"
-        result.errors = {"opacities": Error(error)}
+    error = float((torch.tensor(found, dtype=torch.float64) - exact[chosen]).norm() / exact[chosen].norm())
+    result.backward = [float(np.median(seconds)) * count]
+    result.extrapolated = True
+    result.note = f"{1e3 * float(np.median(seconds)):.1f} ms per parameter, times {count}: extrapolated"
+    result.errors = {"opacities": Error(error)}
     return result
 
 

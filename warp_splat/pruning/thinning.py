@@ -90,9 +90,8 @@ def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, squared_error: fl
 
 def _degrees(change: np.ndarray, bound: float) -> tuple[np.ndarray, float]:
     """The lowest degree of each Gaussian that changes the images by at most ``bound``, and the sum of the changes."""
-    within = np.column_stack([change <= bound, np.ones(len(change), bool)])
-    degrees = within.argmax(axis=1)
     padded = np.column_stack([change, np.zeros(len(change))])
+    degrees = (padded <= bound).argmax(axis=1)
     return degrees, float(padded[np.arange(len(change)), degrees].sum())
 
 

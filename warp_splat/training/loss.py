@@ -137,8 +137,7 @@ class LossInBlocks(torch.autograd.Function):
             height, length = image.shape[0], image.shape[1] * image.shape[2]
             image, target = (p.detach().reshape(height, length).contiguous().resolve_neg() for p in (image, target))
             ctx.pictures = (image, target, _centers(image, target), limits)
-            shares = ((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel(), lambda_dssim)
-            ctx.weights = wp.vec3(*shares)
+            ctx.weights = wp.vec3((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel(), lambda_dssim)
             ctx.blocks = -(-height // int(BAND)) * -(-length // int(STRIP))
             sums, ctx.slopes = image.new_empty(ctx.blocks), image.new_empty(SLOPES, height, length)
             outputs = [view(sums, wp.float32), view(ctx.slopes, wp.float32)]

@@ -108,10 +108,8 @@ def judged(verdict: Verdict, without: Sequence[tuple[float, float]], given: Sequ
     """Whether a part is worth it: with it, every round is better by GAIN of CC_PSNR, and none worse in SSIM."""
     changes = np.subtract(given, without)
     needed = bool((changes[:, 0] >= GAIN).all() and (changes[:, 1] >= 0).all())
-    decibels, likeness = (
-        " and ".join(f"{change:+.{places}f}" for change in column)
-        for column, places in zip(changes.T, (2, 4), strict=True)
-    )
+    decibels = " and ".join(f"{change:+.2f}" for change in changes[:, 0])
+    likeness = " and ".join(f"{change:+.4f}" for change in changes[:, 1])
     told = f"on photographs held back, short trainings with it changed CC_PSNR by {decibels} dB and SSIM by {likeness}"
     return Verdict(needed, f"{verdict.sentence}; {told} (limits {GAIN:+} dB and 0)")
 

@@ -21,7 +21,7 @@ from warp_splat.compare import oracle
 from warp_splat.compare.scenes import look
 from warp_splat.compare.truth import draw_exactly
 from warp_splat.config import RasterOptions
-from warp_splat.gaussians import GaussianModel
+from warp_splat.gaussians import Activate
 from warp_splat.raster import api
 from warp_splat.raster.data import Gaussians
 
@@ -117,13 +117,11 @@ def leaves_of(problem: Problem, dtype: torch.dtype) -> dict[str, torch.Tensor]:
 
 def activated(problem: Problem, leaves: dict[str, torch.Tensor]) -> Gaussians:
     """As the renderer takes them, through the trainer's activations if ``raw``; in float64, through torch's."""
-    if problem.raw and leaves["means"].dtype == torch.float64:
-        scales, opacities = leaves["scales"].clamp_max(88.0).exp(), leaves["opacities"].sigmoid()
+    if problem.raw:
+        raw = leaves["scales"], leaves["opacities"]
+        exact = raw[0].dtype == torch.float64
+        scales, opacities = (raw[0].clamp_max(88.0).exp(), raw[1].sigmoid()) if exact else Activate.apply(*raw)
         leaves = leaves | {"scales": scales, "opacities": opacities}
-    elif problem.raw:
-        model = GaussianModel({name: leaves[name] for name in GaussianModel.NAMES})
-        model.parameters = leaves
-        return model.activated()
     return Gaussians(**{name: leaves[name] for name in Gaussians._fields})
 
 
