@@ -81,8 +81,7 @@ class GradientReport:
     def _sentence(self) -> str:
         off, unclear = self.named("off"), self.named("unclear")
         text = f"off by more than {self.tolerance:g} and the uncertainty: {', '.join(off)}" if off else "nothing is off"
-        if self.worst:
-            worst = self.worst
+        if worst := self.worst:
             text += f" (most in {worst.name}; there, Gaussian {worst.index} alone has {worst.analytic:.5g} instead of "
             text += f"{worst.difference:.5g})"
         rest = f"; too uncertain to tell: {', '.join(unclear)}" if unclear else ""
@@ -145,12 +144,9 @@ def check_gradients(
     trials = {name: differences.try_directions(scene, name, directions, tolerance) for name in names}
     rows = tuple(_judge(name, trials[name], tolerance) for name in names)
     of_gaussians = {*SHAPES, "sh", *INTERMEDIATES}
-    off = [row for row in rows if row.verdict == "off" and row.name in of_gaussians]
-    worst = None
-    if off:
-        name = max(off, key=lambda row: row.error).name
-        worst = _find_worst(scene, name, trials[name])
-    return GradientReport(adjoint, tolerance, rows, worst)
+    off = {row.name: row.error for row in rows if row.verdict == "off" and row.name in of_gaussians}
+    name = max(off, key=lambda name: off[name], default="")
+    return GradientReport(adjoint, tolerance, rows, _find_worst(scene, name, trials[name]) if off else None)
 
 
 def _check_falloff(falloff: Falloff, device: torch.device) -> None:

@@ -70,13 +70,9 @@ class Processes(Rows):
         """Replace ``tensor`` by its sum over the processes."""
         self._exchange(dist.all_reduce, tensor, dist.ReduceOp.SUM)
 
-    def maximum(self, tensor: torch.Tensor) -> None:
-        """Replace each element of ``tensor`` by its largest value in any process."""
-        self._exchange(dist.all_reduce, tensor, dist.ReduceOp.MAX)
-
     def merge(self, tensor: torch.Tensor, largest: bool = False) -> None:
         """Sums (or the largest values) of what each process saw of the Gaussians that it holds, in their place."""
-        (self.maximum if largest else self.sum)(tensor)
+        self._exchange(dist.all_reduce, tensor, dist.ReduceOp.MAX if largest else dist.ReduceOp.SUM)
 
     def observed(self, rows: torch.Tensor) -> torch.Tensor:
         """What each process saw of the Gaussians that it holds [n], as a checkpoint keeps it: [count, n]."""
@@ -91,7 +87,7 @@ class Processes(Rows):
     def largest(self, value: int) -> int:
         """The largest ``value`` of all processes."""
         found = torch.tensor([value], dtype=torch.int32)
-        self.maximum(found)
+        self._exchange(dist.all_reduce, found, dist.ReduceOp.MAX)
         return int(found)
 
     def gather(self, tensor: torch.Tensor) -> torch.Tensor:
