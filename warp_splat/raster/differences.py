@@ -116,9 +116,8 @@ class MovableScene:
     def gradient(self, name: str, kept: torch.Tensor) -> torch.Tensor:
         """Of the loss over the pixels ``kept`` [H, W], float64, shaped like the parameter."""
         upstream = self.weights * kept[..., None]
-        tensor = self.tensor(name)
-        found = torch.autograd.grad(self.picture, tensor, upstream, retain_graph=True, materialize_grads=True)
-        return found[0].double()
+        keep = {"retain_graph": True, "materialize_grads": True}
+        return torch.autograd.grad(self.picture, self.tensor(name), upstream, **keep)[0].double()
 
     @torch.no_grad()
     def draw(self, name: str, step: torch.Tensor) -> torch.Tensor:

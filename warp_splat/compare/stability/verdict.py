@@ -229,36 +229,32 @@ def judge(expected: Expected, mode: str) -> Outcome:
     leaves = leaves_of(problem, torch.float32)
     out = draw_case(problem, leaves, mode)
     gradients = gradients_by_name(out, expected.upstream, leaves)
-    failures = []
-
-    def demand(holds: bool, statement: str) -> None:
-        if not holds:
-            failures.append(statement)
-
-    demand(bool(out.image.isfinite().all() and out.alpha.isfinite().all()), "image not finite")
     wrong = [name for name, value in gradients.items() if not value.isfinite().all()]
-    demand(not wrong, f"gradient not finite: {', '.join(wrong)}")
     error = _pixel_errors(out, exact)
     sure = torch.ones_like(exact.fragile) if problem.continuous else ~exact.fragile
-    demand(sure.double().mean().item() > 1 - FRAGILE_LIMIT, f"only {int(sure.sum())} pixels to compare")
     value_error = error[sure].max().item() if sure.any() else 0.0
-    demand(value_error < expected.image_limit, f"image off by {value_error:.1e} > {expected.image_limit:.1e}")
     share = SHARE * max(1.0, exact.image.max().item())
-    demand(not (error[~sure] > share).any(), "image off by more than one Gaussian at a fragile pixel")
-
     errors = {name: relative_error(value, expected.gradients[name], problem.gain) for name, value in gradients.items()}
     worst = max(errors, key=lambda name: errors[name] / expected.gradient_limits[name])
-    for name, limit in expected.gradient_limits.items():
-        demand(errors[name] < limit, f"gradient of {name} off by {errors[name]:.1e} > {limit:.1e}")
+    off = [(name, errors[name], limit) for name, limit in expected.gradient_limits.items()]
     hidden = out.radii[list(problem.left_out)]
-    demand(not hidden.any(), "drawn although it should be left out")
-    demand(out.invalid == problem.invalid, f"counted {out.invalid} invalid, not {problem.invalid}")
     dropped, dropped_now = int(expected.overflows.sum()), out.dropped.gaussians
-    demand(dropped_now == dropped, f"dropped gradients of {dropped_now} Gaussians, not {dropped}")
-    demand(out.dropped.pixels == 0, f"dropped {out.dropped.pixels} pixels")
+    statements = [
+        (out.image.isfinite().all() and out.alpha.isfinite().all(), "image not finite"),
+        (not wrong, f"gradient not finite: {', '.join(wrong)}"),
+        (sure.double().mean().item() > 1 - FRAGILE_LIMIT, f"only {int(sure.sum())} pixels to compare"),
+        (value_error < expected.image_limit, f"image off by {value_error:.1e} > {expected.image_limit:.1e}"),
+        (not (error[~sure] > share).any(), "image off by more than one Gaussian at a fragile pixel"),
+        *((error < limit, f"gradient of {name} off by {error:.1e} > {limit:.1e}") for name, error, limit in off),
+        (not hidden.any(), "drawn although it should be left out"),
+        (out.invalid == problem.invalid, f"counted {out.invalid} invalid, not {problem.invalid}"),
+        (dropped_now == dropped, f"dropped gradients of {dropped_now} Gaussians, not {dropped}"),
+        (out.dropped.pixels == 0, f"dropped {out.dropped.pixels} pixels"),
+    ]
+    failures = tuple(statement for holds, statement in statements if not holds)
     counted = count_text(culled=int((out.radii == 0).sum()), invalid=out.invalid, dropped=dropped_now)
     gradient = errors[worst], expected.gradient_limits[worst]
-    return Outcome(expected.says, value_error, expected.image_limit, *gradient, counted, tuple(failures))
+    return Outcome(expected.says, value_error, expected.image_limit, *gradient, counted, failures)
 
 
 def count_text(**counts: int) -> str:
