@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from commands import changes_told
-from scenes import C0
+from scenes import C0, SCENES
 from scipy.spatial.transform import Rotation
 
 from warp_splat.cli import main
@@ -88,6 +88,14 @@ def test_an_image_loses_what_the_adjoint_says(device):
     assert float(shares.sum()) * SIZE[0] * SIZE[1] == pytest.approx(float(alpha.sum()), rel=1e-4)
     seen = (splats.means - camera.center) @ camera.rotation.T
     np.testing.assert_allclose(depths.cpu().numpy(), seen[:, 2], rtol=1e-4)
+
+
+def test_a_panorama_is_weighed_across_its_seam():
+    scene = SCENES["panorama"]()
+    setting, gaussians = setting_of([scene.camera]), scene.gaussians()
+    shares, _ = weights(gaussians, setting.views[0], setting)
+    alpha = render(gaussians, scene.camera, setting.background, OPTIONS).alpha
+    assert float(shares.sum()) == pytest.approx(float(alpha.mean()), rel=1e-4)
 
 
 def test_costs_are_the_squared_changes_of_images(device):
