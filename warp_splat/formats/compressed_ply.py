@@ -20,12 +20,8 @@ from warp_splat.text import Report
 
 CHUNK = 256  # Gaussians that share their ranges
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-RANGES = tuple(
-    f"{end}_{name}"
-    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
-    for end in ("min", "max")
-    for name in names
-)
+RANGES = "min_x min_y min_z max_x max_y max_z min_scale_x min_scale_y min_scale_z".split()
+RANGES += "max_scale_x max_scale_y max_scale_z min_r min_g min_b max_r max_g max_b".split()
 WITHOUT_COLOR = 12  # of RANGES, in older files: colors are in 0..1 then
 POINT_BITS = (11, 10, 11)
 COLOR_BITS = (8, 8, 8, 8)

@@ -159,13 +159,8 @@ def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
 
 
 def _splat_primitives(mesh: dict) -> list[dict]:
-    return [
-        primitive
-        for primitive in entries_of(mesh, "primitives")
-        if isinstance(primitive, dict)
-        and isinstance(primitive.get("extensions"), dict)
-        and NAME in primitive["extensions"]
-    ]
+    found = [primitive for primitive in entries_of(mesh, "primitives") if isinstance(primitive, dict)]
+    return [each for each in found if isinstance(each.get("extensions"), dict) and NAME in each["extensions"]]
 
 
 def _read_primitive(document: Document, primitive: dict, report: Report) -> SplatArrays:

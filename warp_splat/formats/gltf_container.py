@@ -56,8 +56,7 @@ class Document:
         count = len(entries_of(self.json, "buffers"))
         if count > MOST_BUFFERS:
             raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
-        entries = [self.entry("buffers", index) for index in range(count)]
-        self.buffers = [self._open(entry, chunk if index == 0 else None) for index, entry in enumerate(entries)]
+        self.buffers = [self._open(self.entry("buffers", i), chunk if i == 0 else None) for i in range(count)]
 
     def entry(self, kind: str, index: Any) -> dict:
         """The object ``index`` of the list ``kind`` of the JSON."""

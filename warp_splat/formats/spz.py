@@ -20,7 +20,7 @@ import numpy as np
 
 from warp_splat.formats.files import Unexpected, atomic_write, check_expansion, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
-from warp_splat.formats.stored import OTHERS, clipped, logit, sigmoid, unit_quats
+from warp_splat.formats.stored import OTHERS, clipped, from_smallest_three, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
 MAGIC = b"NGSP"
@@ -148,12 +148,8 @@ def _pack_quats(quats: np.ndarray) -> np.ndarray:
 def _unpack_quats(stream: np.ndarray) -> np.ndarray:
     packed = stream.view("<u4")
     fields = packed[:, None] // FIELDS & 1023
-    size = (fields & 511) * np.float32(np.sqrt(0.5) / 511)
-    xyzw = np.zeros((len(packed), 4), np.float32)
-    np.put_along_axis(xyzw, OTHERS[packed >> 30], np.where(fields & 512, -size, size), axis=1)
-    rest = np.maximum(0, 1 - (xyzw * xyzw).sum(axis=1))
-    xyzw[np.arange(len(xyzw)), packed >> 30] = np.sqrt(rest)
-    return xyzw[:, [3, 0, 1, 2]]
+    size = (fields & 511) / 1022
+    return from_smallest_three(packed >> 30, np.where(fields & 512, -size, size))[:, [3, 0, 1, 2]]
 
 
 def _unpack_quats2(stream: np.ndarray) -> np.ndarray:
