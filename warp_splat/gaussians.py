@@ -161,21 +161,14 @@ class GaussianModel:
             raw["sh_rest"] = raw["sh_rest"].detach()[:, :0]
         if rows is not None:
             raw = {name: Taken.apply(leaf, rows) for name, leaf in raw.items()}
-        return Gaussians(
-            raw["means"],
-            raw["quats"],
-            *Activate.apply(raw["scales"], raw["opacities"]),
-            raw["sh_dc"],
-            raw["sh_rest"],
-        )
+        raw["scales"], raw["opacities"] = Activate.apply(raw["scales"], raw["opacities"])
+        return Gaussians(**raw)
 
     def splats(self, rows: torch.Tensor | slice = slice(None)) -> SplatArrays:
         """The Gaussians, or some ``rows``, as files have them."""
         raw = {name: tensor.detach()[rows].cpu() for name, tensor in self.parameters.items()}  # the device may be full
-        sh = torch.cat([raw["sh_dc"], raw["sh_rest"]], 1)
-        return SplatArrays(
-            *(tensor.numpy() for tensor in (raw["means"], sh, raw["opacities"], raw["scales"], raw["quats"]))
-        )
+        raw["sh"] = torch.cat([raw.pop("sh_dc"), raw.pop("sh_rest")], 1)
+        return SplatArrays(**{name: tensor.numpy() for name, tensor in raw.items()})
 
     def save(self, path: Path, antialiased: bool = False) -> None:
         """Write a PLY file in the reference's layout, arranged; a part after another, since memory may be short."""
