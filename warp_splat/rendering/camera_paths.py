@@ -151,18 +151,16 @@ def _tour(steps: np.ndarray) -> np.ndarray:
     while left:
         order.append(min(left, key=lambda camera: steps[order[-1], camera]))
         left.remove(order[-1])
-    tour, improved = np.array(order), True
+    tour, improved = np.append(order, len(order)), True
+    steps = np.pad(steps, (0, 1))  # to an end that is near to all
     while improved:
         improved = False
-        for i in range(len(tour) - 2):
-            ends = np.arange(i + 2, len(tour))  # tour[i + 1 : end + 1] turned around
-            after = np.minimum(ends + 1, len(tour) - 1)
+        for i in range(len(order) - 2):
+            ends = np.arange(i + 2, len(order))  # tour[i + 1 : end + 1] turned around
             gain = steps[tour[i], tour[i + 1]] - steps[tour[i], tour[ends]]
-            gain = gain + np.where(
-                ends + 1 < len(tour), steps[tour[ends], tour[after]] - steps[tour[i + 1], tour[after]], 0.0
-            )
+            gain = gain + (steps[tour[ends], tour[ends + 1]] - steps[tour[i + 1], tour[ends + 1]])
             if gain.max() > 1e-9 * steps.max():
                 end = ends[np.argmax(gain)]
                 tour[i + 1 : end + 1] = tour[i + 1 : end + 1][::-1].copy()
                 improved = True
-    return tour
+    return tour[:-1]
