@@ -222,9 +222,8 @@ def camera_entry(camera: Camera) -> dict[str, object]:
     """A camera as ``cameras.json`` has it; the reference's lacks principal point, lens and shutter."""
     pose = {"position": camera.center.tolist(), "rotation": camera.rotation.T.tolist()}
     focal = {name: getattr(camera, name) for name in ("fy", "fx", "cx", "cy")}
-    lens = {"lens": {"model": camera.lens.model, "coefficients": camera.lens.coefficients}} if camera.lens else {}
-    shutter = {"shutter": asdict(camera.shutter)} if camera.shutter else {}
-    return {"width": camera.width, "height": camera.height, **pose, **focal, **lens, **shutter}
+    extra = {name: asdict(part) for name in ("lens", "shutter") if (part := getattr(camera, name))}
+    return {"width": camera.width, "height": camera.height, **pose, **focal, **extra}
 
 
 def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:

@@ -51,11 +51,9 @@ class Finished:
     @property
     def options(self) -> RasterOptions:
         """How it is rendered."""
+        found = RasterOptions(antialiasing=bool(self.trained.get("antialiasing")))
         projection = self.trained.get("projection")
-        return RasterOptions(
-            antialiasing=bool(self.trained.get("antialiasing")),
-            projection=str(projection) if projection in PROJECTIONS else "affine",
-        )
+        return replace(found, projection=projection) if projection in PROJECTIONS else found
 
     def is_linear(self, scene: Scene | None) -> bool:
         """Whether its colors are in linear light: those of its scene, or else what its training says."""

@@ -38,10 +38,8 @@ def guessed(values: np.ndarray, known: Sequence[Camera], others: Sequence[Camera
 
 def _distances(some: Sequence[Camera], others: Sequence[Camera], extent: float) -> np.ndarray:
     """From each to each of ``others`` [Q, P]: of their places, in extents, plus the angle between them [rad]."""
-    (places, ahead), (other_places, other_ahead) = (
-        (np.array([camera.center for camera in cameras]), np.array([camera.forward for camera in cameras]))
-        for cameras in (some, others)
-    )
+    places, other_places = (np.array([camera.center for camera in cameras]) for cameras in (some, others))
+    ahead, other_ahead = (np.array([camera.forward for camera in cameras]) for cameras in (some, others))
     apart = np.linalg.norm(places[:, None] - other_places, axis=2) / max(extent, 1e-12)
     return apart + np.arccos(np.clip((ahead[:, None] * other_ahead).sum(2), -1.0, 1.0))
 
