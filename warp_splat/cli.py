@@ -54,10 +54,7 @@ COMMANDS = {
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.
-NEVER_EMPTY = (
-    *("source_path", "model_path", "start_checkpoint", "start_ply", "config", "lpips_weights", "verify"),
-    *("video_output", "out"),
-)
+NEVER_EMPTY = "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out".split()
 UNUSUAL = re.compile(r"-(inf|[\d.]+e[-+]?\d+)", re.IGNORECASE)  # numbers that argparse takes for flags, without a space
 
 
@@ -127,7 +124,9 @@ def parse(arguments: list[str]) -> Any:
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
     if values.get("crop") == []:
         raise InputError("--crop: expected six numbers, got none; leave the flag out or name a box.")
-    if config_type is TrainConfig and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
+    if config_type is not TrainConfig:
+        return config_type(**values)
+    if os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
         values = _restarted(values)
     given = values
     if values.get("config"):
@@ -139,18 +138,14 @@ def parse(arguments: list[str]) -> Any:
         values = _over(file, values)
     if values.get("start_checkpoint"):
         values = _continued(values)
-    if config_type is TrainConfig:
-        _check_parts(values.get("parts", ""), given)
-        _check_minutes(given)
-    if config_type is TrainConfig and not values.get("start_checkpoint"):
+    _check_parts(values.get("parts", ""), given)
+    _check_minutes(given)
+    if not values.get("start_checkpoint"):
         preset = values.get("preset", "fast" if values.get("minutes") else "")
-        defaults = [PRESETS[preset]]
-        if "source_path" not in values:
-            defaults = [EMBEDDED_DEFAULTS[""], PRESETS[preset], EMBEDDED_DEFAULTS[preset]]
-        values = {**{name: value for table in defaults for name, value in table.items()}, **values, "preset": preset}
-    config = config_type(**values)
-    if isinstance(config, TrainConfig):
-        check_train(config)
+        embedded = {"": {}, preset: {}} if "source_path" in values else EMBEDDED_DEFAULTS
+        values = {**embedded[""], **PRESETS[preset], **embedded[preset], **values, "preset": preset}
+    config = TrainConfig(**values)
+    check_train(config)
     return config
 
 
