@@ -129,18 +129,17 @@ def _columns(tables: PlyTables, element: str, names: Sequence[str], code: str) -
 
 def _pack(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Numbers 0..1 [N, len(bits)] in one word, the first in its highest bits."""
-    word = np.zeros(len(shares), np.uint32)
-    for column, width in zip(shares.T, bits, strict=True):
-        most = (1 << width) - 1
-        word = (word << width) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(np.uint32)
-    return word
+    shifts, most = _fields(bits)
+    return (np.floor(np.clip(shares, 0, 1) * most + 0.5).astype(np.uint32) << shifts).sum(1, dtype=np.uint32)
 
 
 def _unpack(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Numbers 0..1 [N, len(bits)] from words."""
-    columns, shift = [], sum(bits)
-    for width in bits:
-        shift -= width
-        most = (1 << width) - 1
-        columns.append((words >> shift & most) / most)
-    return np.stack(columns, axis=1)
+    shifts, most = _fields(bits)
+    return (words[:, None] >> shifts & most) / most
+
+
+def _fields(bits: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Where numbers lie in their word, and the largest of each."""
+    ends = np.cumsum(bits, dtype=np.uint32)
+    return ends[-1] - ends, (1 << np.array(bits, np.uint32)) - 1

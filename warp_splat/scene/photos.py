@@ -1,5 +1,6 @@
 """Photographs without cameras: which files of a folder they are, and what to tell who trains on them."""
 
+import functools
 import os
 import shlex
 from pathlib import Path
@@ -59,7 +60,7 @@ class ImageFinder:
     def __init__(self, root: Path):
         self.root = root
         self.renamed: dict[str, str] = {}
-        self._folders: dict[Path, frozenset[str]] = {}
+        self._files = functools.cache(self._listed)
 
     def find(self, name: str) -> Path | None:
         """The file, or None.
@@ -92,10 +93,8 @@ class ImageFinder:
     def mask_of(self, name: str) -> Path | None:
         """In a folder of masks, that of the photograph ``name``: name.jpg.png or name.png."""
         path = Path(name)
-        for candidate in (path.with_name(f"{path.name}.png"), path.with_suffix(".png")):
-            if self.has(candidate):
-                return self.root / candidate
-        return None
+        candidates = path.with_name(f"{path.name}.png"), path.with_suffix(".png")
+        return next((self.root / candidate for candidate in candidates if self.has(candidate)), None)
 
     def find_all(self, names: list[str], what: str, hint: str, report: Report) -> list[Path]:
         """The files of all; says how many were found under other endings.
@@ -115,11 +114,8 @@ class ImageFinder:
             report(f"Taking {len(self.renamed)} of {len(names)} images by their stems: {file} for {name}, ...")
         return [file for name in names if (file := files[name])]
 
-    def _files(self, folder: Path) -> frozenset[str]:
-        if folder not in self._folders:
-            try:
-                files = frozenset(entry.name for entry in os.scandir(self.root / folder) if entry.is_file())
-            except (OSError, ValueError):  # there is no such folder, or no such name can be
-                files = frozenset()
-            self._folders[folder] = files
-        return self._folders[folder]
+    def _listed(self, folder: Path) -> frozenset[str]:
+        try:
+            return frozenset(entry.name for entry in os.scandir(self.root / folder) if entry.is_file())
+        except (OSError, ValueError):  # there is no such folder, or no such name can be
+            return frozenset()
