@@ -1,6 +1,7 @@
 """Checks of photographs against points: reprojection, coverage, a sky, how bright they are, axes that are mixed up."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -140,12 +141,10 @@ def _exif(subject: Subject) -> Iterator[tuple[str, float]]:
     """The exposures that files tell [stops], shifted to the mean of those that were subject."""
     told = {}
     for photo in subject.photos:
-        try:
+        with suppress(InputError):  # said elsewhere
             stops = read_exposure(photo.path)
-        except InputError:  # said elsewhere
-            continue
-        if stops is not None and photo.name in subject.stops:
-            told[photo.name] = stops
+            if stops is not None and photo.name in subject.stops:
+                told[photo.name] = stops
     if told:
         shift = np.mean([subject.stops[name] - stops for name, stops in told.items()])
         yield from ((name, float(stops + shift)) for name, stops in told.items())

@@ -114,11 +114,10 @@ def merge_blocks(config: MergeConfig) -> int:
     blocks = [read_json(place / BLOCK, "a block as training writes it", _block_of_json) for place in places]
     models = [open_model(place)[:2] for place in places]
     trained, kinds = [read_cfg_args(place) for place in places], []
-    for block, options in zip(blocks, trained, strict=True):
+    for place, block, options in zip(places, blocks, trained, strict=True):
         cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist()}
         kinds.append({**cells, **{name: options.get(name) for name in COMMON}})
-    for place, kind in zip(places, kinds, strict=True):
-        other = [name for name in kind if kind[name] != kinds[0][name]]
+        other = [name for name, value in kinds[-1].items() if value != kinds[0][name]]
         if other:
             raise InputError(f"{place}: expected the {other[0]} of {places[0]}, found another; move one of them away.")
     numbers, count = [block.number for block in blocks], len(blocks[0].cells)
