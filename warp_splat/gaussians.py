@@ -29,18 +29,19 @@ SMALLEST_DISTANCE2 = 1e-7  # world units^2, floor of the mean squared distance t
 
 def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Scales [N, 3] from their logarithms, opacities [N] from logits. What is too large ends at 1.7e38."""
-    inputs, outputs = (logarithms, logits), (torch.empty_like(logarithms), torch.empty_like(logits))
-    _launch_activation(make_activate, inputs, outputs)
-    return outputs
+    return _launched(make_activate, logarithms, logits)
 
 
-def _launch_activation(make, inputs: Sequence[torch.Tensor], outputs: Sequence[torch.Tensor]) -> None:
+def _launched(make, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Two tensors of the shapes of the last two inputs."""
+
     def number_by_number(tensor: torch.Tensor):
         return lambda types, rows: arrays_of([types.number], [tensor[rows]])[0]
 
+    outputs, logits = [tensor.new_empty(tensor.shape) for tensor in inputs[-2:]], inputs[-1]
     given, made = ([number_by_number(tensor) for tensor in tensors] for tensors in (inputs, outputs))
-    device = outputs[1].device
-    launch_in_lanes(make, driver_of(device).lanes, len(outputs[1]), given, made, device)
+    launch_in_lanes(make, driver_of(logits.device).lanes, len(logits), given, made, logits.device)
+    return outputs[0], outputs[1]
 
 
 class Activate(torch.autograd.Function):
@@ -55,9 +56,7 @@ class Activate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, *adj_outputs):
-        outputs = [adj.new_empty(adj.shape) for adj in adj_outputs]
-        _launch_activation(make_adj_activate, [*ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs)], outputs)
-        return tuple(outputs)
+        return _launched(make_adj_activate, *ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs))
 
 
 class Taken(torch.autograd.Function):
