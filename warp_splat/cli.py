@@ -26,7 +26,7 @@ from warp_splat.config import (
     ViewConfig,
 )
 from warp_splat.errors import InputError, tell
-from warp_splat.flags import FOREIGN_FLAGS, default_of, flags_of
+from warp_splat.flags import FOREIGN_FLAGS, check_numbers, default_of, flags_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig, check_train
@@ -103,7 +103,7 @@ def parse(arguments: list[str]) -> Any:
 
     Raises:
         InputError: for a flag that does not exist here, or that cannot change when a training is continued; for a
-            configuration file that is not one.
+            number out of its bounds; for a configuration file that is not one.
     """
     for argument in arguments:
         name = argument.split("=")[0]
@@ -125,7 +125,9 @@ def parse(arguments: list[str]) -> Any:
     if values.get("crop") == []:
         raise InputError("--crop: expected six numbers, got none; leave the flag out or name a box.")
     if config_type is not TrainConfig:
-        return config_type(**values)
+        config = config_type(**values)
+        check_numbers(config)
+        return config
     if os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
         values = _restarted(values)
     given = values

@@ -18,7 +18,6 @@ from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_json
 from warp_splat.formats.png import save_png
 from warp_splat.inspect.page import address_of, write_page
@@ -33,9 +32,8 @@ def audit(config: AuditConfig) -> int:
     """Audit as ``config`` says; returns the process's exit code: 1 if something is wrong.
 
     Raises:
-        InputError: for a number out of its bounds, or a target, scene or command that there is not.
+        InputError: for a target, scene or command that there is not.
     """
-    check_numbers(config)
     sys.path.append("")  # modules of the folder where one stands, which an installed command does not see otherwise
     place = config.program or config.target
     draw_by_program(place) if config.program else function_of(place)

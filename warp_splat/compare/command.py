@@ -13,7 +13,6 @@ from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_csv, write_json, write_text
 from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.raster.gradcheck import check_gradients
@@ -29,7 +28,6 @@ def run(config: CompareConfig) -> int:
     Raises:
         InputError: for an unknown mode, an unusable scene or output folder.
     """
-    check_numbers(config)
     unknown = [mode for mode in config.modes if mode not in ADJOINTS]
     if unknown or not config.modes:
         raise InputError(f"--modes: expected some of {', '.join(ADJOINTS)}, got {', '.join(unknown) or 'none'}.")

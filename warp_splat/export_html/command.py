@@ -17,7 +17,6 @@ from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.export_html import pack
 from warp_splat.export_html.merge import merged
-from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
 from warp_splat.formats.files import write_text
 from warp_splat.formats.splats import SplatArrays
@@ -42,7 +41,6 @@ def export_html(config: ExportHtmlConfig) -> int:
     path = Path(config.page)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
-    check_numbers(config)
     iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
     cameras = [] if model_folder.is_file_of_gaussians(config.model) else model_folder.read_cameras(config.model)
     kept = pack.shown(splats, config.max_gaussians)

@@ -15,7 +15,6 @@ from scipy.spatial import KDTree
 from warp_splat.color import to_srgb
 from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
-from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
@@ -41,7 +40,6 @@ def mesh(config: MeshConfig) -> int:
     Raises:
         InputError: if the model, its scene, an option or a needed package is not usable; if there is no surface.
     """
-    check_numbers(config)
     output = Path(config.output)
     if output.suffix.lower() not in ENDINGS:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")

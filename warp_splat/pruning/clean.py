@@ -17,7 +17,6 @@ from warp_splat.config import CleanConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
-from warp_splat.flags import check_numbers
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.pruning.opened import Opened, output_of, print_quality, write
 from warp_splat.pruning.score import ViewSetting, weights
@@ -32,7 +31,6 @@ def clean(config: CleanConfig) -> int:
     Raises:
         InputError: if the model, its scene or an option is not usable; if nothing would be left.
     """
-    check_numbers(config)
     output = output_of(config.model, config.output, "cleaned.ply")
     opened = Opened(config)
     file, before = opened.file, opened.file.splats

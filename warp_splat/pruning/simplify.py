@@ -11,7 +11,6 @@ from warp_splat.config import SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
-from warp_splat.flags import check_numbers
 from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
@@ -98,7 +97,6 @@ def bytes_of(size: str) -> int:
 
 
 def _check(config: SimplifyConfig) -> None:
-    check_numbers(config)
     given = [name for name in ("keep", "max_loss", "size", "tolerance") if getattr(config, name)]
     if len(given) != 1:
         found = " and ".join(f"--{name}" for name in given) or "none"

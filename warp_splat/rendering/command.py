@@ -22,7 +22,6 @@ from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.report import save_figure
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
-from warp_splat.flags import check_numbers
 from warp_splat.formats import model_folder
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
@@ -154,7 +153,6 @@ def _certify(config: RenderConfig, maps: dict[str, Callable[[Camera], torch.Tens
 
 
 def _check(config: RenderConfig) -> None:
-    check_numbers(config)
     if config.orbit and config.video:
         raise InputError(f"--orbit, --video {config.video}: expected one of them; leave the other out.")
     if config.video_output and not (config.orbit or config.video):

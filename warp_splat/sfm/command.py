@@ -19,7 +19,6 @@ from tqdm import tqdm
 
 from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, reason_of
-from warp_splat.flags import check_numbers
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.files import write_json
 from warp_splat.runtime.devices import peak_memory
@@ -50,7 +49,6 @@ def sfm(config: SfmConfig) -> int:
     source, scene = Path(config.photos), Path(config.scene)
     say = (lambda *_: None) if config.quiet else tqdm.write
     require_pycolmap("warp-splat sfm")
-    check_numbers(config)
     if not (source.is_dir() or is_video(source)):
         found = f"a file ending in {source.suffix!r}" if source.is_file() else "nothing"
         endings = ", ".join(VIDEOS)

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
-from warp_splat.flags import check_numbers
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished, as_photographed
@@ -26,7 +25,6 @@ def view_model(config: ViewConfig) -> int:
     """
     if not config.model:
         raise InputError("MODEL: expected the folder of a trained model, or a file of Gaussians; name one.")
-    check_numbers(config)
     free_port(config.port)  # before the scene is loaded
     device = settle_device(launch.prepare(config.device, config.threads), config.device)
     finished = Finished(config.model, config.iteration, config.crop)
