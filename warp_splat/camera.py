@@ -15,6 +15,12 @@ MOST_SHARE = 0.5  # of its height by which a picture may move up or down while i
 
 ODD = 2  # px by which a panorama's width may miss twice its height, once it has been resized
 
+# What numbers of a camera are to be, when they are, and of which type.
+PIXELS = ("a whole number of pixels, at least 1", lambda value: value >= 1 and value.is_integer(), int)
+FOCAL = ("a positive number", lambda value: 0 < value < math.inf, float)
+PRINCIPAL = ("a finite number", math.isfinite, float)
+NUMBERS = {"width": PIXELS, "height": PIXELS, "fx": FOCAL, "fy": FOCAL, "cx": PRINCIPAL, "cy": PRINCIPAL}
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -50,18 +56,14 @@ class Camera:
     shutter: Shutter | None = None
 
     def __post_init__(self):
-        for name in ("width", "height"):
-            value = _number(name, getattr(self, name))
-            if not np.isfinite(value) or int(value) != value or value < 1:
-                raise InputError(f"Camera {name}: expected a whole number of pixels, at least 1, got {value}.")
-            object.__setattr__(self, name, int(value))
-        for name in ("fx", "fy", "cx", "cy"):
-            value = _number(name, getattr(self, name))
-            if not np.isfinite(value) or (name in ("fx", "fy") and value <= 0):
-                raise InputError(
-                    f"Camera {name}: expected a {'positive' if name[0] == 'f' else 'finite'} number, got {value}."
-                )
-            object.__setattr__(self, name, value)
+        for name, (expected, fits, kind) in NUMBERS.items():
+            try:
+                value = float(getattr(self, name))
+            except (TypeError, ValueError, OverflowError) as error:
+                raise InputError(f"Camera {name}: expected a number, got {getattr(self, name)!r:.80}.") from error
+            if not fits(value):
+                raise InputError(f"Camera {name}: expected {expected}, got {value}.")
+            object.__setattr__(self, name, kind(value))
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
             try:
                 value = np.array(getattr(self, name), dtype=np.float64)
@@ -77,9 +79,10 @@ class Camera:
         orthonormal = small and np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() <= 1e-4
         if not orthonormal or np.linalg.det(self.rotation) < 0:
             raise InputError("Camera rotation: expected an orthonormal matrix with determinant +1 (world to camera).")
+        for name, kind in (("lens", Lens), ("shutter", Shutter)):
+            if not isinstance(part := getattr(self, name), kind | None):
+                raise InputError(f"Camera {name}: expected a warp_splat.{kind.__name__} or None, got {part!r:.80}.")
         if self.lens is not None:
-            if not isinstance(self.lens, Lens):
-                raise InputError(f"Camera lens: expected a warp_splat.Lens or None, got {self.lens!r:.80}.")
             check_picture(self.lens, *self._picture)
             if self.lens.family.around and abs(self.width - 2 * self.height) > ODD:
                 raise InputError(
@@ -87,8 +90,6 @@ class Camera:
                     "pixels; use one that shows all around."
                 )
         if self.shutter is not None:
-            if not isinstance(self.shutter, Shutter):
-                raise InputError(f"Camera shutter: expected a warp_splat.Shutter or None, got {self.shutter!r:.80}.")
             share = abs(self.shutter.turn[0]) * self.fy / self.height
             if share > MOST_SHARE:
                 raise InputError(
@@ -168,10 +169,3 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
-
-
-def _number(name: str, value) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"Camera {name}: expected a number, got {value!r:.80}.") from error
