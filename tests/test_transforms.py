@@ -117,7 +117,7 @@ def test_a_photograph_with_two_frames_counts_once(tmp_path):
     assert [view.name for view in scene.test] == [names[0], names[8]]
     assert [view.name for view in scene.train] == names[1:8]
     assert lines[0] == "Leaving out 2 of 11 frames, whose photographs had one before: images/a, images/i.png."
-    found = [finding.text for finding in check_loading(read_subject(root, "images")[0], "images")]
+    found = [finding.text for finding in check_loading(read_subject(root, "images")[0])]
     assert found == ["training would accept this scene.", lines[0]]
 
 

@@ -202,6 +202,10 @@ TURNS = {
 }
 
 
+#: In an order in which later ones may use what earlier ones measured.
+CHECKS = (check_reprojection, check_coverage, check_sky, check_axes, check_exposure)
+
+
 def worst_and_best(subject: Subject, photos: list[Photo], count: int) -> list[Photo]:
     """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
     medians = subject.medians

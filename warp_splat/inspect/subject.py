@@ -39,6 +39,7 @@ class Subject:
 
     source: Path
     root: Path  # of the images
+    folder: str = "images"  # theirs, as it is named, if the scene is COLMAP's
     photos: list[Photo] = field(default_factory=list)  # whose file and camera fit each other
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # [P, 3] float64, finite
     model: "pycolmap.Reconstruction | None" = None  # of a COLMAP scene
@@ -62,7 +63,7 @@ class Subject:
 def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     """Read what can be read of the scene in ``source``, with its images in ``folder`` if it is COLMAP's."""
     if takes_colmap(source):
-        subject = Subject(source, source / folder)
+        subject = Subject(source, source / folder, folder)
         findings = list(_read_colmap(subject))
     else:
         subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []

@@ -129,11 +129,11 @@ def check_masks(subject: Subject) -> Iterator[Finding]:
         yield Finding("masks", "ok", "no alpha channels and no masks.")
 
 
-def check_loading(subject: Subject, folder: str) -> Iterator[Finding]:
+def check_loading(subject: Subject) -> Iterator[Finding]:
     """What training itself would say of this scene before its first step."""
     notes: list[str] = []
     try:
-        train, _, points, _ = read_photos(subject.source, folder, notes.append)
+        train, _, points, _ = read_photos(subject.source, subject.folder, notes.append)
         if len(points):
             require_visible(train, points, subject.source)
         if subject.thumbnails:
@@ -197,3 +197,7 @@ def forecast(
 
 def _span(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+#: What is checked once the points are: see geometry.py.
+CHECKS = (check_coordinates, check_names, check_masks, check_loading, check_cost)
