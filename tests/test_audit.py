@@ -38,7 +38,7 @@ def rules_of(eight_bit=False, **broken):
         given = (*geometry, torch.cat([dc, rest], 1), workload.camera, workload.background)
         image = wrong_renderer.draw(wrong_renderer.Wrong(**broken), *given).float().double().numpy()
         image = np.round(image.clip(0, 1) * 255) / 255 if eight_bit else image
-        return Answer(image, eight_bit, None, True)
+        return Answer(image, eight_bit, {}, True)
 
     return find_rules(draw)
 
@@ -229,7 +229,7 @@ def test_bad_input_is_one_sentence(arguments, says, capsys):
 @pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (np.nan, np.nan, np.nan)], ids=str)
 def test_nothing_is_read_off_a_picture_that_shows_nothing(color):
     """The same picture whatever it is asked for."""
-    blank = Answer(np.broadcast_to(color, (47, 63, 3)), False, None, True)
+    blank = Answer(np.broadcast_to(color, (47, 63, 3)), False, {}, True)
     rules = find_rules(lambda workload: blank)
     assert list(rules.sentences) == ["background"] and "shows nothing" in rules.sentences["background"]
 

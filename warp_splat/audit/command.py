@@ -1,6 +1,7 @@
 """``warp-splat audit``: a table, JSON and a page on a renderer, or the smallest scene that shows a finding."""
 
 import sys
+from contextlib import closing
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -39,13 +40,11 @@ def audit(config: AuditConfig) -> int:
     draw_by_program(place) if config.program else function_of(place)
     if config.case and config.case not in SCENES:
         raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
-    renderer, out = Renderer(place, config.limit), Path(config.out)
-    try:
+    out = Path(config.out)
+    with closing(Renderer(place, config.limit)) as renderer:
         if config.case:
             return _write_case(renderer, config.degree, config.case, out)
         facts, rows = run_audit(renderer, config.target, config.degree)
-    finally:
-        renderer.close()
     write_audit(out, facts, rows)
     return int(any(row.level in ("warning", "error") for row in rows))
 

@@ -91,10 +91,9 @@ def _judge(scene: str, workload: Workload, truth: Truth, answer: Answer, options
     own = exact_image(replace(workload, options=replace(workload.options, **options)))
     error, own_error = (errors_in(answer, image)[sure] for image in (exact, own))
     off, own_off = (float((each > 1.01 * LEVEL).mean()) for each in (error, own_error))
-    gradients, not_finite = {}, int((~np.isfinite(answer.image)).sum())
-    if answer.gradients:
-        not_finite += sum(int((~value.isfinite()).sum()) for value in answer.gradients.values())
-        gradients = {name: found.relative for name, found in errors_of(answer.gradients, truth).items()}
+    not_finite = int((~np.isfinite(answer.image)).sum())
+    not_finite += sum(int((~value.isfinite()).sum()) for value in answer.gradients.values())
+    gradients = {name: found.relative for name, found in errors_of(answer.gradients, truth).items()}
     worst = max((name for name in gradients if gradients[name] > GRADIENT_OFF), key=gradients.__getitem__, default="")
     blank = np.ptp(answer.image, axis=(0, 1)).max() == 0 and np.ptp(exact, axis=(0, 1)).max() > 0.1
     texts = {

@@ -27,7 +27,7 @@ class Answer:
 
     image: np.ndarray  # [H, W, 3] float64
     eight_bit: bool
-    gradients: dict[str, torch.Tensor] | None  # by parameter; None: it has none
+    gradients: dict[str, torch.Tensor]  # by parameter; empty: it has none
     same: bool  # every run gave the same bits
 
 
@@ -63,7 +63,7 @@ class Renderer:
             raise RendererFailed(f"returned shape {image.shape}, not {shape}")
         if image.dtype != np.uint8 and image.dtype.kind != "f":
             raise RendererFailed(f"returned {image.dtype}, neither floats nor uint8")
-        found = None if gradients is None else {name: torch.from_numpy(array) for name, array in gradients.items()}
+        found = {name: torch.from_numpy(array) for name, array in gradients.items()}
         eight_bit = image.dtype == np.uint8
         return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same)
 
@@ -137,7 +137,7 @@ def _phrase(error: Exception) -> str:
 
 def _bits(run) -> bytes:
     image, gradients = run
-    return b"".join(array.tobytes() for array in (image, *(gradients or {}).values()))
+    return b"".join(array.tobytes() for array in (image, *gradients.values()))
 
 
 def _draw(render, given: list[np.ndarray], camera, upstream: np.ndarray | None):
@@ -146,7 +146,7 @@ def _draw(render, given: list[np.ndarray], camera, upstream: np.ndarray | None):
     leaves = [tensor.requires_grad_(upstream is not None) for tensor in (*geometry, sh, background)]
     image = render(*leaves[:5], camera, background)
     if not isinstance(image, torch.Tensor) or not image.requires_grad:
-        return np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image), None
+        return np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image), {}
     found = torch.autograd.grad(image, leaves, torch.from_numpy(upstream).to(image), allow_unused=True)
     named = zip(PARAMETERS, found, strict=False)
     return image.detach().cpu().numpy(), {name: value.cpu().numpy() for name, value in named if value is not None}
