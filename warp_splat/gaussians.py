@@ -128,16 +128,15 @@ class GaussianModel:
         squared = np.mean((offsets * offsets).sum(2), axis=1) if neighbors > 1 else np.ones(count)
         scales = 0.5 * logarithm(np.maximum(squared, SMALLEST_DISTANCE2))
         tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
-        return cls(
-            {
-                "means": tensor(centers),
-                "sh_dc": tensor((colors / 255.0 - 0.5) / C0)[:, None],
-                "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
-                "opacities": torch.full((count,), float(np.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)))),
-                "scales": tensor(scales)[:, None].repeat(1, 3),
-                "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
-            }
-        )
+        parameters = {
+            "means": tensor(centers),
+            "sh_dc": tensor((colors / 255.0 - 0.5) / C0)[:, None],
+            "sh_rest": torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+            "opacities": torch.full((count,), float(np.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)))),
+            "scales": tensor(scales)[:, None].repeat(1, 3),
+            "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        }
+        return cls(parameters)
 
     def gradients(self, degree: int) -> list[torch.Tensor]:
         """The gradients, without those of the SH coefficients above ``degree``, which are zero. Views, not copies.
