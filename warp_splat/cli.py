@@ -3,8 +3,8 @@
 import argparse
 import atexit
 import difflib
-import importlib
 import os
+import pkgutil
 import re
 import signal
 import sys
@@ -34,23 +34,23 @@ from warp_splat.training.parts import AUTO, PARTS
 
 #: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
 COMMANDS = {
-    "sfm": (SfmConfig, "sfm.command.sfm", "compute the cameras of photographs or of a video: a scene to train on"),
-    "inspect": (InspectConfig, "inspect.command.inspect", "examine a scene before training: verdicts and pictures"),
-    "train": (TrainConfig, "training.command.train", "train Gaussians on a scene's photographs"),
-    "render": (RenderConfig, "rendering.command.render_model", "render a model: its views with metrics, or a video"),
-    "view": (ViewConfig, "viewer.command.view_model", "look at a trained model in a browser"),
+    "sfm": (SfmConfig, "sfm.command:sfm", "compute the cameras of photographs or of a video: a scene to train on"),
+    "inspect": (InspectConfig, "inspect.command:inspect", "examine a scene before training: verdicts and pictures"),
+    "train": (TrainConfig, "training.command:train", "train Gaussians on a scene's photographs"),
+    "render": (RenderConfig, "rendering.command:render_model", "render a model: its views with metrics, or a video"),
+    "view": (ViewConfig, "viewer.command:view_model", "look at a trained model in a browser"),
     "convert": (
         ConvertConfig,
-        "rendering.changes.convert",
+        "rendering.changes:convert",
         "convert Gaussians between .ply, .splat, .spz, .sog, glTF, USD",
     ),
-    "merge": (MergeConfig, "scene.blocks.merge_blocks", "make one model of the blocks of a scene (train --block)"),
-    "simplify": (SimplifyConfig, "pruning.simplify.simplify", "leave out what a finished model does not need"),
-    "clean": (CleanConfig, "pruning.clean.clean", "leave out what hangs right before few cameras"),
-    "mesh": (MeshConfig, "meshing.command.mesh", "write the surface of a trained model as triangles"),
-    "export-html": (ExportHtmlConfig, "export_html.command.export_html", "write a page that shows a model anywhere"),
-    "audit": (AuditConfig, "audit.command.audit", "measure any renderer of Gaussians against float64"),
-    "compare": (CompareConfig, "compare.command.run", "compare adjoints: error against run time and memory"),
+    "merge": (MergeConfig, "scene.blocks:merge_blocks", "make one model of the blocks of a scene (train --block)"),
+    "simplify": (SimplifyConfig, "pruning.simplify:simplify", "leave out what a finished model does not need"),
+    "clean": (CleanConfig, "pruning.clean:clean", "leave out what hangs right before few cameras"),
+    "mesh": (MeshConfig, "meshing.command:mesh", "write the surface of a trained model as triangles"),
+    "export-html": (ExportHtmlConfig, "export_html.command:export_html", "write a page that shows a model anywhere"),
+    "audit": (AuditConfig, "audit.command:audit", "measure any renderer of Gaussians against float64"),
+    "compare": (CompareConfig, "compare.command:run", "compare adjoints: error against run time and memory"),
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.
@@ -230,8 +230,7 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         with leaving_at_once():
             place = next(place for kind, place, _ in COMMANDS.values() if isinstance(config, kind))
-            module, name = place.rsplit(".", 1)
-            run = getattr(importlib.import_module(f"warp_splat.{module}"), name)
+            run = pkgutil.resolve_name(f"warp_splat.{place}")
         alike = False
         return run(config)
     except (InputError, OSError) as error:
