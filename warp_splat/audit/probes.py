@@ -71,8 +71,7 @@ class Prober:
         camera = camera or probe_camera()
         ring = CENTER + 4 * FOCAL * np.stack([np.cos(COMPANY), np.sin(COMPANY)], 1)
         company = balls(camera, ring, np.where(COMPANY % 2, 25.0, -25.0), 0.1, 0.01, 0.5)
-        rest = arrays["sh_rest"].shape[1]
-        company["sh_rest"] = np.zeros((len(COMPANY), rest, 3))
+        company["sh_rest"] = np.zeros((len(COMPANY), *arrays["sh_rest"].shape[1:]))
         both = {name: np.concatenate([array, company[name]]) for name, array in arrays.items()}
         both["scales"] = both["scales"] * NEARLY_ROUND
         answer = self.draw(on_all_pixels("probe", (tensors(both), camera), background, self.degree))

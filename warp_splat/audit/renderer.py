@@ -3,6 +3,7 @@
 import importlib
 import multiprocessing
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,16 +120,14 @@ def _serve(connection, place: str) -> None:
     except Exception as error:
         connection.send(_phrase(error))
         return
-    while True:
-        try:
+    with suppress(EOFError):  # the other end is gone
+        while True:
             given, camera, upstream, runs = connection.recv()
-        except EOFError:
-            return
-        try:
-            runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
-            connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
-        except Exception as error:
-            connection.send(_phrase(error))
+            try:
+                runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
+                connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
+            except Exception as error:
+                connection.send(_phrase(error))
 
 
 def _phrase(error: Exception) -> str:
