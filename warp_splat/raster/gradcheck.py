@@ -136,7 +136,7 @@ def check_gradients(
     names = differences.inputs_of(camera) if parameters is None else tuple(parameters)
     gaussians = checks.check_gaussians(means, quats, scales, opacities, sh)
     background = checks.check_background(background, means.device)
-    with checks.explained(options, means, [camera.base if isinstance(camera, CameraParameters) else camera]):
+    with checks.explained(options, means, [checks.check_camera(camera)]):
         scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
     if options.falloff:
         _check_falloff(options.falloff, means.device)

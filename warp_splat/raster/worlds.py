@@ -67,8 +67,7 @@ class Worlds:
                 raise InputError(f"counts: expected {len(checked.means)} Gaussians in all, got {sum(counts)}.")
             self.splats = project(checked, camera, options)
             self.bins = self.driver.bin(self.splats, camera, options, worlds=counts)
-            if invalid := int(self.bins.invalid):
-                checks.explain_invalid(invalid, checked.quats)
+            checks.explain_invalid(int(self.bins.invalid), checked.quats)
             self.touched = self.bins.ranges[:, 1] > self.bins.ranges[:, 0]
             if backdrop:
                 self._merge(backdrop)
