@@ -56,6 +56,7 @@ def flushed(numbers: np.ndarray) -> np.ndarray:
 #: By name without types: what an instruction makes of its operands. Where there is a choice, it is to the nearest.
 OPERATIONS: dict[str, Callable] = {
     **{"abs": np.abs, "neg": np.negative, "not": np.invert, "sqrt": np.sqrt, "rcp": np.reciprocal, "fma": fused},
+    "rem": np.fmod,  # with the sign of the first, as C has it
     **dict.fromkeys(("mov", "cvta.to.global", "cvta.shared"), np.asarray),
     **{"add": np.add, "sub": np.subtract, "mul": np.multiply, "mul.lo": np.multiply, "div": divided},
     **{"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "min": np.fmin, "max": np.fmax},

@@ -175,7 +175,7 @@ def test_processes_add_what_they_saw(monkeypatch):
         rows.copy_(values[name][0].to(rows.dtype))
     shared = Pretended(0, 1)
     other = {rows.data_ptr(): values[name][1] for name, rows in first.statistics().items()}
-    monkeypatch.setattr(shared, "sum", lambda rows: rows.add_(other[rows.data_ptr()]))
+    monkeypatch.setattr(shared, "merge", lambda rows: rows.add_(other[rows.data_ptr()]))
     first.processes = shared
     assert alone._grow(70) == first._grow(70)
     for name, tensor in alone.model.parameters.items():

@@ -27,7 +27,7 @@ def test_version_on_the_command_line():
 def test_ctrl_c_while_libraries_load():
     code = (
         "import signal, sys; from warp_splat import cli\n"
-        "cli.importlib.import_module = lambda name: signal.raise_signal(signal.SIGINT)\n"
+        "cli.pkgutil.resolve_name = lambda name: signal.raise_signal(signal.SIGINT)\n"
         "sys.exit(cli.main(['render']))"
     )
     run = python("-c", code, check=False)

@@ -89,8 +89,8 @@ def put_among_meshes(
     mesh_depth: wp.array3d[float],  # [V, H, W] not positive where there is none
     # out
     rgb_out: wp.array3d[wp.vec3],  # [V, H, W] as is packed below; or empty, as what follows
-    color_out: wp.array3d[wp.uint32],
-    depth_out: wp.array3d[float],
+    color_out: wp.array3d[wp.uint32],  # [V, H, W]
+    depth_out: wp.array3d[float],  # [V, H, W]
 ):
     v, y, x = pixel_at(first + wp.tid(), alpha.shape[1], alpha.shape[2])
     through = 1.0 - alpha[v, y, x]

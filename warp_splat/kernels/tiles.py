@@ -174,7 +174,7 @@ def merge_lists(
     first: int,
     back: BinsView,  # of T tiles
     front: BinsView,  # of as many tiles of each of several pictures; splats that are numbered after those
-    ranges: wp.array[wp.vec2i],  # likewise, of the merged lists; empty where nothing of `front` is
+    ranges: wp.array[wp.vec2i],  # [V T] of the merged lists; empty where nothing of `front` is
     # out
     instances_out: wp.array[int],  # [M] nearest first, of equal ones those of `back`
 ):
