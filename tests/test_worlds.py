@@ -72,6 +72,14 @@ def test_what_is_wrong_is_said():
         Worlds([means, *rest], COUNTS, CAMERA, RasterOptions())
     with pytest.raises(InputError, match="counts: expected 55 Gaussians in all, got 54"):
         Worlds(together(OWN), [30, 24], CAMERA, RasterOptions())
+    with pytest.raises(InputError, match=r"counts: expected a number of Gaussians for each world, got \[60, -5\]"):
+        Worlds(together(OWN), [60, -5], CAMERA, RasterOptions())
+    backdrop, tall = Worlds(SHARED, [40], CAMERA, RasterOptions()), make_camera(69, 55, fx=60.0)
+    for way in ((CAMERA, RasterOptions(depth=True)), (tall, RasterOptions())):
+        with pytest.raises(InputError, match="backdrop: expected one of the same camera and options"):
+            Worlds(together(OWN), COUNTS, *way, backdrop)
+    with pytest.raises(InputError, match=r"options\.alpha_min: expected a number"):
+        Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(alpha_min="x"))
     with pytest.raises(InputError, match="neither bound nor tolerance"):
         Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(bound=True))
     with pytest.raises(InputError, match=r"options.hidden_from: expected shape \[135, 69\]"):

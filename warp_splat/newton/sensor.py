@@ -21,6 +21,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.stored import sigmoid, unit_quats
 from warp_splat.kernels.place import ShapeView, make_place, name_shapes, put_among_meshes
+from warp_splat.raster.checks import check_options
 from warp_splat.raster.worlds import takes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
@@ -69,7 +70,8 @@ class SensorSplatCamera:
         adjoint: as in :func:`warp_splat.rasterize`.
 
     Raises:
-        InputError: if the model has no Gaussian shape, or one with a scale that is not the same along all axes.
+        InputError: if the model has no Gaussian shape, or one with a scale that is not the same along all axes; for an
+            option that there is not.
     """
 
     def __init__(
@@ -81,7 +83,7 @@ class SensorSplatCamera:
         adjoint: str = "manual",
     ):
         self.model, self.device, self.adjoint = model, model.device, adjoint
-        self.background, self.options = wp.vec3(*background), options or RasterOptions()
+        self.background, self.options = wp.vec3(*background), check_options(adjoint, options)
         self._layout_of, self._owners_of = lru_cache(LAYOUTS)(self._layout), lru_cache(LAYOUTS)(self._find_owners)
         self._places_of = lru_cache(PLACES)(self._places)
         bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()

@@ -44,7 +44,8 @@ class Worlds:
         backdrop: one world that stands behind and among each of these; its Gaussians are numbered first.
 
     Raises:
-        InputError: as :func:`warp_splat.rasterize` does; if they do not take that, or ``counts`` are of others.
+        InputError: as :func:`warp_splat.rasterize` does; if they do not take that, or if ``counts`` are of others, or
+            the backdrop of another camera or other options.
     """
 
     def __init__(
@@ -55,11 +56,18 @@ class Worlds:
         options: RasterOptions,
         backdrop: "Worlds | None" = None,
     ):
+        options = checks.check_options("manual", options)
         self.counts, self.options, self.backdrop = counts, options, backdrop
-        self.driver = driver_of(gaussians[0].device)
-        self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
+        self.driver, self.way = driver_of(gaussians[0].device), (checks.check_camera(camera), options)
         if not takes(camera, options):
             raise InputError("options: expected neither bound nor tolerance for several worlds, and no panorama.")
+        if backdrop and (options.hidden_from is not None or backdrop.way != self.way):
+            raise InputError(
+                "backdrop: expected one of the same camera and options, and nothing that hides; draw it so."
+            )
+        if not counts or min(counts) < 0:
+            raise InputError(f"counts: expected a number of Gaussians for each world, got {list(counts)!r:.80}.")
+        self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
         with checks.explained(options, gaussians[0], [self.camera]):
             checks.check_hidden_from(options, self.camera, gaussians[0].device)
             checked = checks.check_gaussians(*gaussians)
