@@ -159,8 +159,8 @@ def draw_worlds(
         given = [wp.to_torch(_checked(*pair), requires_grad=False) for pair in zip(names, gaussians, strict=True)]
         given[1] = _w_first(given[1], gaussians[1])
         if hidden_from is not None:
-            surfaces = wp.to_torch(hidden_from, requires_grad=False).reshape(-1, camera.width)
-            options = replace(options, hidden_from=surfaces)
+            surfaces = wp.to_torch(_checked("hidden_from", hidden_from), requires_grad=False)
+            options = replace(options, hidden_from=surfaces.reshape(-1, surfaces.shape[-1]))
         worlds = Worlds(given, counts, camera, options, backdrop)
         return {name: wp.from_torch(tensor, PIXELS.get(name)) for name, tensor in worlds.pictures.items()}, worlds
 
