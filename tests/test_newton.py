@@ -16,10 +16,11 @@ from scenes import C0
 from scipy.spatial.transform import Rotation
 from splat_files import small_splats
 
-from warp_splat import Camera, Lens, RasterOptions, Shutter
+from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile, concatenated
+from warp_splat.raster.worlds import Worlds
 
 newton = pytest.importorskip("newton", reason="newton is not installed")
 from newton.sensors import SensorCamera, SensorTiledCamera  # noqa: E402 - behind the question for it
@@ -131,6 +132,51 @@ def test_views_are_drawn_together_with_the_bits_of_each(simulation, meshes, at_o
     assert all(map(np.array_equal, *found)) and found[0][0].std() > 0.05
 
 
+def test_views_that_are_too_many_together_are_drawn_in_parts(simulation, monkeypatch):
+    """And what one alone cannot be drawn with is said; the surface of the options hides in every view."""
+    camera, transforms = camera_of_fov(WIDTH, HEIGHT, FOV), wp.array([CAMERAS[0]] * 2, dtype=wp.transform)
+    made, more = images(rgb_image=wp.vec3), images(rgb_image=wp.vec3)
+    simulation.sensor.update(state_of(simulation), transforms, camera, **made)
+    counts, bins = [], Worlds.__init__
+
+    def counted(self, gaussians, counts_of, *others):
+        counts.append(len(counts_of))
+        if len(counts_of) > 1:
+            raise InputError("too many")
+        bins(self, gaussians, counts_of, *others)
+
+    monkeypatch.setattr(Worlds, "__init__", counted)
+    simulation.sensor.update(state_of(simulation), transforms, camera, **more)
+    assert counts == [1, 2, 1, 1] and np.array_equal(made["rgb_image"].numpy(), more["rgb_image"].numpy())
+    wrong = state_of(simulation, [(np.nan, 0, 0, 0, 0, 0, 1), BODIES[1]])
+    refusal(lambda: simulation.sensor.update(wrong, transforms, camera, **more), match="means: expected finite numbers")
+    hides = RasterOptions(hidden_from=torch.full((HEIGHT, WIDTH), 1e-3))
+    hidden = SensorSplatCamera(simulation.model, background=BACKGROUND, options=hides)
+    hidden.update(state_of(simulation), transforms, camera, **more)
+    np.testing.assert_allclose(more["rgb_image"].numpy(), np.broadcast_to(BACKGROUND, (2, HEIGHT, WIDTH, 3)), rtol=1e-6)
+
+
+def test_options_are_checked_when_the_sensor_is_made(simulation):
+    for options, word in (({"alpha_min": 5.0}, "alpha_min"), ({"exp_degree": 7}, "exp_degree")):
+        make = partial(SensorSplatCamera, simulation.model, options=RasterOptions(**options))
+        refusal(make, f"options.{word}: expected")
+    refusal(lambda: SensorSplatCamera(simulation.model, adjoint="bogus"), "adjoint: expected one of")
+
+
+def test_the_depth_of_meshes_may_be_written_over(simulation):
+    """Also where shapes are named."""
+    camera, transforms = camera_of_fov(WIDTH, HEIGHT, FOV), wp.array(CAMERAS, dtype=wp.transform)
+    surfaces = np.random.default_rng(0).uniform(-3, 7, (2, HEIGHT, WIDTH)).astype(np.float32)
+    index, found = wp.full((2, HEIGHT, WIDTH), 77, dtype=wp.uint32), []
+    for over in (False, True):
+        mesh = wp.array(surfaces, dtype=float)
+        made = images(shape_index_image=wp.uint32, forward_depth_image=float)
+        made |= {"forward_depth_image": mesh} if over else {}
+        simulation.sensor.update(state_of(simulation), transforms, camera, **made, mesh_depth=mesh, mesh_index=index)
+        found.append([array.numpy() for array in made.values()])
+    assert all(map(np.array_equal, *found)) and {0, 77} < set(np.unique(found[0][0]))
+
+
 def test_a_world_without_gaussians_shows_those_of_all(simulation):
     """Or nothing, if there are none."""
     for shared in (True, False):
@@ -148,6 +194,8 @@ def test_a_world_without_gaussians_shows_those_of_all(simulation):
         first, second = made["rgb_image"].numpy()
         assert (first.max() > 0.3) == shared and second.max() > 0.3
         first, second = (set(np.unique(indices)) for indices in made["shape_index_image"].numpy())
+        one = wp.zeros((1, 1, 1), dtype=wp.vec3)
+        SensorSplatCamera(model).update(model.state(), same[:1], camera_of_fov(1, 1, FOV), rgb_image=one)
         assert first == ({0, 2**32 - 1} if shared else {2**32 - 1}) and 2**32 - 1 in second and len(second) > 1
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from scenes import cloud, make_camera
 
-from warp_splat import InputError, RasterOptions, rasterize
+from warp_splat import CameraParameters, InputError, RasterOptions, rasterize
 from warp_splat.raster.worlds import Worlds, takes
 
 COUNTS = (30, 0, 25)  # one has none of its own
@@ -50,7 +50,7 @@ def test_the_bits_are_those_of_a_call_for_each(asked, driver):
 def test_what_hides_is_each_worlds_own(driver):
     surfaces = torch.stack([torch.full((45, 69), depth) for depth in (4.0, 0.0, 5.0)])
     surfaces[:, :, 40:] = 0.0  # nothing there
-    options = RasterOptions(hidden_from=surfaces.view(-1, 69))
+    options = RasterOptions(hidden_from=surfaces)
     worlds = [together([SHARED, own]) for own in OWN]
     pictures = Worlds(together(worlds), [40 + count for count in COUNTS], CAMERA, options).pictures
     check(pictures, worlds, lambda world: RasterOptions(hidden_from=surfaces[world]))
@@ -76,12 +76,16 @@ def test_what_is_wrong_is_said():
         Worlds(together(OWN), [60, -5], CAMERA, RasterOptions())
     backdrop, tall = Worlds(SHARED, [40], CAMERA, RasterOptions()), make_camera(69, 55, fx=60.0)
     for way in ((CAMERA, RasterOptions(depth=True)), (tall, RasterOptions())):
-        with pytest.raises(InputError, match="backdrop: expected one of the same camera and options"):
+        with pytest.raises(InputError, match="backdrop: expected one world of the same camera and options"):
             Worlds(together(OWN), COUNTS, *way, backdrop)
+    with pytest.raises(InputError, match="that has none itself"):
+        Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(), Worlds(SHARED, [40], CAMERA, RasterOptions(), backdrop))
+    with pytest.raises(InputError, match="for several worlds, got CameraParameters"):
+        Worlds(together(OWN), COUNTS, CameraParameters(CAMERA), RasterOptions())
     with pytest.raises(InputError, match=r"options\.alpha_min: expected a number"):
         Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(alpha_min="x"))
-    with pytest.raises(InputError, match="neither bound nor tolerance"):
+    with pytest.raises(InputError, match="neither bound, tolerance"):
         Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(bound=True))
-    with pytest.raises(InputError, match=r"options.hidden_from: expected shape \[135, 69\]"):
+    with pytest.raises(InputError, match=r"hidden_from: expected shape \[3, 45, 69\]"):
         Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(hidden_from=torch.ones(45, 69)))
     assert not takes(CAMERA, RasterOptions(bound=True)) and not takes(CAMERA, RasterOptions(tolerance=0.01))

@@ -129,21 +129,28 @@ def rasterize(
 
 
 def draw_worlds(
-    *gaussians: wp.array,
+    means: wp.array,
+    quats: wp.array,
+    scales: wp.array,
+    opacities: wp.array,
+    sh: wp.array,
     counts: Sequence[int],
     camera: Camera,
-    options: RasterOptions,
+    options: RasterOptions | None = None,
     hidden_from: wp.array | None = None,
     backdrop: Worlds | None = None,
 ) -> tuple[dict[str, wp.array], Worlds]:
     """Pictures of W worlds through one camera, forward only, with the bits of :func:`rasterize` and in less time.
 
     Args:
-        gaussians: means, quats, scales, opacities and sh of all worlds, one after the other, as :func:`rasterize`
-            takes them.
+        means: of all worlds, one after the other, as :func:`rasterize` takes them, like the next four.
+        quats: likewise.
+        scales: likewise.
+        opacities: likewise.
+        sh: likewise, one array.
         counts: of each world's Gaussians.
         camera: of all worlds; any but a panorama.
-        options: what to compute: the color, depth, the strongest; neither bound nor tolerance.
+        options: what to compute: the color, depth, the strongest.
         hidden_from: as in :func:`rasterize`, [W, H, W].
         backdrop: what was drawn of a world that stands behind and among each of these, and is numbered first.
 
@@ -154,14 +161,14 @@ def draw_worlds(
     Raises:
         InputError: as :func:`rasterize` does.
     """
-    names = ("means", "quats", "scales", "opacities", "sh")
-    with _torch_on(gaussians[0].device, False):
-        given = [wp.to_torch(_checked(*pair), requires_grad=False) for pair in zip(names, gaussians, strict=True)]
-        given[1] = _w_first(given[1], gaussians[1])
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    given |= {} if hidden_from is None else {"hidden_from": hidden_from}
+    with _torch_on(_checked("means", means).device, False):
+        found = {name: wp.to_torch(_checked(name, array), requires_grad=False) for name, array in given.items()}
+        found["quats"] = _w_first(found["quats"], quats)
         if hidden_from is not None:
-            surfaces = wp.to_torch(_checked("hidden_from", hidden_from), requires_grad=False)
-            options = replace(options, hidden_from=surfaces.reshape(-1, surfaces.shape[-1]))
-        worlds = Worlds(given, counts, camera, options, backdrop)
+            options = replace(options or RasterOptions(), hidden_from=found.pop("hidden_from"))
+        worlds = Worlds(list(found.values()), counts, camera, options, backdrop)
         return {name: wp.from_torch(tensor, PIXELS.get(name)) for name, tensor in worlds.pictures.items()}, worlds
 
 

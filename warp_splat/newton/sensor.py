@@ -4,7 +4,7 @@ The tape of Warp has all of it: :mod:`warp_splat.kernels.place` around :mod:`war
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial, partialmethod
 from itertools import groupby, pairwise
@@ -26,7 +26,7 @@ from warp_splat.raster.worlds import takes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
 AT_ONCE = 2**20  # Gaussians of views that are drawn together, or 16 times as many pixels
-LAYOUTS, PLACES = 8, 1024  # that are kept: of the worlds and views that are asked for, again and again
+TOGETHER, PLACES = 8, 1024  # that are kept: of worlds that are drawn together, and of views
 Seen = tuple[slice, dict[str, wp.array]]  # views, and their pixels by their names, on black
 #: Of what images are; others are of uint32.
 KINDS = {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}
@@ -84,7 +84,7 @@ class SensorSplatCamera:
     ):
         self.model, self.device, self.adjoint = model, model.device, adjoint
         self.background, self.options = wp.vec3(*background), check_options(adjoint, options)
-        self._layout_of, self._owners_of = lru_cache(LAYOUTS)(self._layout), lru_cache(LAYOUTS)(self._find_owners)
+        self._layout_of, self._owners_of = _kept(self._layout), _kept(self._find_owners)
         self._places_of = lru_cache(PLACES)(self._places)
         bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()
         sizes, view = model.shape_scale.numpy(), cache(self._view)
@@ -177,18 +177,18 @@ class SensorSplatCamera:
         lenses = {id(one): replace(one, **poseless) for one in cameras}
         cameras, place = [lenses[id(one)] for one in cameras], partial(self._place, state, camera_transforms)
         draw = self._draw_each
-        if open_tape() is None and all(takes(lens, options) for lens in lenses.values()):
+        if not open_tape() and options.hidden_from is None and all(takes(lens, options) for lens in lenses.values()):
             draw = partial(self._draw_together, camera_transforms)
         for views, seen in draw(place, cameras, chosen.tolist(), options, mesh_depth):
             surfaces, size = _part(mesh_depth, views), seen["alpha"].size
+            if shape_index_image is not None:  # first, because the depth of meshes may be written over
+                inputs = [seen["strongest"], seen["strongest_weights"], seen["alpha"]]
+                inputs += [self._owners_of(*chosen[views].tolist()), surfaces, _part(mesh_index, views)]
+                launch_on_tape(name_shapes, size, inputs, [_part(shape_index_image, views)], self.device)
             inputs = [seen["image"], seen["alpha"], seen.get("depth"), self.background]
             made = [_part(image, views) for image in (rgb_image, color_image, forward_depth_image)]
             inputs += [_part(mesh_color, views), surfaces]
             launch_on_tape(put_among_meshes, size, inputs, made, self.device)
-            if shape_index_image is not None:
-                inputs = [seen["strongest"], seen["strongest_weights"], seen["alpha"]]
-                inputs += [self._owners_of(*chosen[views].tolist()), surfaces, _part(mesh_index, views)]
-                launch_on_tape(name_shapes, size, inputs, [_part(shape_index_image, views)], self.device)
 
     def _draw_each(self, place, cameras, worlds, options, mesh_depth) -> Iterator[Seen]:
         """One view after the other, with gradients on a tape."""
@@ -214,17 +214,24 @@ class SensorSplatCamera:
                 given = place(first, [shared])
                 _, backdrop = tape.draw_worlds(*given, counts=[count_of(shared)], camera=camera, options=options)
             most = max(count_of(shared + self._pieces[world]) for world in worlds[first:end])
-            size = max(AT_ONCE // max(most, camera.width * camera.height // 16), 1)
-            for begin in range(first, end, size):
-                part = slice(begin, min(begin + size, end))
+            size = max(AT_ONCE // max(most, camera.width * camera.height // 16, 1), 1)
+            parts = [slice(begin, min(begin + size, end)) for begin in range(first, end, size)]
+            while parts:
+                part = parts.pop(0)
                 table = [([] if backdrop else shared) + self._pieces[world] for world in worlds[part]]
                 more = {"camera": camera, "options": options, "hidden_from": _part(mesh_depth, part)}
-                counts = [count_of(pieces) for pieces in table]
-                yield part, tape.draw_worlds(*place(begin, table), counts=counts, backdrop=backdrop, **more)[0]
+                given, counts = place(part.start, table), [count_of(pieces) for pieces in table]
+                try:
+                    yield part, tape.draw_worlds(*given, counts=counts, backdrop=backdrop, **more)[0]
+                except InputError:  # one that cannot be drawn, or too many at once
+                    if len(table) == 1:
+                        raise
+                    middle = (part.start + part.stop) // 2
+                    parts = [slice(part.start, middle), slice(middle, part.stop), *parts]
 
     def _place(self, state, camera_transforms, first: int, table: Sequence[list[Piece]]) -> tuple[wp.array, ...]:
         """The Gaussians of pieces, view after view, in the camera's frame; on a tape, in arrays of their own."""
-        layout = self._layout_of(*((piece.source, piece.size) for pieces in table for piece in pieces))
+        layout = self._layout_of(*(tuple((piece.source, piece.size) for piece in pieces) for pieces in table))
         made = layout.room
         if open_tape():
             made = tuple(wp.empty_like(array, requires_grad=True) for array in layout.room)
@@ -256,8 +263,9 @@ class SensorSplatCamera:
         view.sh = wp.array(sh, dtype=wp.vec3, device=self.device)
         return view
 
-    def _layout(self, *parts: tuple[Any, float]) -> Layout:
-        """Of the Gaussians of sources, each in its size."""
+    def _layout(self, *views: tuple[tuple[Any, float], ...]) -> Layout:
+        """Of the Gaussians of sources, each in its size, view after view."""
+        parts = [part for view in views for part in view]
         scales = np.concatenate([np.empty((0, 3)), *(size * source.scales for source, size in parts)])
         opacities = np.concatenate([np.empty(0), *(source.opacities for source, _ in parts)])
         new = partial(wp.empty, len(opacities), device=self.device)
@@ -274,6 +282,12 @@ class SensorSplatCamera:
         for row, pieces in zip(shapes, table, strict=True):
             row[: count_of(pieces)] = np.repeat(*np.int64([(p.shape, p.source.count) for p in pieces]).reshape(-1, 2).T)
         return wp.array(shapes, dtype=wp.uint32, device=self.device)
+
+
+def _kept(make: Callable[..., Any]) -> Callable[..., Any]:
+    """``make`` of views, made once for each alone, and kept for some that are drawn together."""
+    alone, together = cache(make), lru_cache(TOGETHER)(make)
+    return lambda *views: (alone if len(views) == 1 else together)(*views)
 
 
 def _part(array: wp.array | None, views: int | slice) -> Any:

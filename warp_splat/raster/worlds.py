@@ -28,9 +28,10 @@ from warp_splat.runtime.launch import empty, launch, send, view
 
 
 def takes(camera: Camera, options: RasterOptions) -> bool:
-    """Whether :class:`Worlds` do: in a panorama splats show twice, and a tolerance asks for more passes."""
+    """Whether :class:`Worlds` do: in a panorama splats show twice, and some options ask for more than they give."""
     around = camera.lens is not None and camera.lens.family.around
-    return not (around or options.bound or options.tolerance is not None)
+    more = options.bound or options.normals or options.median_depth or options.tolerance is not None
+    return not (around or more)
 
 
 class Worlds:
@@ -57,19 +58,27 @@ class Worlds:
         backdrop: "Worlds | None" = None,
     ):
         options = checks.check_options("manual", options)
-        self.counts, self.options, self.backdrop = counts, options, backdrop
-        self.driver, self.way = driver_of(gaussians[0].device), (checks.check_camera(camera), options)
+        if checks.check_camera(camera) is not camera:
+            raise InputError("camera: expected a warp_splat.Camera for several worlds, got CameraParameters.")
         if not takes(camera, options):
-            raise InputError("options: expected neither bound nor tolerance for several worlds, and no panorama.")
-        if backdrop and (options.hidden_from is not None or backdrop.way != self.way):
-            raise InputError(
-                "backdrop: expected one of the same camera and options, and nothing that hides; draw it so."
-            )
-        if not counts or min(counts) < 0:
-            raise InputError(f"counts: expected a number of Gaussians for each world, got {list(counts)!r:.80}.")
+            beside = "bound, tolerance, normals nor median_depth"
+            raise InputError(f"options: expected neither {beside} for several worlds, and no panorama.")
+        if not (isinstance(counts, Sequence) and counts and all(isinstance(n, int) and n >= 0 for n in counts)):
+            raise InputError(f"counts: expected a number of Gaussians for each world, got {counts!r:.80}.")
+        self.way = camera, options
+        if backdrop and (
+            options.hidden_from is not None or len(backdrop.counts) > 1 or backdrop.backdrop or backdrop.way != self.way
+        ):
+            beside = "that has none itself, and nothing that hides"
+            raise InputError(f"backdrop: expected one world of the same camera and options, {beside}.")
+        if options.hidden_from is not None:
+            shape = len(counts), camera.height, camera.width
+            checks.check_tensor("hidden_from", options.hidden_from, shape, gaussians[0].device)
+            options = replace(options, hidden_from=options.hidden_from.flatten(0, 1))
+        self.counts, self.options, self.backdrop = counts, options, backdrop
+        self.driver = driver_of(gaussians[0].device)
         self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
         with checks.explained(options, gaussians[0], [self.camera]):
-            checks.check_hidden_from(options, self.camera, gaussians[0].device)
             checked = checks.check_gaussians(*gaussians)
             if sum(counts) != len(checked.means):
                 raise InputError(f"counts: expected {len(checked.means)} Gaussians in all, got {sum(counts)}.")
