@@ -72,11 +72,14 @@ def test_what_is_wrong_is_said():
         Worlds([means, *rest], COUNTS, CAMERA, RasterOptions())
     with pytest.raises(InputError, match="counts: expected 55 Gaussians in all, got 54"):
         Worlds(together(OWN), [30, 24], CAMERA, RasterOptions())
-    with pytest.raises(InputError, match=r"counts: expected a number of Gaussians for each world, got \[60, -5\]"):
-        Worlds(together(OWN), [60, -5], CAMERA, RasterOptions())
+    for counts in ([60, -5], [27.5, 27.5], 55, b"\x37", None, []):
+        with pytest.raises(InputError, match="counts: expected a list of whole numbers, one for each world, got"):
+            Worlds(together(OWN), counts, CAMERA, RasterOptions())
+    with pytest.raises(InputError, match="backdrop: expected what was drawn of another world, got tuple"):
+        Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(), ({}, None))
     backdrop, tall = Worlds(SHARED, [40], CAMERA, RasterOptions()), make_camera(69, 55, fx=60.0)
     for way in ((CAMERA, RasterOptions(depth=True)), (tall, RasterOptions())):
-        with pytest.raises(InputError, match="backdrop: expected one world of the same camera and options"):
+        with pytest.raises(InputError, match="backdrop: expected one world of the same Camera object and options"):
             Worlds(together(OWN), COUNTS, *way, backdrop)
     with pytest.raises(InputError, match="that has none itself"):
         Worlds(together(OWN), COUNTS, CAMERA, RasterOptions(), Worlds(SHARED, [40], CAMERA, RasterOptions(), backdrop))

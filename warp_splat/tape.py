@@ -15,7 +15,7 @@ import warp as wp
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.raster import api
+from warp_splat.raster import api, checks
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped
 from warp_splat.raster.worlds import Worlds
@@ -167,7 +167,7 @@ def draw_worlds(
         found = {name: wp.to_torch(_checked(name, array), requires_grad=False) for name, array in given.items()}
         found["quats"] = _w_first(found["quats"], quats)
         if hidden_from is not None:
-            options = replace(options or RasterOptions(), hidden_from=found.pop("hidden_from"))
+            options = replace(checks.check_options("manual", options), hidden_from=found.pop("hidden_from"))
         worlds = Worlds(list(found.values()), counts, camera, options, backdrop)
         return {name: wp.from_torch(tensor, PIXELS.get(name)) for name, tensor in worlds.pictures.items()}, worlds
 

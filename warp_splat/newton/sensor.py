@@ -26,7 +26,7 @@ from warp_splat.raster.worlds import takes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
 AT_ONCE = 2**20  # Gaussians of views that are drawn together, or 16 times as many pixels
-TOGETHER, PLACES = 8, 1024  # that are kept: of worlds that are drawn together, and of views
+TOGETHER, PLACES = 32, 1024  # that are kept: of worlds that are drawn together, and of views
 Seen = tuple[slice, dict[str, wp.array]]  # views, and their pixels by their names, on black
 #: Of what images are; others are of uint32.
 KINDS = {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import accumulate
+from numbers import Integral
 
 import torch
 import warp as wp
@@ -63,14 +64,18 @@ class Worlds:
         if not takes(camera, options):
             beside = "bound, tolerance, normals nor median_depth"
             raise InputError(f"options: expected neither {beside} for several worlds, and no panorama.")
-        if not (isinstance(counts, Sequence) and counts and all(isinstance(n, int) and n >= 0 for n in counts)):
-            raise InputError(f"counts: expected a number of Gaussians for each world, got {counts!r:.80}.")
+        whole = isinstance(counts, (list, tuple)) and all(isinstance(n, Integral) and n >= 0 for n in counts)
+        if not (whole and counts):
+            raise InputError(f"counts: expected a list of whole numbers, one for each world, got {counts!r:.80}.")
+        counts = [int(n) for n in counts]
+        if not isinstance(backdrop, Worlds | None):
+            raise InputError(f"backdrop: expected what was drawn of another world, got {type(backdrop).__name__}.")
         self.way = camera, options
         if backdrop and (
             options.hidden_from is not None or len(backdrop.counts) > 1 or backdrop.backdrop or backdrop.way != self.way
         ):
             beside = "that has none itself, and nothing that hides"
-            raise InputError(f"backdrop: expected one world of the same camera and options, {beside}.")
+            raise InputError(f"backdrop: expected one world of the same Camera object and options, {beside}.")
         if options.hidden_from is not None:
             shape = len(counts), camera.height, camera.width
             checks.check_tensor("hidden_from", options.hidden_from, shape, gaussians[0].device)
