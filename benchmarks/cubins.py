@@ -23,11 +23,11 @@ from warp_splat.kernels.activation import make_activate, make_adj_activate
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
 from warp_splat.kernels.cuda import channels, lists
 from warp_splat.kernels.cuda.adam_by_number import make_adam_by_number
-from warp_splat.kernels.cuda.adjoint import make_reverse_block, make_upstream_block
-from warp_splat.kernels.cuda.blend import make_blend_block
+from warp_splat.kernels.cuda.adjoint import make_reverse, make_upstream
+from warp_splat.kernels.cuda.blend import make_blend
 from warp_splat.kernels.cuda.comparison import compare_block
 from warp_splat.kernels.cuda.gather import make_gather
-from warp_splat.kernels.cuda.taped import make_walk_block
+from warp_splat.kernels.cuda.taped import make_walk
 from warp_splat.kernels.environment import make_adj_put_behind, make_put_behind
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.project import adj_camera, affine, ellipsoid
@@ -88,14 +88,14 @@ def modules() -> dict[str, wp.Module]:
         found[f"adjoint of {name}"] = make_project(affine.through(family, True), reach_of, 1, None).module
     for depth in (False, True):
         suffix, variant = ", depth" if depth else "", BlendVariant(3 + depth)
-        found[f"blend{suffix}"] = make_blend_block(variant).module
-        found[f"blend, stored{suffix}"] = make_blend_block(variant._replace(keep=True)).module
-        found[f"upstream{suffix}"] = make_upstream_block(variant).module
+        found[f"blend{suffix}"] = make_blend(variant).module
+        found[f"blend, stored{suffix}"] = make_blend(variant._replace(keep=True)).module
+        found[f"upstream{suffix}"] = make_upstream(variant).module
         found[f"gather{suffix}"] = make_gather(WIDTHS[: 4 + depth]).module
         for mode in ADJOINTS[:2]:
-            found[f"{mode}{suffix}"] = make_reverse_block(mode, variant).module
+            found[f"{mode}{suffix}"] = make_reverse(mode, variant).module
         for mode in ADJOINTS[2:]:
-            found[f"{mode}{suffix}"] = make_walk_block(mode, variant).module
+            found[f"{mode}{suffix}"] = make_walk(mode, variant).module
     plain = BlendVariant()
     found["gather, channels"] = make_gather((*WIDTHS[:3], CHANNEL_WIDTHS[-1])).module
     found["channels"] = channels.make_beside(plain).module

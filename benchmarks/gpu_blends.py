@@ -60,7 +60,7 @@ def multiply_add(first: int, rounds: int, factor: float, values_out: wp.array[wp
 @functools.cache
 def make_adding_block(variant: BlendVariant) -> wp.Kernel:
     """The package's adjoint with another last line: what it wrote to a slot is added to the Gaussian's row."""
-    source = inspect.getsource(adjoint.make_reverse_block)
+    source = inspect.getsource(adjoint.make_reverse)
     changed = source.replace(
         "slots_out[k, column] = total", "wp.atomic_add(slots_out, bins.instances[k], column, total)"
     )
@@ -68,7 +68,7 @@ def make_adding_block(variant: BlendVariant) -> wp.Kernel:
     path, names = "<adjoint that adds>", dict(vars(adjoint))
     linecache.cache[path] = (len(changed), None, changed.splitlines(keepends=True), path)  # where Warp finds it
     exec(compile(changed, path, "exec"), names)
-    return names["make_reverse_block"]("manual", variant)
+    return names["make_reverse"]("manual", variant)
 
 
 class Blends:
@@ -103,7 +103,7 @@ class Blends:
         launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
 
     def into_slots(self) -> None:
-        self.reverse(adjoint.make_reverse_block("manual", variant_of(self.options)), self.slots)
+        self.reverse(adjoint.make_reverse("manual", variant_of(self.options)), self.slots)
 
     def longest_alone(self) -> "Blends":
         """The same with nothing to walk in all tiles but the one with most."""

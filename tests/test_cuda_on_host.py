@@ -71,7 +71,7 @@ def launches_of(case, monkeypatch, scene):
 
 
 def adjoint_of(launches):
-    (launch,) = (launch for launch in launches if launch.kernel.key.startswith("make_reverse_block"))
+    (launch,) = (launch for launch in launches if launch.kernel.key.startswith("make_reverse"))
     return launch
 
 

@@ -103,7 +103,7 @@ def _check_colors(request: Request, batch: tuple[int, ...], count: int, cameras:
         raise InputError(f"colors: expected {least} or more coefficients of 3 colors, got {list(colors.shape[-2:])}.")
     if tail == 1 and not 1 <= colors.shape[-1] <= CHANNELS_MOST:
         raise InputError(f"colors: expected 1 to {CHANNELS_MOST} channels, got {colors.shape[-1]}.")
-    most = driver_of(colors.device).channels.at_once - 2  # the depth and alpha are two more
+    most = driver_of(colors.device).kernels.channels.AT_ONCE - 2  # the depth and alpha are two more
     if request.absgrad and colors.shape[-1] > most:
         raise InputError(f"absgrad: expected at most {most} channels in colors with it, got {colors.shape[-1]}.")
     return per_view

@@ -96,7 +96,8 @@ def _launch(
     """Fill ``pixels`` [H, W, C] with a group of channels; or, with ``strongest``, ranks and median, with weights."""
     new, (_, count) = partial(torch.empty, dtype=torch.int32, device=pixels.device), blending.view_walk()
     ranks, median = strongest or (new(0, 0, 0), new(0, 0))
-    kernel = blending.driver.channels.beside(variant_of(blending.options), ranks.shape[2] if strongest else None)
+    at_most = ranks.shape[2] if strongest else None
+    kernel = blending.driver.kernels.channels.make_beside(variant_of(blending.options), at_most)
     inputs = [blending.bins.view(), alphas_of(blending.options), count, view(blending.steps, wp.int32)]
     inputs += [view(rows, wp.float32), begin, group]
     outputs = [view(pixels, wp.float32), view(ranks, wp.int32), view(median, wp.int32)]
@@ -190,7 +191,7 @@ class Weights(torch.autograd.Function):
 
 def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
     """For each group of channels: where it begins, and the splats' rows of it [V, at once], filled up with zeros."""
-    gaussians, size = wp.to_torch(bins.gaussians).long(), driver.channels.at_once
+    gaussians, size = wp.to_torch(bins.gaussians).long(), driver.kernels.channels.AT_ONCE
     for begin in range(0, features.shape[1], size):
         part = features[:, begin : begin + size]
         rows = features.new_zeros(len(gaussians), size)
@@ -227,7 +228,7 @@ def _differentiate(
     most, width = (0, next(width for width in WIDTHS if width >= group)) if ranks is None else (group, 0)
     width = 0 if mode == "absolute" else width
     slots = _new_slots(bins, CHANNEL + width)
-    kernel = driver.channels.adjoint(mode, variant_of(options), most)
+    kernel = driver.kernels.channels.make_adj_channels(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
     inputs = [bins.view(), alphas_of(options), *blending.view_walk(), view(blending.steps, wp.int32)]
     inputs += [view(rows, wp.float32), view(ranks, wp.float32), begin, group, view(adj_pixels, wp.float32)]

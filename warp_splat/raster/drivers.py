@@ -9,6 +9,7 @@ kernel that writes every T, and ``generated`` (for the comparison) reads a copy 
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
+from types import ModuleType
 from typing import NamedTuple
 
 import torch
@@ -16,19 +17,10 @@ import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions
-from warp_splat.kernels.cpu import adjoint as lanes_adjoint
-from warp_splat.kernels.cpu import blend as lanes_blend
-from warp_splat.kernels.cpu import channels as lanes_channels
-from warp_splat.kernels.cpu import gather as lanes_gather
-from warp_splat.kernels.cpu import taped as lanes_taped
-from warp_splat.kernels.cuda import adjoint as blocks_adjoint
-from warp_splat.kernels.cuda import blend as blocks_blend
-from warp_splat.kernels.cuda import channels as blocks_channels
-from warp_splat.kernels.cuda import gather as blocks_gather
-from warp_splat.kernels.cuda import taped as blocks_taped
+from warp_splat.kernels import cpu, cuda
 from warp_splat.kernels.cuda.warps import WARP
 from warp_splat.kernels.simd import LANES, vec16
-from warp_splat.kernels.splat import BlendVariant, Splat2D
+from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
 from warp_splat.kernels.tiles import count_in_front
 from warp_splat.raster import bin
@@ -38,25 +30,8 @@ from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks
 THREADS = TILE * TILE
 
 
-class ChannelKernels(NamedTuple):
-    """What blends any number of channels, beside the color."""
-
-    at_once: int  # channels of a group
-    beside: Callable[..., wp.Kernel]  # of a variant: channels; and of a number: so many of the strongest Gaussians
-    adjoint: Callable[..., wp.Kernel]
-
-
-class TileKernels(NamedTuple):
-    """What makes the kernels that take a tile."""
-
-    blend: Callable[[BlendVariant], wp.Kernel]
-    upstream: Callable[[BlendVariant], wp.Kernel]
-    reverse: Callable[[str, BlendVariant], wp.Kernel]  # "manual" and "stepwise"
-    walk: Callable[[str, BlendVariant], wp.Kernel]  # the modes whose loop Warp differentiates
-
-
 class TileLayout(NamedTuple):
-    """How these kernels hold what belongs to the pixels of a tile."""
+    """How kernels that take a tile hold what belongs to the pixels of a tile."""
 
     shape: tuple[int, ...]  # of a number for each pixel
     number: type  # an element of that, for kernels
@@ -76,9 +51,8 @@ class Driver:
     bin: Callable[..., Bins]
     gather: Callable[..., list[torch.Tensor]]
     launch_tiles: Callable[..., None]  # a kernel for each tile: kernel, bins, inputs, outputs
-    kernels: TileKernels
+    kernels: ModuleType  # the package of those that take a tile: modules and makers have the same names in both
     layout: TileLayout
-    channels: ChannelKernels
 
     def blend(
         self, bins: Bins, camera: Camera, background: torch.Tensor, options: RasterOptions, keep: bool
@@ -101,10 +75,11 @@ class Driver:
             inputs = [bins.view(), view(options.hidden_from.resolve_neg(), wp.float32), self.lanes]
             outputs = [view(limits.view(-1, THREADS), wp.float32)]
             launch(count_in_front, tile_count, inputs, outputs, bounds=bins.slices, device=background.device)
-        kernel = self.kernels.blend(variant_of(options, keep, options.bound, options.hidden_from is not None))
+        variant = variant_of(options, keep, options.bound, options.hidden_from is not None)
         inputs = [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32), bins.bound]
         inputs.append(view(limits, self.layout.number))
-        self.launch_tiles(kernel, bins, inputs, [pixels.view(), *self.view_walk(*saved)])
+        outputs = [pixels.view(), *self.view_walk(*saved)]
+        self.launch_tiles(self.kernels.blend.make_blend(variant), bins, inputs, outputs)
         return pixels, saved
 
     def adjoint(
@@ -135,14 +110,16 @@ class Driver:
         Zeros in ``slots``, for the instances that the adjoint does not walk.
         """
         tile_count, new = len(bins.ranges), background.new_empty
-        up = new(tile_count, *self.layout.upstream_shape(variant_of(options).channels))
+        variant = variant_of(options)
+        up = new(tile_count, *self.layout.upstream_shape(variant.channels))
         adj_final, adj_background = torch.empty_like(saved.final), new(tile_count, 3)
         dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
         inputs = [bins.view(), view(background, wp.float32), *self.view_walk(saved.final, saved.count)]
         outputs = [view(up, self.layout.upstream), view(adj_final, self.layout.number)]
         outputs += [view(adj_background, wp.float32), view(dropped, wp.int32), view(steps, wp.int32)]
         outputs.append(view(slots, self.layout.slot(slots.shape[1])))
-        self.launch_tiles(self.kernels.upstream(variant_of(options)), bins, [*inputs, adj_pixels.view()], outputs)
+        inputs.append(adj_pixels.view())
+        self.launch_tiles(self.kernels.adjoint.make_upstream(variant), bins, inputs, outputs)
         return (up, adj_final), adj_background, dropped, steps
 
     def differentiate(
@@ -151,10 +128,11 @@ class Driver:
         """Fill ``slots`` [M, 9 or 10]; ``upstream`` and ``steps`` [T] are those of :meth:`spread_upstream`."""
         final, count, kept = self.view_walk(*saved)
         lists, steps, rows = bins.view(), view(steps, wp.int32), view(slots, wp.float32)
+        variant = variant_of(options)
         upstream = [view(upstream[0], self.layout.upstream), view(upstream[1], self.layout.number)]
         if mode in ("manual", "stepwise"):
             inputs = [lists, alphas_of(options), final, count, steps, *upstream]
-            self.launch_tiles(self.kernels.reverse(mode, variant_of(options)), bins, inputs, [rows])
+            self.launch_tiles(self.kernels.adjoint.make_reverse(mode, variant), bins, inputs, [rows])
             return
         inputs = [alphas_of(options), final, count, kept, steps, rows]
         if mode == "generated":
@@ -164,9 +142,9 @@ class Driver:
             lists.splats = copies
         # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``rows``
         adjoint = {"adj_inputs": [BinsView(), *[None] * len(inputs)], "adj_outputs": upstream}
-        self.launch_tiles(self.kernels.walk(mode, variant_of(options)), bins, [lists, *inputs], upstream, **adjoint)
+        self.launch_tiles(self.kernels.taped.make_walk(mode, variant), bins, [lists, *inputs], upstream, **adjoint)
         if mode == "generated":
-            launch(lanes_taped.rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [rows])
+            launch(cpu.taped.rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [rows])
 
     def view_walk(self, final: torch.Tensor, count: torch.Tensor, *kept: torch.Tensor) -> list:
         """Final transmittances, counts and kept transmittances, as kernels take them."""
@@ -207,7 +185,7 @@ def gather_by_splat(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] |
     grads, width = grads or bins.new_gradients(slots), slots.shape[1]
     columns = [grad.data_ptr() + 4 * column for grad in grads for column in range(grad.shape[1])][:width]
     addresses, widths = torch.tensor(columns), tuple(grad.shape[1] for grad in grads)
-    kernel = lanes_gather.make_gather(widths if sum(widths) == width else widths[:-1])
+    kernel = cpu.gather.make_gather(widths if sum(widths) == width else widths[:-1])
     inputs = [bins.gaussian_count, bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32)]
     inputs += [view(slots, wp.types.vector(length=width, dtype=float)), 0.0]
     launch(kernel, len(bins.place_begins) + 1, inputs, [view(addresses, wp.uint64)])
@@ -216,43 +194,34 @@ def gather_by_splat(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] |
 
 def gather_by_warp(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
     """:func:`gather_by_splat` on a GPU, where splats are all Gaussians, nearest first."""
-    grads, views = grads or bins.new_gradients(slots), blocks_gather.GradientsView
+    grads, views = grads or bins.new_gradients(slots), cuda.gather.GradientsView
     ends = accumulate(grad.shape[1] for grad in grads)
     tables = [grad for grad, end in zip(grads, ends, strict=True) if end <= slots.shape[1]]  # no depths, maybe
     filled = [*tables, *[slots.new_empty(0, 0)] * (len(views.vars) - len(tables))]
     tables_out = pack_struct(views, **dict(zip(views.vars, filled, strict=True)))
     inputs = [bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32), view(slots, wp.float32)]
-    kernel = blocks_gather.make_gather(tuple(table.shape[1] for table in tables))
+    kernel = cuda.gather.make_gather(tuple(table.shape[1] for table in tables))
     launch_blocks(kernel, -(-len(bins.gaussians) // WARP), inputs, [tables_out], slots.device)
     return [grad.squeeze(1) for grad in grads]
 
 
 CPU = Driver(
-    *(LANES, True, bin.bin_by_counting, gather_by_splat, _launch_slices),
-    TileKernels(lanes_blend.make_blend, lanes_blend.make_upstream, lanes_adjoint.make_reverse, lanes_taped.make_walk),
+    *(LANES, True, bin.bin_by_counting, gather_by_splat, _launch_slices, cpu),
     TileLayout(
-        (lanes_blend.BLOCKS, LANES),
+        (cpu.blend.BLOCKS, LANES),
         *(vec16, vec16, torch.float32),
-        *(vec16, lambda channels: (lanes_blend.BLOCKS * channels, LANES)),
+        *(vec16, lambda channels: (cpu.blend.BLOCKS * channels, LANES)),
         lambda columns: wp.types.vector(length=columns, dtype=float),
     ),
-    ChannelKernels(lanes_channels.AT_ONCE, lanes_channels.make_beside, lanes_channels.make_adj_channels),
 )
 CUDA = Driver(
-    *(1, False, bin.bin_by_sorting, gather_by_warp, _launch_blocks),
-    TileKernels(
-        blocks_blend.make_blend_block,
-        blocks_adjoint.make_upstream_block,
-        blocks_adjoint.make_reverse_block,
-        blocks_taped.make_walk_block,
-    ),
+    *(1, False, bin.bin_by_sorting, gather_by_warp, _launch_blocks, cuda),
     TileLayout(
         (THREADS,),
         *(wp.float32, wp.int32, torch.int32),
         *(wp.vec4, lambda _channels: (THREADS, 4)),
         lambda _columns: wp.float32,
     ),
-    ChannelKernels(blocks_channels.AT_ONCE, blocks_channels.make_beside, blocks_channels.make_adj_channels),
 )
 #: By torch's name of the device.
 DRIVERS = {"cpu": CPU, "cuda": CUDA}

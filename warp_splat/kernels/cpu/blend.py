@@ -35,7 +35,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, brightness, own_light, sure, unsure
-from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
+from warp_splat.kernels.compiler import IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.cpu.settle import SETTLED, make_settle, rows_from
 from warp_splat.kernels.falloff import make_falloff
@@ -247,77 +247,3 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             block += 1
 
     return blend
-
-
-@functools.cache
-def make_upstream(variant: BlendVariant) -> wp.Kernel:
-    """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
-    CHANNELS = variant.channels
-    vec_grads = wp.types.vector(length=variant.columns, dtype=float)
-    mat_background = wp.types.matrix(shape=(3, LANES), dtype=float)
-    mat_up = wp.types.matrix(shape=(CHANNELS + 1, LANES), dtype=float)
-
-    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
-    def upstream(
-        first: int,
-        bins: BinsView,
-        background: wp.array[float],  # [3]
-        final: wp.array2d[vec16],  # [T, BLOCKS]
-        count: wp.array2d[vec16],  # [T, BLOCKS]
-        adj_pixels: PixelsView,
-        # out
-        up_out: wp.array2d[vec16],  # [T, BLOCKS CHANNELS] dL/d(sum of w color, and of w z)
-        adj_final_out: wp.array2d[vec16],  # [T, BLOCKS] dL/d(final), through alpha and background
-        adj_background_out: wp.array2d[float],  # [T, 3]
-        dropped_out: wp.array[int],  # [T] pixels whose upstream gradient is not finite
-        steps_out: wp.array[int],  # [T] instances that the adjoint walks
-        slots_out: wp.array[vec_grads],  # [M] zeros for those that it does not
-    ):
-        tile = first + wp.tid()
-        column = (tile % bins.tiles_x) * TILE
-        line = (tile // bins.tiles_x) * TILE
-        zero = vec16(0.0)
-        adj_background = mat_background()
-        dropped = zero
-        height = adj_pixels.image.shape[0]
-        width = adj_pixels.image.shape[1]
-        block = int(0)
-        while block < BLOCKS:
-            left = column + 4 * (block & 3)
-            top = line + 4 * (block >> 2)
-            u = mat_up()  # the channels, and dL/dalpha
-            for lane in range(LANES):
-                y = wp.min(top + lane // 4, height - 1)
-                x = wp.min(left + lane % 4, width - 1)
-                for channel in range(3):
-                    u[channel, lane] = adj_pixels.image[y, x, channel]
-                u[CHANNELS, lane] = adj_pixels.alpha[y, x]
-                if wp.static(CHANNELS > 3):
-                    u[3, lane] = adj_pixels.depth[y, x]
-            inside = where_less(LANE_X, vec16(float(width - left)), vec16(1.0), zero)
-            inside = where_less(LANE_Y, vec16(float(height - top)), inside, zero)
-            finite = inside
-            for row in range(CHANNELS + 1):
-                finite = where_less(wp.abs(u[row]), vec16(wp.inf), finite, zero)  # not where it is NaN, either
-            dropped = dropped + inside - finite
-            adj_t = -where_less(zero, finite, u[CHANNELS], zero)
-            for channel in range(CHANNELS):
-                known = where_less(zero, finite, u[channel], zero)
-                up_out[tile, block * CHANNELS + channel] = known
-                if channel < 3:
-                    adj_t = adj_t + known * background[channel]
-                    adj_background[channel] = adj_background[channel] + times(known, final[tile, block])
-            adj_final_out[tile, block] = adj_t
-            block += 1
-        stopped = vec16(0.0)
-        for block in range(BLOCKS):
-            stopped = wp.max(stopped, count[tile, block])
-        longest = wp.max(stopped)
-        for channel in range(3):
-            adj_background_out[tile, channel] = total(adj_background[channel])
-        dropped_out[tile] = int(total(dropped))
-        steps_out[tile] = int(longest)
-        for k in range(bins.ranges[tile][0] + int(longest), bins.ranges[tile][1]):
-            slots_out[k] = vec_grads(0.0)
-
-    return upstream

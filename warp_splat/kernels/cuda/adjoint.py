@@ -54,7 +54,7 @@ def clear_rest(bins: BinsView, tile: int, thread: int, steps: int, slots_out: wp
 
 
 @functools.cache
-def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
+def make_upstream(variant: BlendVariant) -> wp.Kernel:
     """The start of every adjoint: upstream gradients by tile and thread, those that are not finite dropped."""
     CHANNELS = variant.channels
 
@@ -110,7 +110,7 @@ def make_upstream_block(variant: BlendVariant) -> wp.Kernel:
 
 
 @functools.cache
-def make_reverse_block(mode: str, variant: BlendVariant) -> wp.Kernel:
+def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The reverse loop by hand, its step by hand (``manual``) or by Warp (``stepwise``); a warp per tile."""
     CHANNELS, GRADS = variant.channels, variant.columns
     reach_of = make_falloff(variant.falloff).reach_of

@@ -80,7 +80,7 @@ def place_of(lane: int, block: int):
 
 
 @functools.cache
-def make_blend_block(variant: BlendVariant) -> wp.Kernel:
+def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     falloff, CHANNELS = make_falloff(variant.falloff), variant.channels
     fall_at, reach_of = falloff.value, falloff.reach_of

@@ -53,7 +53,7 @@ def adj_behind_of(front: float, w: float, adj_ret: float):
 
 
 @functools.cache
-def make_walk_block(mode: str, variant: BlendVariant) -> wp.Kernel:
+def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
     CHANNELS, GRADS = variant.channels, variant.columns
     fall_known, fall_value = make_falloff(variant.falloff).known, make_fall_value(variant.falloff, float)
