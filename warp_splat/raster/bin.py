@@ -29,11 +29,7 @@ BITS = DIGITS.bit_length() - 1  # of such a sort, at once
 
 
 def bin_by_counting(
-    splats2d: Splats2D,
-    camera: Camera,
-    options: RasterOptions,
-    room: Room | None = None,
-    worlds: Sequence[int] = (),
+    splats2d: Splats2D, camera: Camera, options: RasterOptions, room: Room | None = None, worlds: Sequence[int] = ()
 ) -> Bins:
     """The Gaussians of each tile by depth (ties by index) on the CPU: a counting sort by tile, a band per thread.
 
@@ -75,11 +71,7 @@ def bin_by_counting(
 
 
 def bin_by_sorting(
-    splats2d: Splats2D,
-    camera: Camera,
-    options: RasterOptions,
-    room: Room | None = None,
-    worlds: Sequence[int] = (),
+    splats2d: Splats2D, camera: Camera, options: RasterOptions, room: Room | None = None, worlds: Sequence[int] = ()
 ) -> Bins:
     """:func:`bin_by_counting` for a GPU: the host waits for the number of tile instances, unless there is ``room``.
 

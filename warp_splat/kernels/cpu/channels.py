@@ -36,13 +36,7 @@ def pixel_of(tile: int, tiles_x: int, number: int):
 
 @wp.func
 def into_lanes(
-    pixels: wp.array3d[float],
-    begin: int,
-    channels: int,
-    tile: int,
-    tiles_x: int,
-    numbers: wp.array[float],
-    width: int,
+    pixels: wp.array3d[float], begin: int, channels: int, tile: int, tiles_x: int, numbers: wp.array[float], width: int
 ):
     """A group's channels of a tile's pixels into rows of lanes, ``width`` rows for a block; 0 beyond the image."""
     pixel = int(0)
