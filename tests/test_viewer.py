@@ -75,7 +75,7 @@ def test_no_other_name_gets_the_page(served, host, status):
 
 def test_frames_are_quick_while_moving_and_sharp_at_rest(viewer, monkeypatch):
     client = entered(viewer, size=(960, 640))
-    viewer.watchers[1].pace.pixels = 96 * 64
+    viewer.watchers[1].pixels = 96 * 64
     assert viewer.moving and drawn(viewer) == 1 and drawn(viewer) == 0
     frame, quality = client.frames[-1]
     assert frame.shape == (64, 96, 3) and quality == server.MOVING_QUALITY

@@ -18,7 +18,7 @@ from warp_splat.lenses import Lens
 from warp_splat.viewer import server
 from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
 from warp_splat.viewer.picture import depth_colors, depth_range, overlay
-from warp_splat.viewer.watcher import FEWEST, MOST, Pace
+from warp_splat.viewer.watcher import FEWEST, MOST, pixels_after
 
 
 def test_camera_of_a_browser():
@@ -96,23 +96,21 @@ def test_look_at_all_sees_the_bulk():
 @pytest.mark.parametrize(("fixed", "rate"), [(0.02, 1e-7), (0.02, 5e-6), (0.09, 1e-6), (0.001, 1e-9), (0.5, 1e-6)])
 def test_pace_settles(fixed, rate):
     """On a machine that takes ``fixed`` seconds for any frame and ``rate`` for a pixel: fast enough, no smaller."""
-    pace = Pace()
+    pixels = 0.25 * MOST
     for _ in range(60):
-        pixels = round(pace.pixels)
-        pace.took(fixed + rate * pixels, pixels)
-    seconds = fixed + rate * pace.pixels
-    assert seconds < 0.12 or pace.pixels == FEWEST
-    assert seconds > 0.08 or pace.pixels == MOST
+        pixels = pixels_after(fixed + rate * round(pixels), round(pixels))
+    seconds = fixed + rate * pixels
+    assert seconds < 0.12 or pixels == FEWEST
+    assert seconds > 0.08 or pixels == MOST
 
 
 def test_pace_gets_out_of_a_bad_start_quickly():
-    pace, frames = Pace(), 0
-    while 2e-6 * pace.pixels > 0.2:  # a window that is small takes less than the pace allows
-        pace.took(2e-6 * pace.pixels, round(pace.pixels))
+    pixels, frames = 0.25 * MOST, 0
+    while 2e-6 * pixels > 0.2:
+        pixels = pixels_after(2e-6 * pixels, round(pixels))
         frames += 1
     assert frames <= 2
-    pace.took(0.001, 500)
-    assert pace.pixels >= FEWEST
+    assert pixels_after(0.001, 500) >= FEWEST  # a window that is small takes less than the pace allows
 
 
 def test_sized():

@@ -24,7 +24,7 @@ from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene.types import Scene, View
 from warp_splat.viewer.browser_camera import look_at_all, look_from
 from warp_splat.viewer.picture import KINDS, overlay, paint
-from warp_splat.viewer.watcher import MOST, Watcher
+from warp_splat.viewer.watcher import MOST, Watcher, pixels_after
 
 if TYPE_CHECKING:
     import viser
@@ -155,7 +155,7 @@ class Viewer:
         start = time.perf_counter()
         watcher.changed, watcher.sharp, watcher.drawn_at = False, not moving, time.monotonic()
         try:
-            camera, view, box = watcher.camera(watcher.pace.pixels if moving else MOST)
+            camera, view, box = watcher.camera(watcher.pixels if moving else MOST)
         except InputError:  # a window that was folded up; it will send another camera when it opens
             return
         watcher.ruler.answer(self.draw_camera, camera)
@@ -174,7 +174,7 @@ class Viewer:
         watcher.client.flush()
         seconds = time.perf_counter() - start
         if moving:
-            watcher.pace.took(seconds, camera.width * camera.height)
+            watcher.pixels = pixels_after(seconds, camera.width * camera.height)
         else:
             size = f"{camera.width} x {camera.height} px in {1e3 * seconds:.0f} ms"
             watcher.note.content = "  \n".join([size, *filter(None, [note])])

@@ -25,20 +25,14 @@ CHANGE = (0.25, 1.5)  # from one frame to the next: down quickly, up slowly
 STEPS = {"previous": -1, "again": 0, "next": 1}
 
 
-class Pace:
-    """The pixels that a moving frame may have, learned from what the last ones took.
+def pixels_after(seconds: float, pixels: int) -> float:
+    """The pixels that the next moving frame may have, where the last one's ``pixels`` took ``seconds``.
 
     A frame also has costs without any pixel. That only makes the steps too short: the size still settles where a frame
     takes FRAME_SECONDS, or at a bound.
     """
-
-    def __init__(self):
-        self.pixels = 0.25 * MOST
-
-    def took(self, seconds: float, pixels: int) -> None:
-        """Note that a frame of ``pixels`` took ``seconds``."""
-        change = min(max(FRAME_SECONDS / max(seconds, 1e-6), CHANGE[0]), CHANGE[1])
-        self.pixels = min(max(pixels * change, FEWEST), MOST)
+    change = min(max(FRAME_SECONDS / max(seconds, 1e-6), CHANGE[0]), CHANGE[1])
+    return min(max(pixels * change, FEWEST), MOST)
 
 
 class Watcher:
@@ -61,7 +55,7 @@ class Watcher:
         wake: Callable[[], None],
     ):
         self.client, self.views, self.subject, self.wake = client, views, subject, wake
-        self.pace = Pace()
+        self.pixels = 0.25 * MOST  # that a moving frame may have
         self.changed, self.sharp = True, False  # since the last frame; whether that was one at rest
         self.moved_at = self.drawn_at = 0.0  # on time.monotonic
         gui = client.gui
