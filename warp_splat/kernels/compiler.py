@@ -9,16 +9,6 @@ import os
 
 from warp_splat.errors import InputError
 
-
-def _is_on(variable: str) -> bool:
-    """Whether a variable of the environment is 1. Raises InputError if it is anything else than 0, 1 or nothing."""
-    value = os.environ.get(variable, "")
-    if value not in ("", "0", "1"):
-        expected = "expected 1, 0 or nothing in this environment variable"
-        raise InputError(f"{variable}: {expected}, got {value!r:.50}; set it to one of them.")
-    return value == "1"
-
-
 #: Warp's way to say "this machine", or another processor for tests: "-target-cpu x86-64-v3".
 TARGET = os.environ.get("WARP_SPLAT_TARGET") or "-march=native"
 if not TARGET.startswith("-"):  # which ends Warp's compiler, and the process with it
@@ -26,7 +16,11 @@ if not TARGET.startswith("-"):  # which ends Warp's compiler, and the process wi
     raise InputError(f"WARP_SPLAT_TARGET: {expected}, got {TARGET!r:.50}; mend or unset it.")
 
 #: Multiplications and additions apart, where :func:`.simd.fma` fuses them: x86-64 without AVX2 has no such instruction.
-PORTABLE = _is_on("WARP_SPLAT_PORTABLE")
+_portable = os.environ.get("WARP_SPLAT_PORTABLE", "")
+if _portable not in ("", "0", "1"):
+    expected = "expected 1, 0 or nothing in this environment variable"
+    raise InputError(f"WARP_SPLAT_PORTABLE: {expected}, got {_portable!r:.50}; set it to one of them.")
+PORTABLE = _portable == "1"
 
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its
 #: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie.
