@@ -19,26 +19,10 @@ from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
+from warp_splat.kernels.project.extent import covers_pixel, make_support
 from warp_splat.kernels.project.image import parts_of_image
 from warp_splat.kernels.project.pieces import all_finite, offset, rotation, sized_or_one, taken_along, turned_or_not
-from warp_splat.kernels.simd import (
-    LANES,
-    TYPES,
-    equal,
-    fill,
-    fma,
-    inverse,
-    less,
-    pick,
-    real,
-    root,
-    rounded_down,
-    rounded_up,
-    some,
-    times,
-    vec16,
-    whole,
-)
+from warp_splat.kernels.simd import TYPES, equal, fill, fma, inverse, less, pick, real, root, some, times, vec16, whole
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 CULLED = wp.constant(0)
@@ -54,17 +38,6 @@ for number in (float, vec16):
 
     @wp.func_grad(largest)
     def adj_largest(a: number, b: number, c: number, d: number, adj_ret: number):
-        pass
-
-    @wp.func
-    def covers_pixel(mean: number, extent: number, size: float):
-        """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
-        first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
-        last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
-        return fill(1.0, mean) - less(last, first)
-
-    @wp.func_grad(covers_pixel)
-    def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
         pass
 
 
@@ -83,33 +56,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     number, integer, row2, row3, row4 = TYPES[lanes]
     turns = wp.array2d[row4] if expose else wp.array[row4]
 
-    @wp.func
-    def reaches(opacity: vec16, alpha_min: float):
-        """``reach_of`` in every lane."""
-        r = vec16()
-        for lane in range(LANES):
-            r[lane] = reach_of(opacity[lane], alpha_min)
-        return r
-
-    reaches = reaches if lanes > 1 else reach_of
-
-    @wp.func
-    def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
-        """Half sides of the box where alpha >= alpha_min, its farthest point's distance, rounded up [px]."""
-        reach = reaches(opacity, alpha_min)
-        widest = (xx + yy + root(fma(xx - yy, xx - yy, times(xy, xy) * 4.0))) * 0.5  # variance of the long axis
-        return (
-            root(times(reach, xx)),
-            root(times(reach, yy)),
-            wp.min(rounded_up(root(times(reach, widest))), fill(1.0e9, opacity)),
-        )
-
-    @wp.func_grad(support)
-    def adj_support(
-        opacity: number, alpha_min: float, xx: number, xy: number, yy: number, a: number, b: number, c: number
-    ):
-        pass
-
+    support = make_support(reach_of, lanes)
     parts = {"all_finite": all_finite, "offset": offset, "turned_or_not": turned_or_not, "rotation": rotation}
     parts |= {"taken_along": taken_along, "sized_or_one": sized_or_one} | parts_of_image(projection, lanes)
     image = parts["image"]

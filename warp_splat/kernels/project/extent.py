@@ -1,0 +1,52 @@
+"""How far a Gaussian reaches in the image, and whether that meets the center of a pixel: without gradients."""
+
+import warp as wp
+
+from warp_splat.kernels.simd import LANES, TYPES, fill, fma, less, root, rounded_down, rounded_up, times, vec16
+
+for number in (float, vec16):
+
+    @wp.func
+    def covers_pixel(mean: number, extent: number, size: float):
+        """Mask: a pixel center of a row of ``size`` pixels lies within ``extent`` of ``mean``."""
+        first = wp.max(rounded_up(mean - extent - fill(0.5, mean)), fill(0.0, mean))
+        last = wp.min(rounded_down(mean + extent - fill(0.5, mean)), fill(size - 1.0, mean))
+        return fill(1.0, mean) - less(last, first)
+
+    @wp.func_grad(covers_pixel)
+    def adj_covers_pixel(mean: number, extent: number, size: float, adj_ret: number):
+        pass
+
+
+def make_support(reach_of: wp.Function, lanes: int) -> wp.Function:
+    """The box and the circle around what is at least ``alpha_min``; ``reach_of`` says where the falloff ends."""
+    number = TYPES[lanes][0]
+
+    @wp.func
+    def reaches(opacity: vec16, alpha_min: float):
+        """``reach_of`` in every lane."""
+        r = vec16()
+        for lane in range(LANES):
+            r[lane] = reach_of(opacity[lane], alpha_min)
+        return r
+
+    reaches = reaches if lanes > 1 else reach_of
+
+    @wp.func
+    def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
+        """Half sides of the box where alpha >= alpha_min, its farthest point's distance, rounded up [px]."""
+        reach = reaches(opacity, alpha_min)
+        widest = (xx + yy + root(fma(xx - yy, xx - yy, times(xy, xy) * 4.0))) * 0.5  # variance of the long axis
+        return (
+            root(times(reach, xx)),
+            root(times(reach, yy)),
+            wp.min(rounded_up(root(times(reach, widest))), fill(1.0e9, opacity)),
+        )
+
+    @wp.func_grad(support)
+    def adj_support(
+        opacity: number, alpha_min: float, xx: number, xy: number, yy: number, a: number, b: number, c: number
+    ):
+        pass
+
+    return support
