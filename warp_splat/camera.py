@@ -157,11 +157,13 @@ class Camera:
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions in the camera [P, 3] that are seen at ``pixels`` [P, 2]; NaN where the lens sees none."""
+        rays = self.directions(pixels)
+        return rays if self.lens else rays / np.sqrt((rays * rays).sum(1, keepdims=True))
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """:meth:`rays`; without a lens of z = 1 instead of unit length."""
         places = (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
-        if self.lens:
-            return self.lens.undistorted(places)
-        rays = np.concatenate([places, np.ones((len(places), 1))], 1)
-        return rays / np.sqrt((rays * rays).sum(1, keepdims=True))
+        return self.lens.undistorted(places) if self.lens else np.concatenate([places, np.ones((len(places), 1))], 1)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera for an image resized to ``width`` x ``height``: all of K is scaled."""

@@ -52,11 +52,8 @@ def _along_rays(cameras: list[Camera], extent: float, random: np.random.Generato
     pixels, points = random.uniform(size=(COUNT, 2)), np.empty((COUNT, 3))
     for index, camera in enumerate(cameras):
         mine = slice(index, None, len(cameras))
-        x = (pixels[mine, 0] * camera.width - camera.cx) / camera.fx
-        y = (pixels[mine, 1] * camera.height - camera.cy) / camera.fy
-        ahead = np.stack([x, y, np.ones_like(x)], 1)
-        if camera.lens:  # at the camera, where it sees nothing
-            ahead = np.nan_to_num(camera.lens.undistorted(ahead[:, :2]))
+        # at the camera, where it sees nothing
+        ahead = np.nan_to_num(camera.directions(pixels[mine] * [camera.width, camera.height]))
         seen = ahead * depths[mine, None] - camera.translation
         points[mine] = (seen[:, :, None] * camera.rotation).sum(1)
     return points
