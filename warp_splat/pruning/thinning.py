@@ -10,6 +10,7 @@ import torch
 from warp_splat.flags import fits, flags_of
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
+from warp_splat.presets import TRIPLED
 from warp_splat.pruning.score import ViewSetting, costs
 from warp_splat.scene.types import Scene
 from warp_splat.training.options import TrainConfig
@@ -25,8 +26,7 @@ STAGES, THINNED = 5, 1 / 3  # of training: how often Gaussians are left out, and
 #: - 31.37 (30.37) dB: twice
 #: - 31.46 (30.72) dB: three times
 #: - 31.51 (30.99) dB: three times, left out in stages
-RATES = {"feature_lr": 0.0075, "opacity_lr": 0.075, "scaling_lr": 0.015, "rotation_lr": 0.003}
-RATES |= {"position_lr_init": 1.6e-4, "position_lr_final": 1.6e-5}
+RATES = TRIPLED | {"position_lr_init": 1.6e-4, "position_lr_final": 1.6e-5}
 #: Options of the model's training that hold here; what was learned of cameras and background is so already.
 SAME = {"white_background", "projection", "lambda_dssim", "loss_space", "parts", "opacity_reg"}
 SAME |= {"exposure", "vignetting", "random_background"}
