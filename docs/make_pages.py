@@ -18,7 +18,7 @@ import page_tables
 import sentences
 
 from warp_splat.cli import COMMANDS
-from warp_splat.flags import default_of, flags_of
+from warp_splat.flags import default_of, flags_of, purpose_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 
 DOCS = Path(__file__).parent
@@ -61,8 +61,8 @@ def flags(introduction: str, names: Iterable[str]) -> str:
     """The page of the flags of some commands."""
     parts = [introduction]
     for name in names:
-        config_type, _, help = COMMANDS[name]
-        parts.append(f"\n## warp-splat {name}\n{help[0].upper()}{help[1:]}.\n")
+        config_type, _ = COMMANDS[name]
+        parts.append(f"\n## warp-splat {name}\n{purpose_of(config_type)}\n")
         heading = None
         for item in flags_of(config_type):
             what = item.metadata["help"].replace("|", "\\|")

@@ -10,47 +10,30 @@ import signal
 import sys
 from typing import Any
 
-from warp_splat import __version__
-from warp_splat.config import (
-    AuditConfig,
-    CleanConfig,
-    CompareConfig,
-    ConvertConfig,
-    ExportHtmlConfig,
-    InspectConfig,
-    MergeConfig,
-    MeshConfig,
-    RenderConfig,
-    SfmConfig,
-    SimplifyConfig,
-    ViewConfig,
-)
+from warp_splat import __version__, config
 from warp_splat.errors import InputError, tell
-from warp_splat.flags import FOREIGN_FLAGS, check_numbers, default_of, flags_of
+from warp_splat.flags import FOREIGN_FLAGS, check_numbers, default_of, flags_of, purpose_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import leaving_at_once
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig, check_train
 from warp_splat.training.parts import AUTO, PARTS
 
-#: Of each command: its options, its function (loaded when it runs: torch takes seconds), what it does.
+#: Of each command: its options, whose docstring says what it does, and its function, loaded when it runs: torch takes
+#: seconds.
 COMMANDS = {
-    "sfm": (SfmConfig, "sfm.command:sfm", "compute the cameras of photographs or of a video: a scene to train on"),
-    "inspect": (InspectConfig, "inspect.command:inspect", "examine a scene before training: verdicts and pictures"),
-    "train": (TrainConfig, "training.command:train", "train Gaussians on a scene's photographs"),
-    "render": (RenderConfig, "rendering.command:render_model", "render a model: its views with metrics, or a video"),
-    "view": (ViewConfig, "viewer.command:view_model", "look at a trained model in a browser"),
-    "convert": (
-        ConvertConfig,
-        "rendering.changes:convert",
-        "convert Gaussians between .ply, .splat, .spz, .sog, glTF, USD",
-    ),
-    "merge": (MergeConfig, "scene.blocks:merge_blocks", "make one model of the blocks of a scene (train --block)"),
-    "simplify": (SimplifyConfig, "pruning.simplify:simplify", "leave out what a finished model does not need"),
-    "clean": (CleanConfig, "pruning.clean:clean", "leave out what hangs right before few cameras"),
-    "mesh": (MeshConfig, "meshing.command:mesh", "write the surface of a trained model as triangles"),
-    "export-html": (ExportHtmlConfig, "export_html.command:export_html", "write a page that shows a model anywhere"),
-    "audit": (AuditConfig, "audit.command:audit", "measure any renderer of Gaussians against float64"),
-    "compare": (CompareConfig, "compare.command:run", "compare adjoints: error against run time and memory"),
+    "sfm": (config.SfmConfig, "sfm.command:sfm"),
+    "inspect": (config.InspectConfig, "inspect.command:inspect"),
+    "train": (TrainConfig, "training.command:train"),
+    "render": (config.RenderConfig, "rendering.command:render_model"),
+    "view": (config.ViewConfig, "viewer.command:view_model"),
+    "convert": (config.ConvertConfig, "rendering.changes:convert"),
+    "merge": (config.MergeConfig, "scene.blocks:merge_blocks"),
+    "simplify": (config.SimplifyConfig, "pruning.simplify:simplify"),
+    "clean": (config.CleanConfig, "pruning.clean:clean"),
+    "mesh": (config.MeshConfig, "meshing.command:mesh"),
+    "export-html": (config.ExportHtmlConfig, "export_html.command:export_html"),
+    "audit": (config.AuditConfig, "audit.command:audit"),
+    "compare": (config.CompareConfig, "compare.command:run"),
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.
@@ -90,11 +73,12 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"warp-splat {__version__}")
     commands = parser.add_subparsers(dest="command", required=True)
-    for name, (config_type, _, help) in COMMANDS.items():
+    for name, (config_type, _) in COMMANDS.items():
+        purpose = purpose_of(config_type)
         places = [item.name.upper() for item in flags_of(config_type) if item.metadata["group"] is None]
         usage = " ".join(["warp-splat", name, *places, "[options]"])  # not all flags before the first line of help
-        command = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.", usage=usage)
-        add_flags(command, config_type)
+        said = purpose[:1].lower() + purpose[1:-1]  # in the list of commands
+        add_flags(commands.add_parser(name, help=said, description=purpose, usage=usage), config_type)
     return parser
 
 
@@ -125,9 +109,9 @@ def parse(arguments: list[str]) -> Any:
     if values.get("crop") == []:
         raise InputError("--crop: expected six numbers, got none; leave the flag out or name a box.")
     if config_type is not TrainConfig:
-        config = config_type(**values)
-        check_numbers(config)
-        return config
+        options = config_type(**values)
+        check_numbers(options)
+        return options
     if os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
         values = _restarted(values)
     given = values
@@ -146,9 +130,9 @@ def parse(arguments: list[str]) -> Any:
         preset = values.get("preset", "fast" if values.get("minutes") else "")
         embedded = {"": {}, preset: {}} if "source_path" in values else EMBEDDED_DEFAULTS
         values = {**embedded[""], **PRESETS[preset], **embedded[preset], **values, "preset": preset}
-    config = TrainConfig(**values)
-    check_train(config)
-    return config
+    options = TrainConfig(**values)
+    check_train(options)
+    return options
 
 
 def _restarted(given: dict) -> dict:
@@ -219,8 +203,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
     alike = os.environ.get("LOCAL_RANK", "0") != "0"  # what another process of this machine says as well
     try:
-        config = parse(sys.argv[1:] if arguments is None else arguments)
-        if isinstance(config, TrainConfig) and config.machine.portable:
+        options = parse(sys.argv[1:] if arguments is None else arguments)
+        if isinstance(options, TrainConfig) and options.machine.portable:
             os.environ["WARP_SPLAT_PORTABLE"] = "1"  # read when kernels are loaded
         # idle OpenMP threads of torch must not spin beside busy kernels; read when torch is loaded
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -229,10 +213,10 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault("KINETO_LOG_LEVEL", "99")
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
         with leaving_at_once():
-            place = next(place for kind, place, _ in COMMANDS.values() if isinstance(config, kind))
+            place = next(place for kind, place in COMMANDS.values() if isinstance(options, kind))
             run = pkgutil.resolve_name(f"warp_splat.{place}")
         alike = False
-        return run(config)
+        return run(options)
     except (InputError, OSError) as error:
         if not alike:
             tell(error)

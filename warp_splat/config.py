@@ -129,7 +129,7 @@ class FinishedModel(OnDevice):
 
 @dataclass
 class RenderConfig(OnDevice):
-    """Rendering options; the reference's render.py where it has them."""
+    """Render a model: its views with metrics, or a video."""
 
     model_path: str = flag("", "folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)", "-m")
     source_path: str = flag("", "scene folder, if it has moved since training; a file of Gaussians needs one", "-s")
@@ -165,7 +165,7 @@ class RenderConfig(OnDevice):
 
 @dataclass
 class ViewConfig(FinishedModel):
-    """A model to look at in a browser."""
+    """Look at a trained model in a browser."""
 
     tolerance: float = flag(0.0, TOLERANCE_HELP, most=1)
     port: int = flag(PORT, PORT_HELP, least=1, most=LAST_PORT)
@@ -173,7 +173,7 @@ class ViewConfig(FinishedModel):
 
 @dataclass
 class SfmConfig:
-    """From photographs to a scene: structure from motion."""
+    """Compute the cameras of photographs or of a video: a scene to train on."""
 
     photos: str = argument("folder of photographs, or a video")
     scene: str = argument("the folder to write: images/ without distortion, sparse/0, and the work in sfm/")
@@ -197,7 +197,7 @@ class SfmConfig:
 
 @dataclass
 class InspectConfig:
-    """A scene to examine before anyone trains on it."""
+    """Examine a scene before training: verdicts and pictures."""
 
     scene: str = argument("scene folder (COLMAP, nerf-synthetic or transforms.json)")
     images: str = flag("images", "folder of the photographs inside a COLMAP scene", "-i")
@@ -206,7 +206,7 @@ class InspectConfig:
 
 @dataclass
 class ConvertConfig:
-    """A model and a file of Gaussians: .ply, .splat, .spz, .sog, .glb, .gltf or .usd."""
+    """Convert Gaussians between .ply, .splat, .spz, .sog, glTF, USD."""
 
     source: str = argument("the file to read, or the folder of a trained model")
     target: str = argument("the file to write; its ending says in which format")
@@ -216,14 +216,14 @@ class ConvertConfig:
 
 @dataclass
 class MergeConfig:
-    """Trainings of the blocks of a scene (train --block) to make one model of."""
+    """Make one model of the blocks of a scene (train --block)."""
 
     folder: str = argument("the folder in which the folders of their trainings are; the model is written here")
 
 
 @dataclass
 class SimplifyConfig(FinishedModel):
-    """A model to make smaller."""
+    """Leave out what a finished model does not need."""
 
     keep: float = flag(0.0, "the share of the Gaussians to keep", most=1)
     max_loss: float = flag(0.0, "or: keep as few as cost at most this much PSNR of the training views, in dB")
@@ -235,7 +235,7 @@ class SimplifyConfig(FinishedModel):
 
 @dataclass
 class CleanConfig(FinishedModel):
-    """A model to rid of floaters."""
+    """Leave out what hangs right before few cameras."""
 
     views: float = flag(3.0, "a floater is carried by fewer training views than this")
     near: float = flag(0.5, "and nearer to them than this share of the depth of half of what they show")
@@ -245,7 +245,7 @@ class CleanConfig(FinishedModel):
 
 @dataclass
 class MeshConfig(FinishedModel):
-    """A model as a surface of triangles."""
+    """Write the surface of a trained model as triangles."""
 
     output: str = argument("the mesh to write, *.glb, *.ply or *.obj")
     voxel: float = flag(0.0, "edge of a voxel [world units]; 0: two pixels at their median depth")
@@ -257,7 +257,7 @@ class MeshConfig(FinishedModel):
 
 @dataclass
 class ExportHtmlConfig:
-    """A model as a page that shows it."""
+    """Write a page that shows a model anywhere."""
 
     model: str = argument("the folder of a trained model, or a file of Gaussians (.ply, .spz, .sog, .glb, ...)")
     page: str = argument("the page to write, *.html")
@@ -267,7 +267,7 @@ class ExportHtmlConfig:
 
 @dataclass
 class CompareConfig(OnDevice):
-    """Options of the comparison; without ``--stability``: adjoints on scenes."""
+    """Compare adjoints: error against run time and memory."""
 
     scene: str = flag("", "scene (COLMAP, nerf-synthetic, transforms.json) to measure on, besides our own", "-s")
     out: str = flag("output/compare", "folder for tables (CSV, JSON) and plots", "-o")
@@ -277,7 +277,7 @@ class CompareConfig(OnDevice):
 
 @dataclass
 class AuditConfig:
-    """Options of the audit of a renderer."""
+    """Measure any renderer of Gaussians against float64."""
 
     target: str = argument("MODULE:function, a page that ends in .html, or with --command any name")
     program: str = flag(

@@ -45,6 +45,11 @@ def flags_of(config_type: Any) -> list[Field]:
     return sorted(found, key=lambda item: (item.metadata["group"] == LAST, headings.index(item.metadata["group"])))
 
 
+def purpose_of(config_type: type) -> str:
+    """What the command with these options does, as ``--help`` says it: the first sentence of their docstring."""
+    return (config_type.__doc__ or "").split("\n", 1)[0]  # none with python -OO
+
+
 def default_of(item: Field) -> Any:
     """The default of a flag."""
     return item.default if item.default_factory is MISSING else item.default_factory()

@@ -161,7 +161,10 @@ class MachineOptions:
 
 @dataclass(frozen=True, init=False)
 class TrainConfig:
-    """All options of a training. Flags, files and ``TrainConfig(NAME=VALUE, ...)`` know them by their names alone."""
+    """Train Gaussians on a scene's photographs.
+
+    Flags, files and ``TrainConfig(NAME=VALUE, ...)`` know all options by their names alone.
+    """
 
     data: DataOptions
     model: ModelOptions
