@@ -4,9 +4,10 @@ Warp could not derive the loop over a tile's list (docs/adjoints.md). So the lau
 renderer stands on the tape as one function with its own adjoint, whichever of the four is asked for.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from warp_splat.runtime.timers import stage
 #: What has a gradient, and the type of its elements.
 PIXELS = {"image": wp.vec3, "alpha": wp.float32, "depth": wp.float32, "features": wp.float32, "normals": wp.vec3}
 PIXELS |= {"median_depth": wp.float32, "strongest_weights": wp.float32}
+Twin = tuple[wp.array, torch.Tensor]  # of the caller's, and of torch's graph
 #: Dimensions of what one world gives, counting the numbers of an element.
 RANKS = {"means": 2, "quats": 2, "scales": 2, "opacities": 1, "sh": 3, "features": 2, "hidden_from": 2, "twist": 1}
 
@@ -116,13 +118,10 @@ def rasterize(
             room = out or {}
             pixels = {name: _array(name, tensor, recorded, room.get(name)) for name, tensor in shown.items()}
             if recorded:
-                wanted = [name for name in named if named[name].requires_grad]
-                reached = [name for name, tensor in shown.items() if tensor.requires_grad]
-                inputs, outputs = [named[name] for name in wanted], [pixels[name] for name in reached]
-                backward = _adjoint(
-                    inputs, [leaves[name] for name in wanted], outputs, [shown[name] for name in reached]
-                )
-                tape.record_func(backward, [array for array in (*inputs, *outputs) if array.size])
+                inputs = [(array, leaves[name]) for name, array in named.items() if array.requires_grad]
+                outputs = [(pixels[name], tensor) for name, tensor in shown.items() if tensor.requires_grad]
+                arrays = [array for array, _ in inputs + outputs if array.size]
+                tape.record_func(partial(_run_adjoint, inputs, outputs), arrays)
         others = {"strongest": None if found.strongest is None else wp.from_torch(found.strongest)}
         others |= {"invalid": found.invalid, "dropped": found.dropped, "radii": wp.from_torch(found.radii)}
     return TapeOutput(**{"depth": None} | pixels, **others)
@@ -204,24 +203,19 @@ def _w_first(quats: torch.Tensor, array: wp.array) -> torch.Tensor:
     return quats.roll(1, 1) if issubclass(array.dtype, wp.quatf) else quats
 
 
-def _adjoint(
-    inputs: list[wp.array], leaves: list[torch.Tensor], outputs: list[wp.array], shown: list[torch.Tensor]
-) -> Callable[[], None]:
+def _run_adjoint(inputs: list[Twin], outputs: list[Twin]) -> None:
     """What the tape calls on its way back."""
-
-    def backward() -> None:
-        with _torch_on(outputs[0].device, True):
-            upstream = [wp.to_torch(array.grad, requires_grad=False) for array in outputs]
-            grads = torch.autograd.grad(shown, leaves, upstream, retain_graph=True, allow_unused=True)
-            with stage("adjoint of tape"):
-                for array, grad in zip(outputs, upstream, strict=True):
-                    if not array.retain_grad:  # so do Warp's kernels with what they have read
-                        grad.zero_()
-                for array, grad in zip(inputs, grads, strict=True):
-                    if grad is not None:
-                        wp.to_torch(array.grad, requires_grad=False).add_(grad)
-
-    return backward
+    leaves, shown = ([tensor for _, tensor in twins] for twins in (inputs, outputs))
+    with _torch_on(outputs[0][0].device, True):
+        upstream = [wp.to_torch(array.grad, requires_grad=False) for array, _ in outputs]
+        grads = torch.autograd.grad(shown, leaves, upstream, retain_graph=True, allow_unused=True)
+        with stage("adjoint of tape"):
+            for (array, _), grad in zip(outputs, upstream, strict=True):
+                if not array.retain_grad:  # so do Warp's kernels with what they have read
+                    grad.zero_()
+            for (array, _), grad in zip(inputs, grads, strict=True):
+                if grad is not None:
+                    wp.to_torch(array.grad, requires_grad=False).add_(grad)
 
 
 def _array(name: str, tensor: torch.Tensor, requires_grad: bool, room: wp.array | None) -> wp.array:
