@@ -153,9 +153,7 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
             return 1
         finally:  # whatever happened, the model comes first
             if whole:
-                run.saved = (
-                    save_model(trainer, run) if processes.lost else trainer.lead(lambda: save_model(trainer, run))
-                )
+                run.saved = trainer.lead(lambda: save_model(trainer, run))
             if run.saved:
                 print(f"Model after {run.iteration} iterations: {run.saved}")
             if run.kept is not None and run.iteration < trainer.config.learn.end:

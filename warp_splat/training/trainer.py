@@ -145,8 +145,7 @@ class Trainer:
         camera, photograph = self.photographs.at_size(step.view, step.iteration)
         options = self.options_at(step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
-        rows = self._shown(camera, options)
-        out = self._render(camera, background, options, self.room, splats, rows)
+        out, rows = self._render(camera, background, options, room=self.room, splats=splats)
         out.means2d.retain_grad()
         image = self._through("image", out.image, out, step)
         photograph = self._through("photograph", photograph, step)
@@ -210,8 +209,7 @@ class Trainer:
         view = self.scene.train[0]
         step = Step(0, view)
         camera = self._through("camera", view.camera.resized(2 * TILE, TILE), step)  # 2:1, as a panorama has to be
-        options = self.options_at(step)
-        out = self._render(camera, self.behind, options, rows=self._shown(camera, options))
+        out, _ = self._render(camera, self.behind, self.options_at(step))
         image_loss(out.image, torch.zeros_like(out.image), self.config.learn.lambda_dssim).backward()
         self.optimizer.zero_grad()
         self.optimizer.load()
@@ -288,17 +286,13 @@ class Trainer:
         return torch.cat(radii).nonzero()[:, 0]
 
     def _render(
-        self,
-        camera: Camera | CameraParameters,
-        background: torch.Tensor,
-        options: RasterOptions,
-        room: Room | None = None,
-        splats: Splats2D | None = None,
-        rows: torch.Tensor | None = None,
-    ) -> RenderOutput:
+        self, camera: Camera | CameraParameters, background: torch.Tensor, options: RasterOptions, **more: Any
+    ) -> tuple[RenderOutput, torch.Tensor | None]:
+        """A view, and the Gaussians of :meth:`_shown`; ``more``: what :func:`render` takes besides."""
+        rows = self._shown(camera, options)
         with stage("project"):
             gaussians = self.model.activated(self.degree, rows)
-        return render(gaussians, camera, background, options, self.config.model.adjoint, room=room, splats=splats)
+        return render(gaussians, camera, background, options, self.config.model.adjoint, **more), rows
 
     @property
     def behind(self) -> torch.Tensor:
@@ -310,13 +304,16 @@ class Trainer:
         with torch.no_grad():
             options = replace(self.options, depth=depth, median_depth=median, sh_degree=self.degree)
             splats = self.blocks.ask("show", camera, options) if self.blocks else None
-            return self._render(camera, self.behind, options, splats=splats, rows=self._shown(camera, options))
+            return self._render(camera, self.behind, options, splats=splats)[0]
 
     def lead(self, do: Callable[[], T]) -> T | None:
-        """What process 0 does while the others wait; what it looks at, it sees of the Gaussians of all."""
+        """What process 0 does while the others wait; what it looks at, it sees of the Gaussians of all.
+
+        Where another process went away, each does it that holds the whole model: nobody knows which will be left.
+        """
         if self.blocks:
             return self.blocks.lead(do)
-        return do() if self.processes.rank == 0 else None
+        return do() if self.processes.rank == 0 or self.processes.lost else None
 
     def save(self, path: Path) -> None:
         """Write the model. Raises InputError if that fails."""
