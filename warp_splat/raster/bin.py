@@ -47,10 +47,10 @@ def bin_by_counting(
     inputs = [gaussians, splats2d.view(), camera.height, options.alpha_min, square]
     launch(tiles.make_pack(falloff_of(options).reach_of), count, inputs, [splats, in_place(rows)])
     order = order_by_depth(_taken(splats2d.depths.detach().numpy(), drawn))
-    row_ends, begins = _sums(_taken(rows, order))
-    check_count(_last(row_ends), camera, count, splats2d.radii.device)
+    row_ends, begins, row_count = _sums(_taken(rows, order))
+    check_count(row_count, camera, count, splats2d.radii.device)
     begins = _put(begins, order)
-    spans, counts = empty(_last(row_ends), wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
+    spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, _boxes(options)]
     groups = -(-count // LANES)
     launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=even_slices(groups, each=LANES))
@@ -58,10 +58,10 @@ def bin_by_counting(
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
-    place_ends, begins = _sums(counts)
-    check_count(_last(place_ends), camera, count, splats2d.radii.device)
+    _, begins, total = _sums(counts)
+    check_count(total, camera, count, splats2d.radii.device)
     instances, places, ends = _sort_by_tile(
-        order, _taken(begins, order), row_ends, spans, _last(place_ends), tiles_x * tiles_y * pictures
+        order, _taken(begins, order), row_ends, spans, total, tiles_x * tiles_y * pictures
     )
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges)
@@ -196,8 +196,8 @@ def _drawn(radii: np.ndarray) -> tuple[np.ndarray, int]:
     return np.concatenate([np.empty(0, np.int32), *(parts[low] for low in sorted(parts))]), int(sum(invalid))
 
 
-def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where each of the counted ends, in 64 bits, because 32 wrap without a word, and begins, in 32."""
+def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Where each of the counted ends, in 64 bits, because 32 wrap without a word, and begins, in 32; and their sum."""
     bounds = torch_slices(len(counts))
     ends, begins = np.empty(len(counts), dtype=np.int64), np.empty(len(counts), dtype=np.int32)
     in_slices(lambda low, high: np.cumsum(counts[low:high], out=ends[low:high]), bounds)
@@ -208,7 +208,7 @@ def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         np.subtract(ends[low:high], counts[low:high], out=begins[low:high], casting="unsafe")
 
     in_slices(run, bounds)
-    return ends, begins
+    return ends, begins, int(ends[-1]) if len(ends) else 0
 
 
 def _taken(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
@@ -233,11 +233,6 @@ def _put(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
     in_slices(run, torch_slices(len(indices)))
     return found
-
-
-def _last(ends: np.ndarray) -> int:
-    """The total of an inclusive scan."""
-    return int(ends[-1]) if len(ends) else 0
 
 
 def check_count(count: int, camera: Camera, drawn: int, device: torch.device) -> None:
@@ -302,5 +297,4 @@ def begins_of(counts: np.ndarray) -> np.ndarray:
 
 def in_place(values: np.ndarray) -> wp.array:
     """The same memory for a kernel."""
-    dtype = {np.dtype(np.int32): int, np.dtype(np.int64): wp.int64}[values.dtype]
-    return wp.array(values, dtype=dtype, copy=False, device="cpu")
+    return wp.array(values, copy=False, device="cpu")
