@@ -31,6 +31,8 @@ from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct,
 from warp_splat.runtime.pool import even_slices, in_slices, set_all, torch_slices
 from warp_splat.runtime.timers import stage
 
+Tensors = Sequence[torch.Tensor]
+
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camera | None = None) -> CameraView:
     """The camera as kernels read it; ``rest`` is the number of coefficients beyond the first.
@@ -117,11 +119,7 @@ def project(
 
 
 def _launch_geometry(
-    it: Projecting,
-    inputs: Sequence[torch.Tensor],
-    outputs: Sequence[torch.Tensor],
-    adj_inputs: Sequence[torch.Tensor] = (),
-    adj_outputs: Sequence[torch.Tensor] = (),
+    it: Projecting, inputs: Tensors, outputs: Tensors, adj_inputs: Tensors = (), adj_outputs: Tensors = ()
 ) -> list[torch.Tensor]:
     """The geometry of N Gaussians; or, with adjoints, the adjoint of that, added to ``adj_inputs``.
 
@@ -276,7 +274,7 @@ def _shapes(gaussians: Gaussians) -> list[torch.Tensor]:
     return [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
 
 
-def _all_finite(tensors: Sequence[torch.Tensor]) -> bool:
+def _all_finite(tensors: Tensors) -> bool:
     """Whether the sums of ``tensors``, N rows each, are finite: then all is."""
     sums: list[float] = []
 
