@@ -17,7 +17,7 @@ import warp as wp
 from warp_splat import tape
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, imported
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.stored import sigmoid, unit_quats
 from warp_splat.kernels.place import ShapeView, make_place, name_shapes, put_among_meshes
@@ -315,10 +315,7 @@ def gaussian_of_file(path: str | Path, **more: Any) -> Any:
     Raises:
         InputError: if the file cannot be read, or the package newton is not installed.
     """
-    try:
-        import newton  # noqa: PLC0415 - optional
-    except ImportError as error:
-        raise InputError("newton: expected the package newton; `pip install 'newton>=1.8'`.") from error
+    newton = imported("newton", "newton: expected the package newton; `pip install 'newton>=1.8'`.")
     means, sh, opacities, scales, quats = load_gaussians(path).splats
     coefficients = np.concatenate([sh[:, 0], sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)], 1)
     return newton.Gaussian(

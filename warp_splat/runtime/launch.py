@@ -215,11 +215,8 @@ def read_later(values: torch.Tensor) -> Callable[[], list]:
 
 def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     """With rows of zeros up to so many; the tensor itself, if it has them."""
-    if len(tensor) == rows:
-        return tensor
-    full = tensor.new_zeros(rows, *tensor.shape[1:])
-    full[: len(tensor)] = tensor
-    return full
+    missing = rows - len(tensor)
+    return torch.cat([tensor, tensor.new_zeros(missing, *tensor.shape[1:])]) if missing else tensor
 
 
 def arrays_of(types: Sequence[type], tensors: Sequence[torch.Tensor]) -> list:
