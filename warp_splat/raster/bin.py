@@ -64,10 +64,8 @@ def bin_by_counting(
         order, _taken(begins, order), row_ends, spans, total, tiles_x * tiles_y * pictures
     )
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
-    found = (instances, places, torch.from_numpy(begins), ranges)
-    return Bins(
-        len(splats2d.radii), gaussians, splats, *found, balanced_slices(ends), tiles_x, camera.height, invalid, pictures
-    )
+    found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))
+    return Bins(len(splats2d.radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)
 
 
 def bin_by_sorting(
