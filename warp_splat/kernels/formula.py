@@ -36,21 +36,13 @@ class Notes:
         """Its name."""
         return self.note("fill", repr(float(value))) if value else None
 
+    def number(self, operation: str, *operands: object) -> Number:
+        """What such an operation gives, as a number without slopes."""
+        return Number(self, self.note(operation, *map(str, operands)))
+
     def given(self, code: str) -> Number:
         """A number of the camera."""
-        return Number(self, self.note("fill", code))
-
-    def of_lens(self, index: int) -> Number:
-        """A number of the camera's lens."""
-        return Number(self, self.note("of_lens", "camera", str(index)))
-
-    def turn(self, row: int, column: int) -> Number:
-        """An entry of the camera's rotation."""
-        return Number(self, self.note("turn", "camera", str(row), str(column)))
-
-    def element(self, code: str) -> Number:
-        """A number of an array of the kernel, which gets a gradient."""
-        return Number(self, self.note("everywhere", code))
+        return self.number("fill", code)
 
     def product(self, a: Name, b: Name) -> Name:
         """Of what may be zero or one."""

@@ -36,7 +36,7 @@ def through(family: Family, learned: bool = False) -> Projection:
         notes = Notes()
         place, slopes, seen = image_of(notes, family, *(Number(notes, name) for name in "xyz"), learned=learned)
         place = [np.where(seen, number, NOWHERE) for number in place] if family.wide else place
-        turns = [[notes.turn(axis, column) for axis in range(3)] for column in range(3)]
+        turns = [[notes.number("turn", "camera", axis, column) for axis in range(3)] for column in range(3)]
         rows = [sum(slope * entry for slope, entry in zip(row, turn, strict=True)) for row in slopes for turn in turns]
         more = COEFFICIENTS if learned else ()
         return write_function(f"{family.formula.__name__}_lens", notes, "xyz", [*place, *rows], lanes, more)
@@ -64,7 +64,7 @@ def bent(
 
     And whether it is seen.
     """
-    limit, one = notes.of_lens(LIMIT), notes.given("1.0")
+    limit, one = notes.number("of_lens", "camera", LIMIT), notes.given("1.0")
     seen, excess = one, one
     if family.wide:
         seen = limit * np.sqrt(x * x + y * y + z * z) < z
@@ -78,9 +78,10 @@ def bent(
         Number(notes, number.name, tuple(one.name if axis == other else None for other in range(3)) if linear else ())
         for axis, number in enumerate((x, y, z))
     ]
-    indices = range(family.count)
-    coefficients = [notes.element(f"coefficients[g, {i}]") if learned else notes.of_lens(i) for i in indices]
-    return family.formula(coefficients, *variables), excess, seen
+    kinds = (
+        ("everywhere", f"coefficients[g, {i}]") if learned else ("of_lens", "camera", i) for i in range(family.count)
+    )
+    return family.formula([notes.number(*kind) for kind in kinds], *variables), excess, seen
 
 
 @functools.cache

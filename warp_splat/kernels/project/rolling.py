@@ -47,7 +47,7 @@ def make_expose(family: Family, lanes: int, steps: int = STEPS) -> wp.Function:
     """
     notes = Notes()
     given = {name: Number(notes, name) for name in GIVEN}
-    camera = [[notes.turn(row, column) for column in range(3)] for row in range(3)]
+    camera = [[notes.number("turn", "camera", row, column) for column in range(3)] for row in range(3)]
     world = [list(column) for column in zip(*camera, strict=True)]
     w, d = (_times(world, [given[f"{name}{axis}"] for axis in "xyz"]) for name in "wd")
     o = [given[f"o{axis}"] for axis in "xyz"]
@@ -86,7 +86,7 @@ def _held_in_view(notes: Notes, family: Family, x: Number, y: Number, z: Number)
     if not family.wide:
         near = notes.given("camera.near")
         return np.where(z < near, near, z)
-    limit, across = notes.of_lens(LIMIT), x * x + y * y
+    limit, across = notes.number("of_lens", "camera", LIMIT), x * x + y * y
     inside = limit + EDGE
     unseen = z < inside * np.sqrt(across + z * z)
     return np.where(unseen, inside / np.sqrt(1.0 - inside * inside) * np.sqrt(across), z)

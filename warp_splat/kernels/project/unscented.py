@@ -33,7 +33,7 @@ LEAST = 1.0e-30  # px^2 or px^4, of what has a root
 def make_identity(lanes: int) -> wp.Function:
     """The camera's own axes: the outline, not the lens, makes an image of them."""
     notes = Notes()
-    turns = [notes.turn(row, column) for row in range(2) for column in range(3)]
+    turns = [notes.number("turn", "camera", row, column) for row in range(2) for column in range(3)]
     return write_function("identity", notes, "xyz", [Number(notes, "x"), Number(notes, "y"), *turns], lanes)
 
 
