@@ -14,7 +14,7 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 
@@ -38,17 +38,9 @@ FRACTION_BITS = 12  # steps of 1/4096 world unit, as the authors write, if the s
 POSITION_MAX = 2**23 - 1
 FIELDS = np.array([2**20, 2**10, 1], np.uint32)  # where the numbers of a rotation lie in their word
 DEGREE_COEFFICIENTS = (*COEFFICIENTS, 25)  # degree 4 is read, and left out
-
-
-class _Packed(NamedTuple):
-    """A file's bytes, decompressed, by attribute."""
-
-    streams: list[bytes]  # positions, opacities, colors, scales, rotations, harmonics
-    version: int
-    degree: int
-    fraction_bits: int
-    antialiased: bool
-    axes: str
+#: What is read of a file: the numbers of its header; positions, opacities, colors, scales, rotations, harmonics,
+#: decompressed; the extension records.
+Packed = tuple[tuple, list[bytes], bytes]
 
 
 def save_spz(path: str | Path, file: SplatFile, report: Report = print) -> None:
@@ -100,34 +92,33 @@ def load_spz(path: str | Path, report: Report = print) -> SplatFile:
         start, file_bytes = source.read(4), os.fstat(source.fileno()).st_size
         source.seek(0)
         if start == MAGIC:
-            packed = _read_zstd(source, file_bytes)
+            header, streams, records = _read_zstd(source, file_bytes)
         elif start[:2] == b"\x1f\x8b":
-            packed = _read_gzip(source, file_bytes)
+            header, streams, records = _read_gzip(source, file_bytes)
         else:
             raise Unexpected(f"a file that begins with {start!r}; it may be another format, or cut short")
-        splats = _unpack(packed)
-    if packed.degree == 4:
-        report(f"{path}: left out the harmonics of degree 4 of {len(splats.means)} Gaussians; degree 3 is the highest.")
-    return SplatFile(turned(splats, frame(packed.axes)), packed.antialiased)
+        _, version, count, degree, fraction_bits, flags, *_ = header
+        axes, splats = _find_axes(records), _unpack(streams, version, degree, fraction_bits)
+    if degree == 4:
+        report(f"{path}: left out the harmonics of degree 4 of {count} Gaussians; degree 3 is the highest.")
+    return SplatFile(turned(splats, frame(axes)), bool(flags & FLAG_ANTIALIASED))
 
 
-def _unpack(packed: _Packed) -> SplatArrays:
-    positions, opacities, colors, scales, rotations, harmonics = (
-        np.frombuffer(stream, np.uint8) for stream in packed.streams
-    )
+def _unpack(streams: list[bytes], version: int, degree: int, fraction_bits: int) -> SplatArrays:
+    positions, opacities, colors, scales, rotations, harmonics = (np.frombuffer(each, np.uint8) for each in streams)
     count = len(opacities)
     fixed = np.zeros((count, 3, 4), np.uint8)
     fixed[..., 1:] = positions.reshape(count, 3, 3)  # into the upper three bytes, so that the sign is in its place
-    sh = np.zeros((count, min(DEGREE_COEFFICIENTS[packed.degree], COEFFICIENTS[-1]), 3), np.float32)
+    sh = np.zeros((count, min(DEGREE_COEFFICIENTS[degree], COEFFICIENTS[-1]), 3), np.float32)
     sh[:, 0] = (colors.reshape(count, 3) / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
-    higher = harmonics.reshape(count, DEGREE_COEFFICIENTS[packed.degree] - 1, 3)[:, : sh.shape[1] - 1]
+    higher = harmonics.reshape(count, DEGREE_COEFFICIENTS[degree] - 1, 3)[:, : sh.shape[1] - 1]
     sh[:, 1:] = (higher.astype(np.float32) - 128) / 128
     return SplatArrays(
-        means=((fixed.view("<i4")[..., 0] >> 8) * 2.0**-packed.fraction_bits).astype(np.float32),
+        means=((fixed.view("<i4")[..., 0] >> 8) * 2.0**-fraction_bits).astype(np.float32),
         sh=sh,
         opacities=logit(opacities / 255),
         scales=scales.reshape(count, 3) / np.float32(SCALE_STEP) + np.float32(SCALE_LOW),
-        quats=_unpack_quats2(rotations) if packed.version == 2 else _unpack_quats(rotations),
+        quats=_unpack_quats2(rotations) if version == 2 else _unpack_quats(rotations),
     )
 
 
@@ -168,13 +159,13 @@ def _sizes(version: int, count: int, degree: int, file_bytes: int) -> list[int]:
     return [count * row for row in per_row]
 
 
-def _read_gzip(source: BinaryIO, file_bytes: int) -> _Packed:
+def _read_gzip(source: BinaryIO, file_bytes: int) -> Packed:
     try:
         with gzip.GzipFile(fileobj=source) as stream:
             start = stream.read(HEADER.size)
             if len(start) < HEADER.size or start[:4] != MAGIC:
                 raise Unexpected("a gzip file of something else")
-            _, version, count, degree, fraction_bits, flags, _ = HEADER.unpack(start)
+            _, version, count, degree, *_ = header = HEADER.unpack(start)
             if version not in (2, 3):
                 raise Unexpected(f"version {version} in a gzip file")
             streams = [_exactly(stream, size) for size in _sizes(version, count, degree, file_bytes)]
@@ -183,20 +174,21 @@ def _read_gzip(source: BinaryIO, file_bytes: int) -> _Packed:
                 raise ValueError("the gzip stream goes on after its last Gaussian")
     except (zlib.error, EOFError, gzip.BadGzipFile) as error:
         raise ValueError(str(error)) from error
-    return _Packed(streams, version, degree, fraction_bits, bool(flags & FLAG_ANTIALIASED), _find_axes(records))
+    return header, streams, records
 
 
-def _read_zstd(source: BinaryIO, file_bytes: int) -> _Packed:
+def _read_zstd(source: BinaryIO, file_bytes: int) -> Packed:
     import zstandard  # noqa: PLC0415 - only files of version 4 need it
 
-    _, version, count, degree, fraction_bits, flags, streams, table = HEADER4.unpack(_exactly(source, HEADER4.size))
+    header = HEADER4.unpack(_exactly(source, HEADER4.size))
+    _, version, count, degree, _, _, streams, table = header
     if version != 4:
         raise Unexpected(f"version {version}; export it as version 3 or 4")
     sizes = _sizes(version, count, degree, file_bytes)
     present = [size for index, size in enumerate(sizes) if index < 5 or degree]
     if streams != len(present) or not HEADER4.size <= table <= file_bytes:
         raise ValueError(f"{streams} streams after byte {table}")
-    axes = _find_axes(_exactly(source, table - HEADER4.size))
+    records = _exactly(source, table - HEADER4.size)
     entries = struct.unpack(f"<{2 * streams}Q", _exactly(source, 16 * streams))
     found = []
     for size, packed_size, announced in zip(present, entries[::2], entries[1::2], strict=True):
@@ -208,8 +200,7 @@ def _read_zstd(source: BinaryIO, file_bytes: int) -> _Packed:
                 found.append(_exactly(reader, size))
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from error
-    found += [b""] * (len(sizes) - len(found))
-    return _Packed(found, version, degree, fraction_bits, bool(flags & FLAG_ANTIALIASED), axes)
+    return header, found + [b""] * (len(sizes) - len(found)), records
 
 
 def _exactly(source, size: int) -> bytes:
