@@ -100,11 +100,10 @@ def test_view(scene, model, tmp_path):
         eventually(lambda: likeness(shot(), wanted) > level)
 
         page.get_by_role("slider").press("End")
-        place = (slice(box.top, box.top + box.height), slice(box.left, box.left + box.width))
         planes = torch.from_numpy(view.image).permute(2, 0, 1)[None].float()
-        planes = functional.interpolate(planes, (box.height, box.width), mode="bilinear")
+        planes = functional.interpolate(planes, wanted[box].shape[:2], mode="bilinear")
         overlaid = wanted.copy()
-        overlaid[place] = planes[0].permute(1, 2, 0).byte()
+        overlaid[box] = planes[0].permute(1, 2, 0).byte()
         eventually(lambda: likeness(shot(), overlaid) > 30)
         page.get_by_role("slider").press("Home")
         eventually(lambda: likeness(shot(), wanted) > level)

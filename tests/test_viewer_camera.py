@@ -16,7 +16,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import NEAR
 from warp_splat.lenses import Lens
 from warp_splat.viewer import server
-from warp_splat.viewer.browser_camera import Box, browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
+from warp_splat.viewer.browser_camera import browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
 from warp_splat.viewer.picture import depth_colors, depth_range, overlay
 from warp_splat.viewer.watcher import FEWEST, MOST, pixels_after
 
@@ -53,14 +53,15 @@ def test_what_is_no_camera(change):
 @pytest.mark.parametrize("size", [(640, 360), (200, 900), (300, 200), (37, 41)])
 def test_photograph_in_a_window(size):
     """Its pixels lie in its box, to scale; the field of view shows all of it, up to the window's edge on one side."""
-    camera, box = framed(PHOTO, *size)
+    camera, (rows, columns) = framed(PHOTO, *size)
+    width, height = columns.stop - columns.start, rows.stop - rows.start
     corners = np.array([[x, y, 1.0] for x, y in itertools.product((0.0, 300.0), (0.0, 200.0))])
     rays = (corners - [140, 110, 0]) / [250, 260, 1]
     points = (7.0 * rays - PHOTO.translation) @ PHOTO.rotation
-    scale = [box.width / 300, box.height / 200]
-    np.testing.assert_allclose(project(camera, points), corners[:, :2] * scale + [box.left, box.top], atol=1e-9)
-    assert 0 <= box.left and box.left + box.width <= size[0] and 0 <= box.top and box.top + box.height <= size[1]
-    assert box.width == size[0] or box.height == size[1]
+    scale = [width / 300, height / 200]
+    np.testing.assert_allclose(project(camera, points), corners[:, :2] * scale + [columns.start, rows.start], atol=1e-9)
+    assert 0 <= columns.start and columns.stop <= size[0] and 0 <= rows.start and rows.stop <= size[1]
+    assert width == size[0] or height == size[1]
     assert fitting_fov(PHOTO, *size) == pytest.approx(2 * np.arctan(size[1] / 2 / camera.fy))
 
 
@@ -134,7 +135,7 @@ def test_depth_colors():
 @pytest.mark.parametrize("opacity", [0.0, 0.5, 1.0])
 def test_overlay(opacity):
     frame, photograph = np.full((20, 30, 3), 100, np.uint8), np.full((50, 50, 3), 200, np.uint8)
-    result = overlay(frame, photograph, Box(5, 0, 20, 20), opacity)
+    result = overlay(frame, photograph, np.s_[:20, 5:25], opacity)
     assert (result[:, 5:25] == 100 + 100 * opacity).all()
     assert (result[:, :5] == 100).all() and (result[:, 25:] == 100).all() and (frame == 100).all()
 
@@ -155,4 +156,4 @@ def test_photographs_show_through_their_own_lens(model, kept):
     numbers = {"fx": 300 / np.pi, "fy": 300 / np.pi, "cx": 300, "cy": 150, "width": 600, "height": 300}
     wide, box = framed(replace(PHOTO, **numbers, lens=lens), 900, 300)
     assert wide.lens == (lens if kept else None) and (wide.width, wide.height) == (900, 300)
-    assert box == Box(150, 0, 600, 300) and (wide.cx, wide.cy) == (450, 150)
+    assert box == np.s_[0:300, 150:750] and (wide.cx, wide.cy) == (450, 150)

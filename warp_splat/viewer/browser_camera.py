@@ -15,6 +15,8 @@ SAME_PLACE = 0.002  # of the distance to what one looks at
 USUAL_WINDOW = (16, 9)
 VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
 
+Box = tuple[slice, slice]  # rows and columns of a window
+
 
 class Look(NamedTuple):
     """A place to look from, in world coordinates, as a browser's controls want it."""
@@ -23,15 +25,6 @@ class Look(NamedTuple):
     target: np.ndarray  # [3], what they orbit
     up: np.ndarray  # [3], unit length
     fov: float  # vertical field of view, rad
-
-
-class Box(NamedTuple):
-    """A rectangle of pixels in a window."""
-
-    left: int
-    top: int
-    width: int
-    height: int
 
 
 def browser_camera(wxyz, position, fov: float, width: int, height: int) -> Camera:
@@ -75,7 +68,7 @@ def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
         wide = replace(inner, **size)
     except InputError:
         wide = replace(inner, **size, lens=None)
-    return wide, Box(left, top, inner.width, inner.height)
+    return wide, np.s_[top : top + inner.height, left : left + inner.width]
 
 
 def is_at(camera: Camera, other: Camera, distance: float) -> bool:

@@ -40,12 +40,11 @@ class Ruler:
     Args:
         client: viser's handle.
         subject: where the box begins, [3], world.
-        unit: of the scene's coordinates, " m" or nothing.
         touched: called when a click waits for its point.
     """
 
-    def __init__(self, client: "viser.ClientHandle", subject: np.ndarray, unit: str, touched: Callable[[], None]):
-        self.client, self.unit, self.touched = client, unit, touched
+    def __init__(self, client: "viser.ClientHandle", subject: np.ndarray, touched: Callable[[], None]):
+        self.client, self.touched = client, touched
         self.clicks: list[tuple[float, float]] = []  # that wait for their points
         self.points: list[np.ndarray] = []
         self.corners: list[viser.TransformControlsHandle] = []
@@ -69,18 +68,21 @@ class Ruler:
         self.clicks.append(event.screen_pos)
         self.touched()
 
-    def answer(self, draw: Callable, camera: Camera) -> None:
-        """Find the points that were clicked in a frame of ``camera``, and tell how far the last two are apart."""
+    def answer(self, draw: Callable, camera: Camera, unit: str) -> None:
+        """Find the points that were clicked in a frame of ``camera``, and tell how far the last two are apart.
+
+        ``unit``: of the scene's coordinates, " m" or nothing.
+        """
         while self.clicks:
             point = point_at(draw, camera, self.clicks.pop(0))
             if point is not None and self.measuring.value:
                 self.points = points = [*self.points, point] if len(self.points) < 2 else [point]
-                self._show(points)  # which a switch may take away meanwhile
+                self._show(points, unit)  # which a switch may take away meanwhile
 
-    def _show(self, points: list[np.ndarray]) -> None:
+    def _show(self, points: list[np.ndarray], unit: str) -> None:
         text, ends = " ".join(f"{value:.6g}" for value in points[0]), np.array([points[0], points[-1]])
         if len(points) == 2:
-            text = f"{np.linalg.norm(ends[1] - ends[0]):.4g}{self.unit}"
+            text = f"{np.linalg.norm(ends[1] - ends[0]):.4g}{unit}"
         scene = self.client.scene
         scene.add_line_segments("/distance/line", ends[None], COLOR, thickness=2.0, thickness_units="screen")
         scene.add_label("/distance/label", text, position=ends[1])

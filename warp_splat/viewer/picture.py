@@ -74,7 +74,7 @@ def overlay(frame: np.ndarray, photograph: np.ndarray, box: Box, opacity: float)
         opacity: of the photograph, 0..1.
     """
     result = frame.copy()
-    inside = result[box.top : box.top + box.height, box.left : box.left + box.width]
-    scaled = Image.fromarray(photograph).resize((box.width, box.height), Image.Resampling.BILINEAR)
+    inside = result[box]
+    scaled = Image.fromarray(photograph).resize(inside.shape[1::-1], Image.Resampling.BILINEAR)
     inside[:] = Image.blend(Image.fromarray(inside), scaled, opacity)
     return result

@@ -112,7 +112,7 @@ class Viewer:
         return f"{len(self.means()):,} Gaussians"
 
     async def _enter(self, client: "viser.ClientHandle") -> None:
-        self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.unit, self.wake)
+        self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.wake)
 
     async def _leave(self, client: "viser.ClientHandle") -> None:
         self.watchers.pop(client.client_id, None)
@@ -158,12 +158,11 @@ class Viewer:
             camera, view, box = watcher.camera(watcher.pixels if moving else MOST)
         except InputError:  # a window that was folded up; it will send another camera when it opens
             return
-        watcher.ruler.answer(self.draw_camera, camera)
+        watcher.ruler.answer(self.draw_camera, camera, self.unit)
         kind = watcher.kind.value
         out = self.draw_camera(camera, kind == "depth")
         if view is not None:
-            inside = out.image[box.top : box.top + box.height, box.left : box.left + box.width]
-            inside[:] = self.exposed(inside.clone(), view)
+            out.image[box] = self.exposed(out.image[box].clone(), view)
         frame, note = paint(out, kind, self.linear)
         if view is not None and watcher.opacity.value > 0:
             frame = overlay(frame, view.picture, box, watcher.opacity.value)

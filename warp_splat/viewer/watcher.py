@@ -42,17 +42,11 @@ class Watcher:
         client: viser's handle.
         views: the photographs that it can jump to, by name.
         subject: what they show, [3], world.
-        unit: of the world, " m" or nothing.
         wake: called whenever something has changed.
     """
 
     def __init__(
-        self,
-        client: "viser.ClientHandle",
-        views: Mapping[str, View],
-        subject: np.ndarray,
-        unit: str,
-        wake: Callable[[], None],
+        self, client: "viser.ClientHandle", views: Mapping[str, View], subject: np.ndarray, wake: Callable[[], None]
     ):
         self.client, self.views, self.subject, self.wake = client, views, subject, wake
         self.pixels = 0.25 * MOST  # that a moving frame may have
@@ -68,7 +62,7 @@ class Watcher:
             self.view.on_update(self._jump)
             self.opacity.on_update(self._touched)
             self.steps.on_click(self._step)
-        self.ruler = Ruler(client, subject, unit, self._touched)
+        self.ruler = Ruler(client, subject, self._touched)
         self.note = gui.add_markdown("")
         client.camera.on_update(self._touched)
         self._touched()
@@ -117,4 +111,4 @@ class Watcher:
             if is_at(free, view.camera, distance):
                 camera, box = framed(view.camera, free.width, free.height)
                 return camera, view, box
-        return free, None, Box(0, 0, 0, 0)
+        return free, None, np.s_[:, :]
