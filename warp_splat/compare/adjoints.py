@@ -100,9 +100,7 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
     try:
         image, gradients = gradients_of(workload, truth, variant.adjoint, options)
     except InputError as error:  # stored refuses what does not fit
-        result.extrapolated = True
-        result.note = str(error)
-        return result
+        return replace(result, extrapolated=True, note=str(error))
     result.errors = errors_of(gradients, truth)
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
@@ -145,7 +143,6 @@ def peak_of(run: Callable[[], object], device: torch.device) -> int:
 
 def central_differences(workload: Workload, truth: Truth) -> Measurement:
     """Time per parameter, measured; for all of them, extrapolated. Error at the largest gradients of the opacities."""
-    result = Measurement(workload.name, "central differences", len(workload.gaussians.means))
     opacities, exact = workload.gaussians.opacities, truth.gradients["opacities"]
     chosen = exact.abs().argsort(descending=True)[:DIFFERENCES]
     found, seconds = [], []
@@ -161,11 +158,10 @@ def central_differences(workload: Workload, truth: Truth) -> Measurement:
         seconds.append(time.perf_counter() - start)
     count = sum(tensor.numel() for tensor in workload.gaussians)
     error = float((torch.tensor(found, dtype=torch.float64) - exact[chosen]).norm() / exact[chosen].norm())
-    result.backward = [float(np.median(seconds)) * count]
-    result.extrapolated = True
-    result.note = f"{1e3 * float(np.median(seconds)):.1f} ms per parameter, times {count}: extrapolated"
-    result.errors = {"opacities": Error(error)}
-    return result
+    each = float(np.median(seconds))
+    note = f"{1e3 * each:.1f} ms per parameter, times {count}: extrapolated"
+    result = Measurement(workload.name, "central differences", len(opacities), note=note, extrapolated=True)
+    return replace(result, errors={"opacities": Error(error)}, backward=[each * count])
 
 
 def _loss(workload: Workload, truth: Truth, opacities: torch.Tensor) -> float:
