@@ -16,6 +16,7 @@ That holds for every projection and every lens whose limits and coefficients sta
 """
 
 import functools
+from typing import Any
 
 import warp as wp
 
@@ -25,24 +26,19 @@ from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import TYPES, equal, fill, fma, inner, less, pick, root, times
 
+wp.set_module_options(FORWARD_ONLY)
 
-@functools.cache
-def make_total(lanes: int) -> wp.Function:
+
+@wp.func
+def total_where(mask: Any, x: Any):
     """Sum over the lanes where a mask is set."""
-    number = TYPES[lanes].number
-
-    @wp.func
-    def total(mask: number, x: number):
-        return inner(pick(mask, x, fill(0.0, x)), fill(1.0, x))
-
-    return total
+    return inner(pick(mask, x, fill(0.0, x)), fill(1.0, x))
 
 
 @functools.cache
 def make_adj_pose(lanes: int) -> wp.Kernel:
     """Of ``lanes`` Gaussians at once."""
     number, _integer, _row2, row3, row4 = TYPES[lanes]
-    total = make_total(lanes)
 
     @wp.func
     def cross(ax: number, ay: number, az: number, bx: number, by: number, bz: number):
@@ -77,12 +73,12 @@ def make_adj_pose(lanes: int) -> wp.Kernel:
         gx, gy, gz = columns(adj_means[g])
         zero = fill(0.0, x)
         finite = equal(times(turn_x + turn_y + turn_z + gx + gy + gz, zero), zero)
-        sums_out[g, 0] = total(finite, turn_x)
-        sums_out[g, 1] = total(finite, turn_y)
-        sums_out[g, 2] = total(finite, turn_z)
-        sums_out[g, 3] = total(finite, gx)
-        sums_out[g, 4] = total(finite, gy)
-        sums_out[g, 5] = total(finite, gz)
+        sums_out[g, 0] = total_where(finite, turn_x)
+        sums_out[g, 1] = total_where(finite, turn_y)
+        sums_out[g, 2] = total_where(finite, turn_z)
+        sums_out[g, 3] = total_where(finite, gx)
+        sums_out[g, 4] = total_where(finite, gy)
+        sums_out[g, 5] = total_where(finite, gz)
 
     return adj_pose
 
@@ -91,7 +87,6 @@ def make_adj_pose(lanes: int) -> wp.Kernel:
 def make_adj_intrinsics(lanes: int) -> wp.Kernel:
     """Of ``lanes`` Gaussians at once."""
     number, _integer, row2, row3, _row4 = TYPES[lanes]
-    total = make_total(lanes)
 
     @wp.func
     def stretch(camera: CameraView, xx: number, xy: number, adj_xx: number, adj_xy: number, adj_yy: number):
@@ -134,9 +129,9 @@ def make_adj_intrinsics(lanes: int) -> wp.Kernel:
             along_x = fma(fainter, xx, along_x)
             along_y = fma(fainter, yy, along_y)
         seen = times(less(zero, xx), equal(times(along_x + along_y + adj_px + adj_py, zero), zero))
-        sums_out[g, 0] = total(seen, along_x)
-        sums_out[g, 1] = total(seen, along_y)
-        sums_out[g, 2] = total(seen, adj_px)
-        sums_out[g, 3] = total(seen, adj_py)
+        sums_out[g, 0] = total_where(seen, along_x)
+        sums_out[g, 1] = total_where(seen, along_y)
+        sums_out[g, 2] = total_where(seen, adj_px)
+        sums_out[g, 3] = total_where(seen, adj_py)
 
     return adj_intrinsics
