@@ -36,7 +36,7 @@ def test_photographs_that_overlap_are_found_and_order_counts_where_it_means_some
     near = looks.alike(described)
     true = overlapping(order)
     assert len(true - set(near)) < 0.02 * len(true) and len(near) < COUNT * looks.NEAREST
-    beside = looks.next_in_order(range(COUNT), near)
+    beside = looks.next_in_order(COUNT, near)
     assert len(beside) == (0 if mixed else sum(min(COUNT - 1 - a, looks.NEIGHBORS) for a in range(COUNT)))
 
 

@@ -5,7 +5,7 @@ normalized residuals (Arandjelovic and Zisserman 2013). All is drawn from a seed
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -75,14 +75,11 @@ def alike(described: np.ndarray, most: int = NEAREST) -> Pairs:
     return sorted(pairs)
 
 
-def next_in_order(order: Sequence[int], looks: Pairs) -> Pairs:
-    """Neighbors in an ``order`` of the photographs; none if neighbors do not look alike, and so it means nothing."""
-    beside = set(looks)
-    pair = [(min(pair), max(pair)) for pair in pairwise(order)]
-    if sum(each in beside for each in pair) < ORDERED * len(pair):
+def next_in_order(count: int, looks: Pairs) -> Pairs:
+    """Neighbors among the photographs; none if neighbors do not look alike, and so their order means nothing."""
+    if len({*looks}.intersection(pairwise(range(count)))) < ORDERED * (count - 1):
         return []
-    both = ((a, b) for place, a in enumerate(order) for b in order[place + 1 : place + 1 + NEIGHBORS])
-    return [(min(pair), max(pair)) for pair in both]
+    return [(one, other) for one in range(count) for other in range(one + 1, min(one + 1 + NEIGHBORS, count))]
 
 
 def beyond(matched: dict[tuple[int, int], int], tried: set[tuple[int, int]]) -> Pairs:

@@ -111,7 +111,7 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
         with bar:
             described = looks.described_by_words(features, len(images), config.seed)
     alike = looks.alike(described)
-    pairs = sorted({*alike, *looks.next_in_order(range(len(images)), alike)})
+    pairs = sorted({*alike, *looks.next_in_order(len(images), alike)})
     places = {number: place for place, number in enumerate(numbers)}
     tried, matched = set(), {}
     while pairs:
