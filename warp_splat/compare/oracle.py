@@ -104,9 +104,8 @@ def jacobians(points, camera):
     """
     z = points[:, 2]
     entries = []
-    for axis, (focal, center, size) in enumerate(
-        ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
-    ):
+    sides = (camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)
+    for axis, (focal, center, size) in enumerate(sides):
         held = _double(focal).item()
         margin, middle = SIDE * size / (2 * held), _double(center).item() / held
         slope = (points[:, axis] / z).clamp(-middle - margin, size / held - middle + margin)
