@@ -26,6 +26,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.png import load_png
 from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.stored import SH_C0
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import orbit_cameras
 from warp_splat.scene.types import Decoded, View
@@ -112,6 +113,18 @@ def test_pictures_agree_with_ours(browser, tmp_path, coefficients, options, whit
         found = pixels(page, index)
         assert psnr(found, picture(camera)) > 45
     assert found.std() > 10
+
+
+@pytest.mark.slow
+def test_no_pixel_at_the_rim_is_lost_to_rounded_corners(browser, tmp_path):
+    """Small ones, so bright that the faintest pixel of each has five levels, and of numbers that the page can store."""
+    splats = some_splats(400, 1)
+    splats.means[:], splats.scales[:], splats.opacities[:] = np.round(splats.means * 64) / 64, -4.0, 2.0
+    splats.quats[:], splats.sh[:] = [1, 0, 0, 0], 4.5 / SH_C0
+    folder, picture, cameras = model(tmp_path, splats)
+    page = open_page(browser, export(folder))
+    for index, camera in enumerate(cameras):
+        assert np.abs(pixels(page, index).astype(int) - picture(camera)).max() <= 1
 
 
 def test_a_screenshot_shows_the_first_camera_and_a_drag_another_view(browser, tmp_path):

@@ -17,7 +17,8 @@ void main() {
   gl_Position = vec4(2, 2, 2, 1); // outside
   if (color.a < ALPHA_MIN) return;
   float reach = sqrt(max(log2(color.a / ALPHA_MIN), 1e-6));
-  vec2 corner = reach * (2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) - 1.0);
+  vec2 wider = reach + SNAP * vec2(root.x + abs(root.y), root.z); // a corner that is rounded cuts no pixel off
+  vec2 corner = wider * (2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) - 1.0);
   float dy = corner.y / root.z;
   float dx = (corner.x - root.y * dy) / root.x;
   gl_Position = vec4(2.0 * (mean + vec2(dx, dy)) / size - 1.0, 0, 1);

@@ -66,6 +66,7 @@ class Renderer {
         precision highp float;
         precision highp int;
         const int WIDTH = ${this.width};
+        const float SNAP = ${0.5 ** (gl.getParameter(gl.SUBPIXEL_BITS) + 1)}; // px, by which corners are rounded
         uvec4 texel(highp usampler2D table, int index) { // of tables in rows of one width
           return texelFetch(table, ivec2(index % WIDTH, index / WIDTH), 0);
         }
