@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import audit
 import audit_targets
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from audit_targets import own
 from browser import CHROMIUM
 
 from warp_splat.audit import program
-from warp_splat.audit.judged import measure
+from warp_splat.audit.judged import RUNS, measure
+from warp_splat.audit.probes import FOCAL, GREEN, NEARLY_ROUND
 from warp_splat.audit.renderer import Answer, Renderer, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
@@ -156,7 +158,7 @@ def test_this_renderer_is_as_float64(importable):
     renderer = Renderer("audit_targets.own:manual")
     (row,) = measure(renderer, {}, scenes=("cloud",))
     renderer.close()
-    assert row.verdict == "as in float64" and row.same and row.largest < 1e-4
+    assert row.verdict == "as in float64" and row.same and row.runs == RUNS and row.largest < 1e-4
     assert set(row.gradients) == {"means", "quats", "scales", "opacities", "sh", "background"}
     assert max(row.gradients.values()) < 1e-4
 
@@ -268,6 +270,21 @@ def test_tiny_rotations_are_not_lost_in_gsplats_function():
     small = own.as_gsplat(*given)
     given[1] = given[1] * 1e20
     torch.testing.assert_close(small, own.as_gsplat(*given), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("disks", "shift", "error"), [(False, 0.0, 1e-6), (False, 0.01, 1e-4), (True, 0.0, 1e-9), (True, 0.3, 0.06)]
+)
+def test_the_camera_of_what_rays_see_is_measured(disks, shift, error):
+    """Soft Gaussians and opaque disks, moved to the right by ``shift`` px."""
+
+    def draw(workload):
+        means, _, scales, opacities, *_ = (tensor.double().numpy() for tensor in workload.gaussians)
+        moved = means + shift / FOCAL * means[:, 2:] * [1, 0, 0]
+        cover = audit.along_rays({"means": moved, "scales": scales / NEARLY_ROUND, "opacities": opacities})
+        return Answer((cover > audit.DISK if disks else cover)[..., None] * GREEN, False, {}, True)
+
+    assert audit.camera_error(SimpleNamespace(draw=draw), 0, 31)[0] == pytest.approx(shift, abs=error)
 
 
 def test_adapters_are_small():

@@ -1,6 +1,7 @@
 """How far a renderer's pictures and gradients are from float64: under the usual rules, and under its own."""
 
 import functools
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,7 +15,7 @@ from warp_splat.compare.workloads import Workload
 from warp_splat.raster.data import Gaussians
 
 LEVEL = 1 / 255  # of a screen
-RUNS = 10
+RUNS, QUICK = 10, 0.5  # s: what takes longer is drawn again in the scenes of REPEATED alone
 GRADIENT_OFF = 1e-2  # relative L2 from which a gradient is called off
 HOPELESS = 3  # failures in a row after which the rest is left out
 
@@ -35,6 +36,7 @@ class SceneRow:
     not_finite: int = 0  # numbers of picture and gradients
     same: bool = True
     pictures: tuple[np.ndarray, ...] = ()  # expected, found
+    runs: int = 1  # that were compared
 
     def record(self) -> dict[str, Any]:
         """All but the pictures, for JSON."""
@@ -75,8 +77,11 @@ def measure(
         if failures >= HOPELESS:
             yield SceneRow(scene, SCENES[scene][0], f"not tried after {HOPELESS} failures in a row", "error")
             continue
+        given, start = (workload, truth.weights.reshape(*shape, 3)), time.perf_counter()
         try:
-            answer = renderer.draw(workload, truth.weights.reshape(*shape, 3), RUNS if scene in REPEATED else 1)
+            answer = renderer.draw(*given)
+            if scene in REPEATED or time.perf_counter() - start < QUICK:
+                answer = renderer.draw(*given, RUNS)
         except RendererFailed as error:
             failures += renderer.process is None
             yield SceneRow(scene, SCENES[scene][0], str(error), "error")
@@ -109,8 +114,8 @@ def _judge(scene: str, workload: Workload, truth: Truth, answer: Answer, options
     level = "warning" if wrong or (worst and not off) else "note" if found else "ok"
     verdict = "; ".join(found) or "as in float64"
     numbers = (float(error.max(initial=0)), float(error.mean()) if error.size else 0.0, off, own_off)
-    pictures = (exact, answer.image)
-    return SceneRow(scene, SCENES[scene][0], verdict, level, *numbers, gradients, not_finite, answer.same, pictures)
+    rest = (gradients, not_finite, answer.same, (exact, answer.image), answer.runs)
+    return SceneRow(scene, SCENES[scene][0], verdict, level, *numbers, *rest)
 
 
 def smallest(renderer: Renderer, workload: Workload) -> tuple[Workload, Answer]:

@@ -30,6 +30,7 @@ class Answer:
     eight_bit: bool
     gradients: dict[str, torch.Tensor]  # by parameter; empty: it has none
     same: bool  # every run gave the same bits
+    runs: int = 1
 
 
 class Renderer:
@@ -66,7 +67,7 @@ class Renderer:
             raise RendererFailed(f"returned {image.dtype}, neither floats nor uint8")
         found = {name: torch.from_numpy(array) for name, array in gradients.items()}
         eight_bit = image.dtype == np.uint8
-        return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same)
+        return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same, runs)
 
     def _receive(self, limit: float):
         if not self.connection.poll(limit):

@@ -19,7 +19,7 @@ from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
 SIZE = (64, 48)  # px
-REPEATED = ("cloud", "layers_4000")  # drawn ten times: whatever depends on an order of threads shows here
+REPEATED = ("cloud", "layers_4000")  # drawn ten times by slow ones, too: an order of threads shows here
 #: Parts of names in the catalog: what only this package promises (a count, a decision of float32, an outline, a ratio),
 #: or pictures of 20,000 px.
 OURS = ("log_scales", "scales_1e38", "not_finite", "near_plane", "quats_1e-42", "size_", "ellipsoid", "antialiased")
