@@ -127,6 +127,17 @@ def test_no_pixel_at_the_rim_is_lost_to_rounded_corners(browser, tmp_path):
         assert np.abs(pixels(page, index).astype(int) - picture(camera)).max() <= 1
 
 
+def test_small_differences_of_depth_decide_the_order(browser, tmp_path):
+    """Of layers 1e-5 apart, in front of or behind one that is far from them."""
+    splats = some_splats(20, 1)
+    splats.means[1:] *= 1e-4
+    splats.scales[:], splats.opacities[:] = -1.0, 1.0
+    folder, picture, cameras = model(tmp_path, splats)
+    page = open_page(browser, export(folder))
+    for index, camera in enumerate(cameras):
+        assert np.abs(pixels(page, index).astype(int) - picture(camera)).max() <= 2
+
+
 def test_a_screenshot_shows_the_first_camera_and_a_drag_another_view(browser, tmp_path):
     folder, picture, cameras = model(tmp_path, some_splats(400))
     page = open_page(browser, export(folder))
