@@ -4,10 +4,12 @@ A renderer that was measured before and is not named keeps its row, and so does 
 those in a browser take longer.
 
     python benchmarks/audit.py [TARGET ...] [--scenes one two] [--more] [--pictures 401] [--out docs/benchmarks]
+    python benchmarks/audit.py TARGET --more --scenes   # of a row that is there, the camera alone
 """
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from warp_splat.audit.probes import GREEN, NEARLY_ROUND, probe_camera
 from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import REPEATED, SCENES, balls
+from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.formats.files import write_json, write_text
 from warp_splat.formats.png import save_png
@@ -32,9 +35,8 @@ PICTURES, LATTICE = 101, np.array([1, 39])  # another number of pictures should 
 DISK = 0.51  # alpha at which the opaque disks of Newton end
 
 
-def along_rays(arrays: dict[str, np.ndarray]) -> np.ndarray:
+def along_rays(arrays: dict[str, np.ndarray], camera: Camera) -> np.ndarray:
     """The cover [H, W] of Gaussians that are not turned, seen along rays: each by its largest alpha along the ray."""
-    camera = probe_camera()
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)[..., None, :]
     scales = arrays["scales"] * NEARLY_ROUND
@@ -46,9 +48,9 @@ def along_rays(arrays: dict[str, np.ndarray]) -> np.ndarray:
 def camera_error(renderer: Renderer, degree: int, pictures: int = PICTURES) -> list[float]:
     """How far three small Gaussians are from their places, and the standard error: px, the worst of six numbers.
 
-    The picture around each is a share of float64's, and shares of its derivatives by the place, by least squares. What
-    rays see is compared with rays, since the ellipse of an outline has its middle 0.05 px beside the peak, and an
-    opaque disk with disks a pixel apart.
+    The picture around each is a share of float64's, and shares of its derivatives by the principal point, by least
+    squares; if the Gaussians moved instead, their shapes would change. What rays see is compared with rays, since the
+    ellipse of an outline has its middle 0.05 px beside the peak, and an opaque disk with disks a pixel apart.
     """
     try:
         prober = find_rules(renderer.draw, degree, ("background", "camera"))
@@ -59,18 +61,20 @@ def camera_error(renderer: Renderer, degree: int, pictures: int = PICTURES) -> l
     for number in range(pictures):
         wiggle = number * LATTICE % pictures / pictures - 0.5
         places = np.array([[12.5, 10.25], [33.0, 24.75], [52.25, 38.5]]) + wiggle
-        at = lambda moved: balls(camera, places + moved, [3.0, 3.5, 4.0], 2.0, 0.9, GREEN)  # noqa: B023, E731
+        arrays = balls(camera, places, [3.0, 3.5, 4.0], 2.0, 0.9, GREEN)
         try:
-            seen = prober.cover_of(at((0, 0)))
+            seen = prober.cover_of(arrays)
         except RendererFailed:  # a busy browser now and then; one of many is little
             continue
-        cover, step = lambda arrays: prober.exact(arrays).alpha.numpy(), 0.01
+        cover, step = lambda *given: prober.exact(*given).alpha.numpy(), 0.01
         if np.isin(seen.round(6), (0, 1)).all():
-            cover, step = lambda arrays: np.float64(along_rays(arrays) > DISK), 1.0
+            cover, step = lambda *given: np.float64(along_rays(*given) > DISK), 1.0
         elif prober.options["projection"] == "ellipsoid":
             cover = along_rays
         moves = step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        here, right, left, down, up = (cover(at(moved)) for moved in moves)
+        here, right, left, down, up = (
+            cover(arrays, replace(camera, cx=camera.cx + a, cy=camera.cy + b)) for a, b in moves
+        )
         images = np.stack([here, (right - left) / (2 * step), (down - up) / (2 * step)], -1)
         near = [np.maximum(abs(x - a), abs(y - b)) < 8 for a, b in places]
         shares = [np.linalg.lstsq(images[part], seen[part], rcond=None)[0] for part in near]
@@ -95,7 +99,7 @@ def measured(name: str, scenes: list[str], out: Path, more: bool, pictures: int)
     if facts.get("version") != target.version or "worst" not in facts:
         facts, _ = run_audit(renderer, name, target.degree, ())
         facts |= {"version": target.version, "settings": target.settings, "worst": ["", 0.0], "scenes": []}
-    facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None]
+    facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None or row["scene"] not in scenes]
     known = {row["scene"] for row in facts["scenes"]}
     left = tuple(scene for scene in scenes if scene not in known)
     for row in measure(renderer, facts["options"], target.degree, tuple(facts["background"]), left):
@@ -105,7 +109,7 @@ def measured(name: str, scenes: list[str], out: Path, more: bool, pictures: int)
             save_png(out / "audit" / f"{name}.png", side_by_side(*row.pictures))
         facts["scenes"].append(row.record())
         write_json(file, facts)
-    if facts.get("pictures") != pictures:
+    if facts.get("pictures") != pictures or not scenes:
         facts |= {"camera": camera_error(renderer, target.degree, pictures), "pictures": pictures}
         write_json(file, facts)
     renderer.close()

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,7 +20,7 @@ from audit_targets import own
 from browser import CHROMIUM
 
 from warp_splat.audit import program
-from warp_splat.audit.judged import RUNS, measure
+from warp_splat.audit.judged import RUNS, exact_image, measure
 from warp_splat.audit.probes import FOCAL, GREEN, NEARLY_ROUND
 from warp_splat.audit.renderer import Answer, Renderer, function_of
 from warp_splat.audit.rules import find_rules
@@ -281,10 +282,21 @@ def test_the_camera_of_what_rays_see_is_measured(disks, shift, error):
     def draw(workload):
         means, _, scales, opacities, *_ = (tensor.double().numpy() for tensor in workload.gaussians)
         moved = means + shift / FOCAL * means[:, 2:] * [1, 0, 0]
-        cover = audit.along_rays({"means": moved, "scales": scales / NEARLY_ROUND, "opacities": opacities})
+        arrays = {"means": moved, "scales": scales / NEARLY_ROUND, "opacities": opacities}
+        cover = audit.along_rays(arrays, workload.camera)
         return Answer((cover > audit.DISK if disks else cover)[..., None] * GREEN, False, {}, True)
 
     assert audit.camera_error(SimpleNamespace(draw=draw), 0, 31)[0] == pytest.approx(shift, abs=error)
+
+
+def test_a_weaker_filter_is_not_taken_for_a_shift():
+    """Its Gaussians are smaller, and beside the middle those of another place have another shape."""
+
+    def draw(workload):
+        options = replace(workload.options, blur=0.05)
+        return Answer(exact_image(replace(workload, options=options)), False, {}, True)
+
+    assert audit.camera_error(SimpleNamespace(draw=draw), 0, 31)[0] < 1e-4
 
 
 def test_adapters_are_small():
