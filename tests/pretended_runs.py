@@ -45,7 +45,7 @@ TRAININGS = {
     "default": "--eval",
     "budget": "--growth budget --max_gaussians 30",
     "mcmc": "--growth mcmc --max_gaussians 40",
-    "parts": "--parts exposure,sky,floaters --vignetting",
+    "parts": "--parts exposure,sky,surface,floaters --vignetting",
     "depth": "--depths depths",
     "grid": "--exposure bilateral --coarse 2 --coarse_until_iter 5",
     "background": "--random_background --white_background",

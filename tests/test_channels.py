@@ -46,6 +46,7 @@ def truth(name):
     sure = ~exact.fragile & ((after - 0.5).abs().amin(2) > NARROW)
     sure &= (strong.values[..., :-1] - strong.values[..., 1:]).amin(2) > NARROW * 1e-2
     shown = {"features": weights @ leaves[5][order], "normals": weights @ normals[order], "median_depth": median}
+    shown["planes"] = weights @ (normals * (leaves[0] - center)).sum(1, keepdim=True)[order]
     shown["strongest_weights"] = strong.values[..., :3]
     return leaves, shown, order[strong.indices[..., :3]], sure
 

@@ -57,7 +57,7 @@ def test_a_run_that_stops_again_and_again_ends_in_the_same_bytes(options, scene,
     assert len(expected[0].model) not in (4500, 0) or options.get("max_gaussians")
 
 
-ALL = {"parts": "sky,exposure,pose,depth,floaters", "vignetting": True}
+ALL = {"parts": "sky,exposure,pose,depth,surface,floaters", "vignetting": True}
 POSE = {"parts": "pose", "pose_from_iter": 5}
 
 

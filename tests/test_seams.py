@@ -164,8 +164,9 @@ def test_flags_files_and_output_know_them(tmp_path, capsys, fails):
         main(["train", "--help"])
     assert "--gain_lr FLOAT" in capsys.readouterr().out
     begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
-    assert "--parts: expected auto, or some of random_background, sky, exposure, pose, depth, floaters, gain" in fails(
-        *begun, "--parts", "weather"
+    assert (
+        "--parts: expected auto, or some of random_background, sky, exposure, pose, depth, surface, floaters, gain"
+        in fails(*begun, "--parts", "weather")
     )
     assert "--growth: expected one of reference, budget, mcmc, faint" in fails(*begun, "--growth", "weather")
 
@@ -176,7 +177,7 @@ def test_neither_trainer_nor_command_line_knows_one_by_name():
     words = set(re.findall(r"\w+", re.sub(r'""".*?"""|#[^\n]*', "", "\n".join(texts), flags=re.DOTALL)))
     for entry in (*PARTS.values(), *GROWTHS.values()):
         found = words & {*entry.place.split(".")[-2:], *(item.name for item in fields(entry.options))}
-        assert found <= {"background", "depth"}  # a color and a plane, too
+        assert found <= {"background", "depth", "surface"}  # a color, a plane, and of a mesh, too
 
 
 def test_options_of_one_name_are_refused(monkeypatch, fails):

@@ -16,7 +16,7 @@ from warp.geometry import IsoSurfaceMarchingCubes, sparse_marching_cubes_from_ce
 from warp_splat.camera import Camera
 from warp_splat.kernels.distance_field import agree, fuse
 from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.beside import rotations
+from warp_splat.raster.beside import rays, rotations
 from warp_splat.runtime import launch
 
 EDGE = 8  # voxels of a block
@@ -49,12 +49,12 @@ def lens_of(camera: Camera) -> wp.vec4:
     return wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def rays(camera: Camera, device: torch.device) -> torch.Tensor:
-    """Of a pinhole's pixels, in the world, from its center to depth 1, [H, W, 3]."""
-    columns, rows = torch.arange(camera.width, device=device), torch.arange(camera.height, device=device)
-    y, x = torch.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
-    right, down, forward = torch.from_numpy(camera.rotation.astype(np.float32)).to(device)
-    return x[..., None] * right + y[..., None] * down + forward
+def image_at(image: torch.Tensor, camera: Camera, mode: str = "nearest-exact") -> torch.Tensor:
+    """An image [H, W, C] at the size of a camera's."""
+    planes = image.movedim(2, 0)[None]
+    return (
+        torch.nn.functional.interpolate(planes, (camera.height, camera.width), mode=mode)[0].movedim(0, 2).contiguous()
+    )
 
 
 def depth_of(shown: RenderOutput, camera: Camera) -> torch.Tensor:

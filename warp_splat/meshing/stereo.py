@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from warp_splat.camera import Camera
 from warp_splat.kernels.patches import REACH, SPACING, Other, search
-from warp_splat.meshing.fusion import Drawn, agreed, lens_of, nearest_to, rays, relative
+from warp_splat.meshing.fusion import Drawn, agreed, image_at, lens_of, nearest_to, relative
+from warp_splat.raster.beside import rays
 from warp_splat.runtime import launch
 from warp_splat.scene.types import View
 
@@ -37,9 +38,9 @@ def filled(views: Sequence[Drawn], kept: list[Drawn], photographs: Sequence[View
     for i, (view, known) in enumerate(zip(tqdm(small, "comparing photographs", leave=False), kept, strict=True)):
         nearest = (small[j] for j in nearest_to(i, small))
         facing = [other for other in nearest if other.camera.rotation[2] @ view.camera.rotation[2] > ALONG]
-        depth = _resized(known.depth[..., None], view)[..., 0]
+        depth = image_at(known.depth[..., None], view.camera)[..., 0]
         planes = _planes(view, depth, facing[:LOOKED_IN], wp.vec2(1 / far / RANGE, RANGE / near))
-        nearness = _nearness(_resized(planes, known), known.camera)
+        nearness = _nearness(image_at(planes, known.camera), known.camera)
         found.append(_joined(known, torch.where(nearness > 0, 1 / nearness, 0.0)))
     return [_joined(known, new.depth) for known, new in zip(kept, agreed(found, CONFIRMING), strict=True)]
 
@@ -49,12 +50,6 @@ def _joined(view: Drawn, depth: torch.Tensor) -> Drawn:
     return view._replace(depth=torch.where(view.depth > 0, view.depth, depth))
 
 
-def _resized(image: torch.Tensor, view: Drawn, mode: str = "nearest-exact") -> torch.Tensor:
-    """An image [H, W, C] at the size of a view."""
-    size = view.camera.height, view.camera.width
-    return torch.nn.functional.interpolate(image.movedim(2, 0)[None], size, mode=mode)[0].movedim(0, 2).contiguous()
-
-
 def _small(view: Drawn, photograph: View) -> Drawn:
     """The view with few enough pixels, and its photograph in gray [H, W, 1], 0 to 1; below where it is masked."""
     share = min(1.0, math.sqrt(MOST / view.depth.numel()))
@@ -62,7 +57,9 @@ def _small(view: Drawn, photograph: View) -> Drawn:
     gray = torch.from_numpy(photograph.picture).float().mean(2, keepdim=True) / 255
     if photograph.mask is not None:
         gray[torch.from_numpy(photograph.mask == 0)] = -1.0
-    return small._replace(depth=_resized(view.depth[..., None], small)[..., 0], image=_resized(gray, small, "area"))
+    return small._replace(
+        depth=image_at(view.depth[..., None], small.camera)[..., 0], image=image_at(gray, small.camera, "area")
+    )
 
 
 def _nearness(planes: torch.Tensor, camera: Camera) -> torch.Tensor:

@@ -44,6 +44,7 @@ class RenderOutput:
     dropped: Dropped = field(default_factory=Dropped)
     features: torch.Tensor | None = None  # [H, W, C] sum of weight times feature, if given
     normals: torch.Tensor | None = None  # [H, W, 3] sum of weight times normal, in the world, if asked for
+    planes: torch.Tensor | None = None  # [H, W, 1] likewise: minus the plane's distance from the camera
     median_depth: torch.Tensor | None = None  # [H, W] world units, where half of the light is gone; 0 where it is not
     strongest: torch.Tensor | None = None  # [H, W, k] int64, Gaussians of the largest weights; -1 where there is none
     strongest_weights: torch.Tensor | None = None  # [H, W, k] share of them in the pixel

@@ -38,7 +38,11 @@ def blend_beside(
     """
     channels, found, options = {} if features is None else {"features": features}, {}, blending.options
     if options.normals:
-        channels["normals"] = normals_of(gaussians, camera.camera if isinstance(camera, CameraParameters) else camera)
+        center = (camera.camera if isinstance(camera, CameraParameters) else camera).center.tolist()
+        # number by number, since a copy of the center would make a GPU wait
+        away = torch.stack([mean - value for mean, value in zip(gaussians.means.unbind(1), center, strict=True)], 1)
+        normals = normals_of(gaussians, away.detach())
+        channels |= {"normals": normals, "planes": (normals * away).sum(1, keepdim=True)}
     if channels:
         widths = [channel.shape[1] for channel in channels.values()]
         together = torch.cat(list(channels.values()), 1) if len(channels) > 1 else next(iter(channels.values()))
@@ -114,18 +118,22 @@ def _gaussians_of(bins: Bins, camera: Camera, ranks: torch.Tensor) -> torch.Tens
     return torch.where(ranks >= 0, wp.to_torch(bins.gaussians)[splats].long(), none)
 
 
-def normals_of(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """The shortest axis of each Gaussian in the world, turned towards the camera, [N, 3] of length 1.
+def normals_of(gaussians: Gaussians, away: torch.Tensor) -> torch.Tensor:
+    """The shortest axis of each Gaussian in the world, turned against ``away`` [N, 3], [N, 3] of length 1.
 
     Differentiable in the quaternions.
     """
     axes = rotations(gaussians.quats).mT
     shortest = gaussians.scales.detach().argmin(1)
     normals = axes.gather(1, shortest[:, None, None].expand(-1, 1, 3)).squeeze(1)
-    with torch.no_grad():
-        center = torch.tensor(camera.center, dtype=torch.float32, device=normals.device)
-        away = (normals * (gaussians.means - center)).sum(1, keepdim=True) > 0
-    return torch.where(away, -normals, normals)
+    return torch.where((normals.detach() * away).sum(1, keepdim=True) > 0, -normals, normals)
+
+
+def rays(camera: Camera, device: torch.device) -> torch.Tensor:
+    """Of a pinhole's pixels, in the world, from its center to depth 1, [H, W, 3]."""
+    columns, rows = torch.arange(camera.width, device=device), torch.arange(camera.height, device=device)
+    y, x = torch.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
+    return torch.stack([x * right + y * down + forward for right, down, forward in camera.rotation.T.tolist()], -1)
 
 
 def rotations(quats: torch.Tensor) -> torch.Tensor:

@@ -31,12 +31,12 @@ def guessed(values: np.ndarray, known: Sequence[Camera], others: Sequence[Camera
     values = np.asarray(values, np.float64)
     if len(known) < 2 or not others:
         return np.zeros((len(others), *values.shape[1:]))
-    again = _mean_of_nearest(values, _distances(known, known, extent) + np.diag(np.full(len(known), np.inf)))
+    again = _mean_of_nearest(values, distances(known, known, extent) + np.diag(np.full(len(known), np.inf)))
     factor = np.clip((again * values).sum() / max((again * again).sum(), 1e-30), 0.0, 1.0)
-    return factor * _mean_of_nearest(values, _distances(others, known, extent))
+    return factor * _mean_of_nearest(values, distances(others, known, extent))
 
 
-def _distances(some: Sequence[Camera], others: Sequence[Camera], extent: float) -> np.ndarray:
+def distances(some: Sequence[Camera], others: Sequence[Camera], extent: float) -> np.ndarray:
     """From each to each of ``others`` [Q, P]: of their places, in extents, plus the angle between them [rad]."""
     places, other_places = (np.array([camera.center for camera in cameras]) for cameras in (some, others))
     ahead, other_ahead = (np.array([camera.forward for camera in cameras]) for cameras in (some, others))

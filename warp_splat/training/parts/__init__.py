@@ -67,6 +67,14 @@ class DepthOptions:
         return bool(self.depths)
 
 
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """A truer surface."""
+
+    surface_normals: float = learning(0.01, "weight in the loss of --parts surface: of normals unlike those of depths")
+    surface_views: float = learning(0.5, "weight in the loss of --parts surface: of depths unlike those of other views")
+
+
 #: In this order they act in each step. A flag with the name of its part asks for it as ``--parts`` does.
 PARTS: dict[str, Entry] = {
     "random_background": Entry(BackgroundOptions, "warp_splat.training.parts.background.RandomBackground"),
@@ -74,5 +82,6 @@ PARTS: dict[str, Entry] = {
     "exposure": Entry(ExposureOptions, "warp_splat.training.parts.exposure.Exposure"),
     "pose": Entry(PoseOptions, "warp_splat.training.parts.pose.Pose"),
     "depth": Entry(DepthOptions, "warp_splat.training.parts.depth.Depth"),
+    "surface": Entry(SurfaceOptions, "warp_splat.training.parts.surface.SurfacePart"),
     "floaters": Entry(FloatersOptions, "warp_splat.training.parts.floaters.Floaters"),
 }
