@@ -3,7 +3,7 @@
 Of a mesh of the embedded scene: accuracy, its area that is near the true surface; completeness, what the cameras see
 of the true surface that is near the mesh; both within shares of the extent, and F, their harmonic mean. The table, with
 what is on it: completeness without the room around. Normals: mean angle of what is near. Of any scene: how far the
-points of structure from motion are from the mesh.
+points of structure from motion are from the mesh. Colors: PSNR of the mesh in the photographs that were held out.
 
 Beside it, on the same scene, what comes of the model's depths alone, without what photographs tell; and by Open3D (pip
 install open3d-cpu), whose rows are left out without it: its distance field of the same depths, of all depths (those
@@ -46,6 +46,7 @@ HEADERS += (
     "normals, degrees",
     "points, median",
     "points, 90 %",
+    "colors, dB",
     "triangles",
     "processor seconds",
 )
@@ -73,6 +74,45 @@ def to_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tupl
     found = [wp.empty(len(points), dtype=dtype, device="cpu") for dtype in (float, wp.vec3)]
     wp.launch(nearest, dim=len(points), inputs=[exact.id, arrays[1]], outputs=found, device="cpu")
     return found[0].numpy(), found[1].numpy()
+
+
+@wp.kernel
+def hit(
+    mesh: wp.uint64,
+    center: wp.vec3,
+    rays: wp.array[wp.vec3],  # [P]
+    colors: wp.array[wp.vec3],  # [V]
+    # out
+    color_out: wp.array[wp.vec3],  # [P]; -1 where a ray meets nothing
+):
+    i = wp.tid()
+    query = wp.mesh_query_ray(mesh, center, rays[i], FAR)
+    color = wp.vec3(-1.0)
+    if query.result:
+        corners = wp.mesh_get(mesh).indices
+        a, b, c = corners[3 * query.face], corners[3 * query.face + 1], corners[3 * query.face + 2]
+        color = query.u * colors[a] + query.v * colors[b] + (1.0 - query.u - query.v) * colors[c]
+    color_out[i] = color
+
+
+def colors_of(found: trimesh.Trimesh, views: list[View]) -> float:
+    """PSNR [dB] of a mesh's colors in views that were held out, where they show the mesh."""
+    vertices, colors = (
+        wp.array(np.asarray(x, np.float32), dtype=wp.vec3, device="cpu")
+        for x in (found.vertices, found.visual.vertex_colors[:, :3] / 255)
+    )
+    exact = wp.Mesh(vertices, wp.array(np.asarray(found.faces, np.int32).ravel(), dtype=int, device="cpu"))
+    errors = []
+    for view in views:
+        c = view.camera
+        x, y = np.meshgrid(np.arange(c.width) + 0.5, np.arange(c.height) + 0.5)
+        rays = c.rays(np.stack([x, y], -1).reshape(-1, 2)) @ c.rotation
+        made = wp.empty(len(rays), dtype=wp.vec3, device="cpu")
+        inputs = [exact.id, wp.vec3(*c.center), wp.array(rays.astype(np.float32), dtype=wp.vec3, device="cpu"), colors]
+        wp.launch(hit, dim=len(rays), inputs=inputs, outputs=[made], device="cpu")
+        shown = made.numpy()
+        errors.append((shown - view.picture.reshape(-1, 3) / 255)[shown[:, 0] >= 0])
+    return -10 * np.log10(np.mean(np.concatenate(errors) ** 2))
 
 
 def seen_by(view: View, measure: Measure) -> np.ndarray:
@@ -142,7 +182,10 @@ def surfaces_of(config: MeshConfig, opened: Opened) -> Iterator[tuple[str, Calla
         mesh(config)
         return trimesh.load(config.output, process=False)
 
-    yield "ours", ours
+    learned = opened.trained.get("parts")
+    yield f"ours, --parts {learned}" if learned else "ours", ours
+    if learned:
+        return
     views = drawn_views(opened, MEMORY)
     counting = agreed(views)
     voxel = PIXELS * pixel(counting)
@@ -167,7 +210,8 @@ def rows_of(model: Path) -> Iterator[tuple]:
         seconds = time.process_time() - begin
         truth = against_truth(found, scene) if name == "still_life" else [None] * (3 * len(SHARES) + 2)
         far = to_mesh(scene.points, found.vertices, found.faces)[0] / scene.extent * 100
-        numbers = [*truth, np.median(far), np.quantile(far, 0.9)]
+        colors = colors_of(found, scene.test) if found.visual.kind == "vertex" else None
+        numbers = [*truth, np.median(far), np.quantile(far, 0.9), colors]
         shown = ("" if value is None else f"{value:.3g}" for value in numbers)
         yield name, surface, *shown, len(found.faces), f"{seconds:.0f}"
 

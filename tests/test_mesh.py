@@ -1,6 +1,7 @@
 """Surfaces against a sphere and a plane of known depths, and of a model of Gaussians on a sphere."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,10 +15,14 @@ from warp_splat import RasterOptions, rasterize
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.splats import SplatArrays, SplatFile
-from warp_splat.meshing.command import smoothed, surface_in, without_islands
+from warp_splat.lenses import Lens
+from warp_splat.meshing.command import photographed, smoothed, surface_in, without_islands
 from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, fused, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
+from warp_splat.rendering.finished import as_photographed
+from warp_splat.scene.types import Decoded, View
 
 trimesh = pytest.importorskip("trimesh", reason="no trimesh: pip install 'warp-splat[mesh]'")
 MASKED = 12  # columns of a photograph
@@ -175,6 +180,26 @@ def test_a_smoothed_ball_is_as_large_and_its_hole_stays():
     assert len(edge) > 50 and np.std(after) < 0.5 * np.std(before) and abs(after.mean()) < 0.001
 
 
+def test_colors_are_those_of_photographs_in_the_mean_exposure():
+    """Where there is no mask. A photograph of another size, exposed by an affine map, and what is not exposed alike."""
+    random = np.random.default_rng(0)
+    image, camera = random.uniform(0.2, 0.7, (6, 8, 3)).astype(np.float32), camera_at(0).resized(8, 6)
+    turn = np.eye(3) * 0.8 + 0.05
+    numbers = np.float32([*(turn - np.eye(3)), [0.1] * 3]).ravel()
+    exposures = Exposures("affine", 0.0, np.zeros(2, np.float32), {"a": numbers})
+    exposed = as_photographed(torch.from_numpy(image), exposures, "a").numpy()
+    taken = np.rint(255 * exposed.repeat(3, 0).repeat(3, 1)).astype(np.uint8)
+    taken[:, 12:] += 20
+    mask = np.ones(taken.shape[:2], np.uint8)
+    mask[9:] = 0
+    view = View("a", camera.resized(24, 18), Decoded(taken, None, mask), camera)
+    found = photographed(torch.from_numpy(image), view, exposures).numpy() - image
+    assert np.abs(found[:3, :4]).max() < 0.003 and not found[3:].any()
+    assert np.abs(found[:3, 4:] - 20 / 255).max() < 0.003 and np.abs(exposed - image).max() > 0.01
+    bent = replace(view, camera=replace(camera, lens=Lens("OPENCV", (0.1, 0.0, 0.0, 0.0))))
+    assert not (photographed(torch.from_numpy(image), bent, exposures).numpy() - image).any()
+
+
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     """Flat Gaussians on a ball that the embedded scene's cameras look at."""
@@ -217,6 +242,7 @@ def test_the_command(model, scene, tmp_path, capsys, ending):
     vertices = mesh.vertices * ([-1, -1, 1] if ending == "glb" else [1, 1, 1])
     assert np.abs(np.linalg.norm(vertices - center, axis=1) - radius).max() < 0.04
     assert len(mesh.faces) <= 900 and mesh.visual.vertex_colors.shape == (len(vertices), 4)
+    assert np.abs(mesh.visual.vertex_colors[:, :3] - 99.0).max() <= 1  # the photographs', not the model's
     assert "triangles" in capsys.readouterr().out
 
 

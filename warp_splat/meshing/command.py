@@ -15,14 +15,28 @@ from scipy.spatial import KDTree
 from warp_splat.color import to_srgb
 from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
+from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import Drawn, Surface, agreed, closed, depth_of, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.fusion import (
+    Drawn,
+    Surface,
+    agreed,
+    closed,
+    depth_of,
+    fused,
+    image_at,
+    pixel,
+    surface_of,
+    voxels_of,
+)
 from warp_splat.meshing.stereo import filled
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
+from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime.launch import available_memory
+from warp_splat.scene.types import View
 
 ENDINGS = (".ply", ".glb", ".obj")
 GLTF_AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # x left, y up, z forward
@@ -91,21 +105,38 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     setting, found = opened.setting, []
     options = replace(setting.options, strongest=STRONGEST_MOST)
     background = setting.background if setting.background.ndim == 1 else setting.background.new_zeros(3)
-    cameras = [view.camera for view in opened.scene.train]
+    views, cameras = opened.scene.train, [view.camera for view in opened.scene.train]
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
     if share * min(min(camera.width, camera.height) for camera in cameras) < LEAST:
         raise InputError(f"--memory: views of {LEAST} px and more do not fit into half of it; raise it.")
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
-        for camera in cameras:
+        for view, camera in zip(views, cameras, strict=True):
             if camera.lens is not None and camera.lens.family.around:
                 raise InputError("mesh: expected views of a plane to fuse, found a panorama; train on cube faces.")
             smaller = camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height)))
             smaller = replace(smaller, lens=None, shutter=None)  # depths are drawn, not taken from photographs
             shown = render(gaussians, smaller, background, options)
-            image = to_srgb(shown.image, torch.where) if opened.scene.linear else shown.image
-            found.append(Drawn(smaller, depth_of(shown, smaller).cpu(), image.cpu().contiguous()))
+            image = photographed(shown.image.cpu(), view, opened.exposures)
+            image = to_srgb(image.clamp_min(0), torch.where) if view.linear else image
+            found.append(Drawn(smaller, depth_of(shown, smaller).cpu(), image.contiguous()))
     return found
+
+
+def photographed(image: torch.Tensor, view: View, exposures: Exposures | None) -> torch.Tensor:
+    """A model's picture [H, W, 3] with a photograph's colors, in the mean exposure; where it is masked, the model's.
+
+    To first order: what the photograph has more than the picture exposed alike. A lens's photograph gives none.
+    """
+    if view.camera.lens or view.camera.shutter:
+        return image
+    height, width, _ = image.shape
+    pixels, camera = view.pixels, view.camera.resized(width, height)
+    taken = image_at(torch.from_numpy(pixels.image).float(), camera, "area") / (1 if view.linear else 255)
+    more = taken - as_photographed(image, exposures, view.name)
+    if pixels.mask is not None:
+        more = more * image_at(torch.from_numpy(pixels.mask[..., None]), camera).bool()
+    return image + more
 
 
 def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: float) -> tuple[float, torch.Tensor]:
