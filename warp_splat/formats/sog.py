@@ -17,7 +17,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warp_splat.formats import files
+from warp_splat.formats.files import (
+    Unexpected,
+    atomic_write,
+    check_expansion,
+    entries_of,
+    json_object,
+    numbers_of,
+    reading,
+    whole_number,
+)
 from warp_splat.formats.palettes import ENTRIES, codebook, palette
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.formats.stored import from_smallest_three, logit, sigmoid, smallest_three
@@ -78,7 +87,7 @@ def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
     if file.antialiased:
         meta |= {"antialias": True, "model": "antialiased"}
     meta |= {part: {**facts, "files": [f"{name}.webp" for name in images]} for part, (facts, images) in parts.items()}
-    with files.atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         # entries without a time, so that equal Gaussians give equal bytes; WebP is compressed already
         archive.writestr(zipfile.ZipInfo(META), json.dumps(meta, allow_nan=False))
         for name, image in (image for _, images in parts.values() for image in images.items()):
@@ -96,7 +105,7 @@ def load_sog(path: str | Path, report: Report = print) -> SplatFile:
     Raises:
         InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
     """
-    with files.reading(path, "a .sog file of version 2"):
+    with reading(path, "a .sog file of version 2"):
         try:
             with zipfile.ZipFile(path) as archive:
                 return _Bundle(archive, Path(path).stat().st_size).file()
@@ -111,20 +120,20 @@ class _Bundle:
         self.archive = archive
         self.file_bytes = file_bytes
         self.size: tuple[int, int] | None = None  # of the images that hold the Gaussians
-        self.meta = files.json_object(self._bytes(META, META_BYTES))
+        self.meta = json_object(self._bytes(META, META_BYTES))
         version = self.meta.get("version", 1)  # the first had none
         if version != 2:
-            raise files.Unexpected(f"version {version!r:.40}; save it with splat-transform, which writes version 2")
-        self.count = files.whole_number(self.meta.get("count"), "count", 2**32)
+            raise Unexpected(f"version {version!r:.40}; save it with splat-transform, which writes version 2")
+        self.count = whole_number(self.meta.get("count"), "count", 2**32)
         harmonics = self.meta.get("shN") is not None
-        self.degree = files.whole_number(self._part("shN").get("bands"), "bands", 3) if harmonics else 0
+        self.degree = whole_number(self._part("shN").get("bands"), "bands", 3) if harmonics else 0
         self.coefficients = COEFFICIENTS[self.degree]
-        files.check_expansion(self.count, PIXEL_BYTES + 3 * (self.coefficients - 1), file_bytes)
+        check_expansion(self.count, PIXEL_BYTES + 3 * (self.coefficients - 1), file_bytes)
 
     def file(self) -> SplatFile:
         """The Gaussians."""
         means, colors = self._part("means"), self._pixels("sh0", 0)
-        low, high = files.numbers_of(means, "mins", 3), files.numbers_of(means, "maxs", 3)
+        low, high = numbers_of(means, "mins", 3), numbers_of(means, "maxs", 3)
         steps = self._pixels("means", 0)[:, :3] + 256.0 * self._pixels("means", 1)[:, :3]
         sh = np.zeros((self.count, self.coefficients, 3), np.float32)
         sh[:, 0] = self._codebook("sh0")[colors[:, :3]]
@@ -143,11 +152,11 @@ class _Bundle:
     def _part(self, name: str) -> dict:
         part = self.meta.get(name)
         if not isinstance(part, dict):
-            raise files.Unexpected(f"no object {name!r} in its {META}")
+            raise Unexpected(f"no object {name!r} in its {META}")
         return part
 
     def _codebook(self, part: str) -> np.ndarray:
-        return files.numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
+        return numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
 
     def _pixels(self, part: str, index: int) -> np.ndarray:
         """The Gaussians' pixels [N, 4] of an image."""
@@ -156,7 +165,7 @@ class _Bundle:
     def _harmonics(self) -> np.ndarray:
         """[N, K - 1, 3] float32."""
         part = self._part("shN")
-        entries = files.whole_number(part.get("count"), "count of the palette", PALETTE_MOST)
+        entries = whole_number(part.get("count"), "count of the palette", PALETTE_MOST)
         size = (PALETTE_ROW * (self.coefficients - 1), -(-entries // PALETTE_ROW))
         table = self._image("shN", 0, size).reshape(-1, self.coefficients - 1, 4)[:entries, :, :3]
         labels = self._pixels("shN", 1)
@@ -167,9 +176,9 @@ class _Bundle:
 
     def _image(self, part: str, index: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """An image [H, W, 4] uint8 of ``size`` (width, height), or of that which holds the Gaussians."""
-        names = files.entries_of(self._part(part), "files")
+        names = entries_of(self._part(part), "files")
         if index >= len(names) or not isinstance(names[index], str):
-            raise files.Unexpected(f"no name of image {index} of {part!r}")
+            raise Unexpected(f"no name of image {index} of {part!r}")
         data = self._bytes(names[index], self.file_bytes)
         width, height = _webp_size(data, names[index])
         wanted = size or self.size
@@ -190,9 +199,9 @@ class _Bundle:
         try:
             info = self.archive.getinfo(name)
         except KeyError:
-            raise files.Unexpected(f"no file {name!r:.80} in it") from None
+            raise Unexpected(f"no file {name!r:.80} in it") from None
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise files.Unexpected(f"{name!r:.80} in another compression than deflate")
+            raise Unexpected(f"{name!r:.80} in another compression than deflate")
         with self.archive.open(info) as source:
             data = source.read(most + 1)
         if len(data) > most:
@@ -213,14 +222,14 @@ def _laid_out(rows: np.ndarray) -> np.ndarray:
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     """Width and height by the header: Pillow allocates an image as it opens it."""
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
-        raise files.Unexpected(f"an image {name!r:.80} that is no WebP")
+        raise Unexpected(f"an image {name!r:.80} that is no WebP")
     match data[12:16]:
         case b"VP8L":
             bits = int.from_bytes(data[21:25], "little")
             return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
         case b"VP8X" if _is_lossless(data):
             return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    raise files.Unexpected(f"an image {name!r:.80} whose compression changes values")
+    raise Unexpected(f"an image {name!r:.80} whose compression changes values")
 
 
 def _is_lossless(data: bytes) -> bool:
