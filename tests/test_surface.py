@@ -9,9 +9,11 @@ import torch
 from hostile import refusal
 from trainings import Pretended, begin, stepped, steps
 
+from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.lenses import Lens
 from warp_splat.scene.neighbors import distances
 from warp_splat.training.options import TrainConfig
+from warp_splat.training.record import keep, restore
 from warp_splat.training.seams import Step
 from warp_splat.training.trainer import Trainer
 
@@ -119,6 +121,21 @@ def test_it_asks_for_nothing_in_the_first_quarter(scene, tmp_path):
     trainer, _ = begin(scene, tmp_path, **SURFACE)
     asked = [trainer.parts[0].asks(trainer.options, Step(step, scene.train[0])).normals for step in (0, 1, 12, 13, 50)]
     assert asked == [True, False, False, True, True]
+
+
+def test_two_tiny_photographs(scene, tmp_path):
+    """Of which each has one neighbor, and of 3 x 5 px none whose normal is told; begun without the part."""
+    few = replace(scene, train=scene.train[:2])
+    trainer, run = stepped(few, tmp_path, 20)
+    keep(trainer, run)
+    trainer, run = begin(few, tmp_path, **SURFACE)
+    restore(trainer, run, load_checkpoint(tmp_path))
+    assert run.iteration == 20 and not trainer.parts[0].kept.any()
+    steps(trainer, run, 24)
+    part, tiny = trainer.parts[0], few.train[0].camera.resized(3, 5)
+    part.kept[0], part.kept[1] = torch.rand(128, 128), 0.0  # its own, with which it is not compared
+    out, _ = trainer._render(tiny, trainer.background, replace(trainer.options, normals=True))
+    assert part.loss(torch.zeros(()), out, Step(50, few.train[0])) == 0
 
 
 def test_what_it_cannot_work_with_is_one_sentence(scene, tmp_path):

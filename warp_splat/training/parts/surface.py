@@ -62,8 +62,8 @@ class SurfacePart:
             unlike = torch.where(seen[1:-1, 1:-1], _unlike(points, normals, alpha), 0.0)
             added = self.options.surface_normals * _mean(unlike)
             apart = distances([camera], self.cameras, self.extent)[0]
-            apart[place] = np.inf
-            for other in np.argsort(apart, kind="stable")[:OTHERS]:
+            nearest = [int(other) for other in np.argsort(apart, kind="stable") if other != place]
+            for other in nearest[:OTHERS]:
                 error = torch.where(seen, self._error(points, camera, other), 0.0)
                 added = added + self.options.surface_views / OTHERS * _mean(error)
             nearness = torch.where(seen, 1 / depth.detach(), 0.0)[None, None]
@@ -90,8 +90,9 @@ class SurfacePart:
         return {"surface.kept": self.kept}
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Take them back."""
-        self.kept = torch.tensor(checkpoint.array("surface.kept", tuple(self.kept.shape)), device=self.kept.device)
+        """Take them back; none if the training went without this part until now."""
+        if "surface.kept" in checkpoint.arrays:
+            self.kept = torch.tensor(checkpoint.array("surface.kept", tuple(self.kept.shape)), device=self.kept.device)
 
 
 def _unlike(points: torch.Tensor, normals: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
@@ -102,6 +103,6 @@ def _unlike(points: torch.Tensor, normals: torch.Tensor, alpha: torch.Tensor) ->
 
 
 def _mean(values: torch.Tensor) -> torch.Tensor:
-    """In float64; values are from 0 to about 2."""
+    """In float64, 0 of none; values are from 0 to about 2."""
     # Now multiples of 2^-22, whose sum is exact, and the same in any order.
-    return (values + 3.0 - 3.0).double().mean()
+    return (values + 3.0 - 3.0).double().sum() / max(values.numel(), 1)
