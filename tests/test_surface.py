@@ -117,6 +117,19 @@ def test_the_same_bits_for_any_number_of_threads(scene, tmp_path, same_by_thread
     same_by_threads(trained)
 
 
+def test_views_of_one_step_take_other_pixels(scene, tmp_path):
+    """Of four, all pixels count, each once."""
+    trainer, _ = stepped(scene, tmp_path, 30, **{**SURFACE, "surface_views": 0.0})
+    view, counted = scene.train[3], 0
+    for place in range(4):
+        out = looked(trainer, view)
+        trainer.parts[0].loss(torch.zeros(()), out, Step(52, view, place)).backward()
+        rows, columns = np.nonzero(out.planes.grad[..., 0].numpy())
+        assert len(rows) and len({*(rows % 2)}) == len({*(columns % 2)}) == 1
+        counted |= 1 << int(2 * (rows[0] % 2) + columns[0] % 2)
+    assert counted == 15
+
+
 def test_it_asks_for_nothing_in_the_first_quarter(scene, tmp_path):
     trainer, _ = begin(scene, tmp_path, **SURFACE)
     asked = [trainer.parts[0].asks(trainer.options, Step(step, scene.train[0])).normals for step in (0, 1, 12, 13, 50)]
@@ -133,9 +146,10 @@ def test_two_tiny_photographs(scene, tmp_path):
     assert run.iteration == 20 and not trainer.parts[0].kept.any()
     steps(trainer, run, 24)
     part, tiny = trainer.parts[0], few.train[0].camera.resized(3, 5)
-    part.kept[0], part.kept[1] = torch.rand(128, 128), 0.0  # its own, with which it is not compared
+    compared = []  # not with itself
+    part._error = lambda points, camera, other: compared.append(other) or 0.0 * points[..., 0]
     out, _ = trainer._render(tiny, trainer.background, replace(trainer.options, normals=True))
-    assert part.loss(torch.zeros(()), out, Step(50, few.train[0])) == 0
+    assert part.loss(torch.zeros(()), out, Step(50, few.train[0])) == 0 and compared == [1]
 
 
 def test_what_it_cannot_work_with_is_one_sentence(scene, tmp_path):

@@ -72,7 +72,8 @@ class RasterOptions:
             GPU its own instruction, with an error of 2.4e-7, stands for 3 to 5.
         falloff: of your own instead of the Gaussian's, see :class:`warp_splat.Falloff`; not with adjoint "manual".
         median_depth: also return the depth per pixel at which half of the light is gone.
-        normals: also blend the Gaussians' normals: their shortest axes, towards the camera.
+        normals: also blend the Gaussians' normals, their shortest axes towards the camera, and how far from the camera
+            the planes across them are.
         strongest: also return which Gaussians weigh most in each pixel, so many of them, 0 to 8, and their weights.
         near: Gaussians whose center is nearer along the optical axis (of a wide lens: nearer) are left out, at least
             1e-6 [world units].

@@ -79,8 +79,8 @@ def measure(
             continue
         given, start = (workload, truth.weights.reshape(*shape, 3)), time.perf_counter()
         try:
-            answer = renderer.draw(*given)
-            if scene in REPEATED or time.perf_counter() - start < QUICK:
+            answer = renderer.draw(*given, RUNS if scene in REPEATED else 1)
+            if answer.runs == 1 and time.perf_counter() - start < QUICK:
                 answer = renderer.draw(*given, RUNS)
         except RendererFailed as error:
             failures += renderer.process is None

@@ -105,20 +105,20 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     setting, found = opened.setting, []
     options = replace(setting.options, strongest=STRONGEST_MOST)
     background = setting.background if setting.background.ndim == 1 else setting.background.new_zeros(3)
-    views, cameras = opened.scene.train, [view.camera for view in opened.scene.train]
+    cameras = [view.camera for view in opened.scene.train]
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
     if share * min(min(camera.width, camera.height) for camera in cameras) < LEAST:
         raise InputError(f"--memory: views of {LEAST} px and more do not fit into half of it; raise it.")
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
-        for view, camera in zip(views, cameras, strict=True):
+        for view, camera in zip(opened.scene.train, cameras, strict=True):
             if camera.lens is not None and camera.lens.family.around:
                 raise InputError("mesh: expected views of a plane to fuse, found a panorama; train on cube faces.")
             smaller = camera.resized(*(max(int(share * size), 1) for size in (camera.width, camera.height)))
             smaller = replace(smaller, lens=None, shutter=None)  # depths are drawn, not taken from photographs
             shown = render(gaussians, smaller, background, options)
             image = photographed(shown.image.cpu(), view, opened.exposures)
-            image = to_srgb(image.clamp_min(0), torch.where) if view.linear else image
+            image = to_srgb(image, torch.where) if view.linear else image
             found.append(Drawn(smaller, depth_of(shown, smaller).cpu(), image.contiguous()))
     return found
 

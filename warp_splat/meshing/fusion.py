@@ -51,10 +51,8 @@ def lens_of(camera: Camera) -> wp.vec4:
 
 def image_at(image: torch.Tensor, camera: Camera, mode: str = "nearest-exact") -> torch.Tensor:
     """An image [H, W, C] at the size of a camera's."""
-    planes = image.movedim(2, 0)[None]
-    return (
-        torch.nn.functional.interpolate(planes, (camera.height, camera.width), mode=mode)[0].movedim(0, 2).contiguous()
-    )
+    size = camera.height, camera.width
+    return torch.nn.functional.interpolate(image.movedim(2, 0)[None], size, mode=mode)[0].movedim(0, 2).contiguous()
 
 
 def depth_of(shown: RenderOutput, camera: Camera) -> torch.Tensor:

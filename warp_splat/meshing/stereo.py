@@ -57,9 +57,8 @@ def _small(view: Drawn, photograph: View) -> Drawn:
     gray = torch.from_numpy(photograph.picture).float().mean(2, keepdim=True) / 255
     if photograph.mask is not None:
         gray[torch.from_numpy(photograph.mask == 0)] = -1.0
-    return small._replace(
-        depth=image_at(view.depth[..., None], small.camera)[..., 0], image=image_at(gray, small.camera, "area")
-    )
+    depth = image_at(view.depth[..., None], small.camera)[..., 0]
+    return small._replace(depth=depth, image=image_at(gray, small.camera, "area"))
 
 
 def _nearness(planes: torch.Tensor, camera: Camera) -> torch.Tensor:

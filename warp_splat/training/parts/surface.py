@@ -23,7 +23,7 @@ from warp_splat.training.seams import Setting, Step
 
 BEGIN = 0.25  # share of the steps after which it counts
 OPAQUE, GRAZING = 0.5, 0.05  # alpha, and cosine between ray and normal, under which a pixel has no depth to speak of
-EVERY = 2  # of rows and columns one counts, another one in each step
+EVERY = 2  # of rows and columns one counts, another one in each view of a step
 OTHERS = 4  # views that one is compared with, those nearest to it
 SAME = 0.02  # share of a depth within which two views see the same place
 SIZE = 128  # edge of the map of depths that is kept of each view
@@ -51,10 +51,11 @@ class SurfacePart:
         if out.normals is None or out.planes is None:
             return loss
         with stage("surface"):
-            place, row, column = self.places[step.view], step.iteration // EVERY % EVERY, step.iteration % EVERY
+            place, turn = self.places[step.view], step.iteration + step.place
             camera = self.cameras[place].resized(*out.alpha.T.shape)
             planes = out.alpha.detach(), out.normals, out.planes[..., 0], rays(camera, out.alpha.device)
-            alpha, normals, plane, ray = (values[row::EVERY, column::EVERY] for values in planes)
+            counting = np.s_[turn // EVERY % EVERY :: EVERY, turn % EVERY :: EVERY]
+            alpha, normals, plane, ray = (values[counting] for values in planes)
             slope = (normals * ray).sum(-1)
             seen = (alpha > OPAQUE) & (slope < -GRAZING * alpha) & (plane < 0)
             depth = torch.where(seen, plane, -1.0) / torch.where(seen, slope, -1.0)
