@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from warp_splat.color import to_srgb
+from warp_splat.color import from_srgb, to_srgb
 from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
 from warp_splat.formats.exposures import Exposures
@@ -202,8 +202,20 @@ def trimesh_of(surface: Surface) -> Any:
 
 
 def exported(shape: Any, suffix: str) -> bytes:
-    """The bytes of a file of what trimesh holds; .glb in glTF's axes, as Gaussians are written."""
+    """The bytes of a file of what trimesh holds; .glb in glTF's axes, as Gaussians are written, and in linear light."""
+    more = {}
     if suffix.lower() == ".glb":
         shape = shape.copy().apply_transform(GLTF_AXES)
-    data = shape.export(file_type=suffix.lower()[1:])
+        if shape.visual.kind == "vertex":
+            colors = shape.visual.vertex_colors[:, :3] / np.float32(255)
+            shape.vertex_attributes["_COLOR_0"] = from_srgb(colors, np.where)
+            shape.visual = None
+            more["tree_postprocessor"] = _name_colors
+    data = shape.export(file_type=suffix.lower()[1:], **more)
     return data.encode() if isinstance(data, str) else data
+
+
+def _name_colors(tree: dict) -> None:
+    """As glTF does; trimesh itself writes them in 8 bits."""
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = attributes.pop("_COLOR_0")
