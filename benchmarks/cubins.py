@@ -63,6 +63,7 @@ def modules() -> dict[str, wp.Module]:
         "adjoint of intrinsics": adj_camera.make_adj_intrinsics(1).module,
         "shade": sh_colors.make_shade(1).module,
         "adjoint of shade": sh_colors.make_adj_shade(1).module,
+        "adjoint of coefficients": sh_colors.make_adj_rest().module,
         "quarantine": quarantine.module,
         "activate": make_activate(1).module,
         "adjoint of activate": make_adj_activate(1).module,

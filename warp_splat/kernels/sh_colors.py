@@ -168,3 +168,38 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
                     means_out[i] = wp.vec3(adj_x[lane], adj_y[lane], adj_z[lane])
 
     return adj_shade
+
+
+@functools.cache
+def make_adj_rest() -> wp.Kernel:
+    """Of a GPU, the gradients of all coefficients but the first, which threads then store side by side."""
+    evaluate = make_harmonics(1).evaluate
+    offsets = make_offsets(1)
+
+    @wp.kernel(module="unique", module_options=dict(OPTIONS))
+    def adj_rest(
+        first: int,  # coefficient of this launch
+        camera: CameraView,
+        means: wp.array[wp.vec3],  # [N]
+        radii: wp.array[int],  # [N]
+        colors: wp.array[wp.vec3],  # [N]
+        adj_colors: wp.array[wp.vec3],  # [N]
+        rest_out: wp.array2d[wp.vec3],  # [N, K - 1], zero as those of `adj_shade`
+    ):
+        i, mine = (first + wp.tid()) // rest_out.shape[1], (first + wp.tid()) % rest_out.shape[1]
+        adj = wp.vec3(0.0)
+        if radii[i] > 0:
+            if mine < camera.sh_degree * (camera.sh_degree + 2):
+                x, y, z = offsets(camera, means, i)
+                functions = evaluate(x, y, z)
+                function = float(0.0)
+                for k in range(15):  # an index that varies would put them in memory
+                    if k == mine:
+                        function = functions[k, 0]
+                for channel in range(3):
+                    if colors[i][channel] > 0.0:  # not cut to 0
+                        adj[channel] = adj_colors[i][channel]
+                adj = function * adj
+        rest_out[i, mine] = adj
+
+    return adj_rest

@@ -19,7 +19,7 @@ from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.lens import LIMIT
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import UNSEEN, make_project
-from warp_splat.kernels.sh_colors import make_adj_shade, make_shade
+from warp_splat.kernels.sh_colors import make_adj_rest, make_adj_shade, make_shade
 from warp_splat.kernels.simd import TYPES, vec16
 from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.lenses import Lens
@@ -228,8 +228,12 @@ class Project(torch.autograd.Function):
             tensors = (given.means, splats.colors, adj_splats.colors)
             means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
             inputs = [it.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
-            outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
+            by_number = lanes == 1 and rest.shape[1] > 0
+            outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest[:, :0] if by_number else adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
+            if by_number:
+                numbers = [it.cam, means, seen, colors, adj_colors], [view(adj_rest, wp.vec3)]
+                launch(make_adj_rest(), adj_rest[..., 0].numel(), *numbers, device=device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
             set_all(0, *shapes)
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
