@@ -113,6 +113,7 @@ def stages(scene: Scene, arch: int) -> dict[str, tuple[float, float]]:
         "adjoint of project": (
             (2 * SHAPE + SH + 32 + RADII) * n + (2 * GRADIENT + SH + SHAPE) * drawn + 48 * n,
             each(("adjoint of shade", "adj_shade"), ("project", "project, adjoint"))
+            + 15 * each(("adjoint of coefficients", "adj_rest"))
             + each(("quarantine", "quarantine"), ("adjoint of activate", "adj_activate")),
         ),
         "densify": (28 * n, each(("observe", "observe"))),

@@ -276,16 +276,14 @@ def _cameras() -> list[tuple]:
 def _cuda() -> list[tuple]:
     million = ("980 x 545", 1_000_000)
     small, large = (f.on_card("Training step", size, count)[0] for size, count in (("64 x 64", 100), million))
-    modes = f.on_card("Adjoints: time and memory", *million)
-    ours, theirs = f.on_card("Beside gsplat", *million)
+    huge = f.on_card("Training step", "980 x 545", 5_000_000)[0]
+    modes = f.on_card("Adjoints: time and memory", "980 x 545", 5_000_000)
+    kernels = {row["kernel"].split("__")[0]: float(row["ms per step"]) for row in f.on_card("Kernels of a step")}
+    (ours,) = f.on_card("Beside gsplat", *million)
     ways = [row["sum ms"] for row in f.on_card("Slots against atomics")]
     errors = [row for row in f.on_card("Adjoints: error against time", scene=f.MANY) if row["variant"] in f.MODES]
     shares = [row["share"].rstrip(" %") for row in f.on_card("Longest tile")]
-    adjoint_of_colors, adjoint_of_blend, adam = (
-        next(row for row in f.on_card("Kernels by ncu") if word in row["kernel"])
-        for word in ("adj_shade", "adj_blend", "adam")
-    )
-    own, other = (f.data("simulation_cuda")["rows"][place][2] for place in (0, 1))
+    own, apart, other = (f.data("simulation_cuda")["rows"][place][3] for place in range(3))
     return [
         ("the image is the CPU's within {}, the gradients within {},", *f.off_on_card()),
         (
@@ -293,37 +291,36 @@ def _cuda() -> list[tuple]:
             "it takes {} ms, its kernels {} ms.",
             *(row[what] for row in (small, large) for what in ("step ms", "kernels ms")),
         ),
+        ("five million the kernels are all there is: {} of {} ms.", huge["kernels ms"], huge["step ms"]),
         (
             "`manual` {} ms, `stepwise` {}, `reversible` {}, `stored` {} with {} MiB instead of {}.",
             *(row["forward + backward ms"] for row in modes),
             *(modes[place]["peak MiB"] for place in (3, 0)),
         ),
         ("at most {} of float64's", max((row["error"] for row in errors), key=float)),
-        ("which draws {} pictures a second without it", round(float(f.on_card("Orbit")[0]["frames per second"]))),
         (
-            "forward {} ms, gsplat {}; both passes {}, gsplat {}. What",
-            *(row[what] for what in ("forward ms", "forward + backward ms") for row in (ours, theirs)),
+            "it draws {} pictures a second without it and {} with it,",
+            *(round(float(row["frames per second"])) for row in f.on_card("Orbit")),
         ),
+        ("Now ours takes {} and {} ms, with no", ours["forward ms"], ours["forward + backward ms"]),
         (
             "take {} ms for the ball, atomic additions {}; for the crowd {} and {}. So",
             *(f.two(float(way)) for way in ways),
         ),
         (
-            "the first to mend: {} ms, at {} % of the card's bandwidth",
-            *(f.two(float(adjoint_of_colors["ms"])), adjoint_of_colors["% of bandwidth"]),
+            "Now a thread has one coefficient: {} ms instead of",
+            f.two(kernels["make_adj_shade"] + kernels["make_adj_rest"]),
         ),
-        ("The adjoint of the blend takes {} ms by ncu", f.two(float(adjoint_of_blend["ms"]))),
         (
-            "By events it is {} ms, and the longest tile, alone, takes {} % of that. Adam reaches {} % of",
+            "with Adam: {} and {} ms of a million. By events it is {} ms, and the longest tile, alone, takes {} % of",
+            *(f.two(kernels[name]) for name in ("make_reverse", "make_adam_by_number")),
             f.two(float(f.on_card("Longest tile")[0]["adjoint ms"])),
             shares[0],
-            adam["% of bandwidth"],
         ),
         ("the longest tile of the ball takes {} % of the adjoint's time, that of the crowd {} %;", *shares),
         (
-            "it drew {} pictures a second (after the first of the two changes), where Newton's own sensor "
-            "draws {} ([table]",
-            *map(f.thousands, (own, other)),
+            "it draws {} pictures a second in one pass, and {} if each view is a call; Newton's own sensor draws {} (",
+            *map(f.thousands, (own, apart, other)),
         ),
         ("the blend has {} registers and", f.registers("blend")[0]),
         ("shared memory, {} % of the threads of an sm_90 are resident", f.resident("blend")),

@@ -128,7 +128,7 @@ def in_simulation() -> None:
     world.add_shape_gaussian(world.add_body(mass=1.0), gaussian=splats)
     scene.add_shape_gaussian(-1, gaussian=splats)
     scene.replicate(world, 2)
-    card = wp.device_from_torch(torch.device("cuda"))
+    card = wp.device_from_torch(torch.device("cuda", 0))
     for device in (card, wp.get_device("cpu")):
         model = scene.finalize(device=device, requires_grad=True)
         sensor, state = SensorSplatCamera(model), model.state()
