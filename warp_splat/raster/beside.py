@@ -4,7 +4,9 @@ The color is blended first. These kernels repeat its weights, from what it has f
 cost nothing where they are not asked for. Channels go in groups, so that memory does not grow with their number.
 """
 
+from collections.abc import Iterator
 from functools import partial
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -22,6 +24,14 @@ from warp_splat.runtime.timers import stage
 
 WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
 MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them
+
+
+class Group(NamedTuple):
+    """Channels that a kernel takes at once."""
+
+    begin: int  # the first of them
+    count: int
+    rows: torch.Tensor  # of the splats [V, at once], filled up with zeros; [0, 0] where their weights are looked at
 
 
 def blend_beside(
@@ -79,7 +89,7 @@ def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, 
     ranks = torch.empty(*shape, most, dtype=torch.int32, device=device)
     weights = torch.empty(*shape, most, device=device)
     median = torch.empty(shape, dtype=torch.int32, device=device)
-    _launch(blending, weights, weights.new_empty(0, 0), strongest=(ranks, median))
+    _launch(blending, weights, Group(0, 0, weights.new_empty(0, 0)), (ranks, median))
     gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
     if most:
         weights = Weights.apply(splats.means2d, splats.conics, splats.opacities, weights, ranks, blending)
@@ -89,21 +99,14 @@ def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, 
     return gaussians, weights, median_depth.view(shape)
 
 
-def _launch(
-    blending: Blending,
-    pixels: torch.Tensor,
-    rows: torch.Tensor,
-    begin: int = 0,
-    group: int = 0,
-    strongest: tuple[torch.Tensor, torch.Tensor] | None = None,
-) -> None:
+def _launch(blending: Blending, pixels: torch.Tensor, group: Group, strongest: tuple[torch.Tensor, ...] = ()) -> None:
     """Fill ``pixels`` [H, W, C] with a group of channels; or, with ``strongest``, ranks and median, with weights."""
     new, (_, count) = partial(torch.empty, dtype=torch.int32, device=pixels.device), blending.view_walk()
     ranks, median = strongest or (new(0, 0, 0), new(0, 0))
     at_most = ranks.shape[2] if strongest else None
     kernel = blending.driver.kernels.channels.make_beside(variant_of(blending.options), at_most)
     inputs = [blending.bins.view(), alphas_of(blending.options), count, view(blending.steps, wp.int32)]
-    inputs += [view(rows, wp.float32), begin, group]
+    inputs += [view(group.rows, wp.float32), group.begin, group.count]
     outputs = [view(pixels, wp.float32), view(ranks, wp.int32), view(median, wp.int32)]
     blending.driver.launch_tiles(kernel, blending.bins, inputs, outputs)
 
@@ -156,8 +159,8 @@ class Channels(torch.autograd.Function):
     def forward(ctx, means2d, conics, opacities, features, blending):
         camera, driver, features = blending.camera, blending.driver, features.contiguous()
         image = features.new_empty(camera.height, camera.width, features.shape[1])
-        for begin, group, rows in _groups(blending.bins, features, driver):
-            _launch(blending, image, rows, begin, group)
+        for group in _groups(blending.bins, features, driver):
+            _launch(blending, image, group)
         ctx.save_for_backward(features)
         ctx.blending = blending
         return image
@@ -170,9 +173,9 @@ class Channels(torch.autograd.Function):
             adj_image = _without_bad(adj_image, ctx.blending)
             adj_features = torch.empty_like(features)
             total: list[torch.Tensor] = []
-            for begin, group, rows in _groups(ctx.blending.bins, features, ctx.blending.driver):
-                geometry, part = _differentiate(ctx.blending, rows, None, begin, group, adj_image)
-                adj_features[:, begin : begin + group] = part
+            for group in _groups(ctx.blending.bins, features, ctx.blending.driver):
+                geometry, part = _differentiate(ctx.blending, group, adj_image)
+                adj_features[:, group.begin : group.begin + group.count] = part
                 total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
         return *total, adj_features, None
 
@@ -191,20 +194,18 @@ class Weights(torch.autograd.Function):
     def backward(ctx, adj_weights):
         with stage("adjoint of channels"):
             (ranks,) = ctx.saved_tensors
-            rows = adj_weights.new_empty(0, 0)
-            adj_weights = _without_bad(adj_weights, ctx.blending)
-            geometry, _ = _differentiate(ctx.blending, rows, ranks, 0, ranks.shape[2], adj_weights)
+            group = Group(0, ranks.shape[2], adj_weights.new_empty(0, 0))
+            geometry, _ = _differentiate(ctx.blending, group, _without_bad(adj_weights, ctx.blending), ranks)
         return *geometry, None, None, None
 
 
-def _groups(bins: Bins, features: torch.Tensor, driver: Driver):
-    """For each group of channels: where it begins, and the splats' rows of it [V, at once], filled up with zeros."""
+def _groups(bins: Bins, features: torch.Tensor, driver: Driver) -> Iterator[Group]:
+    """The channels of ``features`` [N, C]."""
     gaussians, size = wp.to_torch(bins.gaussians).long(), driver.kernels.channels.AT_ONCE
     for begin in range(0, features.shape[1], size):
         part = features[:, begin : begin + size]
-        rows = features.new_zeros(len(gaussians), size)
-        rows[:, : part.shape[1]] = part[gaussians]
-        yield begin, part.shape[1], rows
+        count = part.shape[1]
+        yield Group(begin, count, torch.nn.functional.pad(part[gaussians], (0, size - count)))
 
 
 def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:
@@ -212,46 +213,38 @@ def absolute_gradients(channels: torch.Tensor, adj_pixels: torch.Tensor, blendin
 
     By all that a pixel blends: ``channels`` [N, C] of one group, with their upstream gradients [H, W, C].
     """
-    ((_, _, rows),) = _groups(blending.bins, channels, blending.driver)
-    adj_pixels = adj_pixels.contiguous().resolve_neg()
-    (means2d, *_), _ = _differentiate(blending, rows, None, 0, channels.shape[1], adj_pixels, "absolute")
+    (group,) = _groups(blending.bins, channels, blending.driver)
+    (means2d, *_), _ = _differentiate(blending, group, adj_pixels.contiguous().resolve_neg(), mode="absolute")
     return means2d
 
 
 def _differentiate(
-    blending: Blending,
-    rows: torch.Tensor,
-    ranks: torch.Tensor | None,
-    begin: int,
-    group: int,
-    adj_pixels: torch.Tensor,
-    mode: str = "",
+    blending: Blending, group: Group, adj_pixels: torch.Tensor, ranks: torch.Tensor | None = None, mode: str = ""
 ) -> tuple[list[torch.Tensor], torch.Tensor]:
-    """Gradients of means2d, conics and opacities, and those of a group of channels [N, group].
+    """Gradients of means2d, conics and opacities, and those of a group of channels [N, count].
 
     With ``ranks``, by the weights of those Gaussians instead of channels.
     """
     bins, options, driver = blending.bins, blending.options, blending.driver
     mode = mode or ("manual" if blending.adjoint == "manual" else "stepwise")
-    most, width = (0, next(width for width in WIDTHS if width >= group)) if ranks is None else (group, 0)
-    width = 0 if mode == "absolute" else width
+    most = 0 if ranks is None else group.count
+    width = 0 if most or mode == "absolute" else next(width for width in WIDTHS if width >= group.count)
     slots = _new_slots(bins, CHANNEL + width)
     kernel = driver.kernels.channels.make_adj_channels(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
     inputs = [bins.view(), alphas_of(options), *blending.view_walk(), view(blending.steps, wp.int32)]
-    inputs += [view(rows, wp.float32), view(ranks, wp.float32), begin, group, view(adj_pixels, wp.float32)]
-    driver.launch_tiles(kernel, bins, inputs, [view(slots, wp.float32)])
+    inputs += [view(group.rows, wp.float32), view(ranks, wp.float32), group.begin, group.count]
+    driver.launch_tiles(kernel, bins, [*inputs, view(adj_pixels, wp.float32)], [view(slots, wp.float32)])
     tables = [slots.new_empty(bins.gaussian_count, columns) for columns in (2, 3, 1, width) if columns]
     geometry = driver.gather(bins, slots, tables)[:3]
-    return geometry, tables[-1][:, :group]
+    return geometry, tables[-1][:, : group.count]
 
 
 def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
     """A row of gradients per tile instance. Raises InputError if there is no room for them."""
     count, device = len(bins.instances), bins.instances.device
     if (needed := 4 * count * columns) > MANY:
-        what = f"rasterize: the gradients of {count} tile instances take"
-        check_memory(what, needed, device, LESS)
+        check_memory(f"rasterize: the gradients of {count} tile instances take", needed, device, LESS)
     return torch.empty(count, columns, dtype=torch.float32, device=device)
 
 
