@@ -40,7 +40,7 @@ def dense(scene: Scene, count: int) -> Scene:
     drawn, found = [drawn for drawn, _ in views], []
     with patch.object(stereo, "TURNS", TURNS):
         for i, view in enumerate(drawn):
-            others = (drawn[j] for j in nearest_to(i, drawn))
+            others = nearest_to(i, drawn)
             facing = [o for o in others if o.camera.rotation[2] @ view.camera.rotation[2] > stereo.ALONG][:NEIGHBORS]
             planes = stereo._planes(view, torch.zeros_like(view.depth), facing, nearness)
             near_by = stereo._nearness(planes, view.camera)

@@ -20,7 +20,7 @@ from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.lenses import Lens
 from warp_splat.meshing.command import photographed, smoothed, surface_in, without_islands
-from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, fused, pixel, surface_of, voxels_of
+from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 from warp_splat.rendering.finished import as_photographed
 from warp_splat.scene.types import Decoded, View
@@ -53,7 +53,7 @@ def ball(index, radius=1.0):
 
 def surface(views):
     voxels = voxels_of(views, VOXEL)
-    return surface_of(voxels, *fused(views, voxels, VOXEL), VOXEL)
+    return surface_of(voxels, views, VOXEL)
 
 
 def test_a_ball():

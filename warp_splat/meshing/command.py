@@ -19,18 +19,7 @@ from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import (
-    Drawn,
-    Surface,
-    agreed,
-    closed,
-    depth_of,
-    fused,
-    image_at,
-    pixel,
-    surface_of,
-    voxels_of,
-)
+from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, image_at, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
@@ -157,10 +146,7 @@ def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: fl
 
 def surface_in(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, watertight: bool = False) -> Surface:
     """What is written, but for triangles that are too many; watertight, if ``voxels`` fill a box."""
-    field = [voxels, *fused(views, voxels, voxel)]
-    if watertight and (field[1].abs() < 1).any():
-        field = closed(*field)
-    return smoothed(without_islands(surface_of(*field, voxel)))
+    return smoothed(without_islands(surface_of(voxels, views, voxel, watertight)))
 
 
 def without_islands(surface: Surface) -> Surface:

@@ -74,10 +74,10 @@ def depth_of(shown: RenderOutput, camera: Camera) -> torch.Tensor:
     return torch.where(shown.alpha > 0.5, (along * mean).sum(-1) / (along * along).sum(-1), 0.0)
 
 
-def nearest_to(i: int, views: Sequence[Drawn]) -> list[int]:
+def nearest_to(i: int, views: Sequence[Drawn]) -> list[Drawn]:
     """The other views, those whose centers are nearest first."""
     distances = [np.sum((view.camera.center - views[i].camera.center) ** 2) for view in views]
-    return [int(j) for j in np.argsort(distances, kind="stable") if j != i]
+    return [views[j] for j in np.argsort(distances, kind="stable") if j != i]
 
 
 def relative(camera: Camera, other: Camera) -> tuple[wp.mat33, wp.vec3]:
@@ -92,7 +92,7 @@ def agreed(views: Sequence[Drawn], share: float = AGREEING) -> list[Drawn]:
     for i, view in enumerate(views):
         nearest = nearest_to(i, views)[:OTHERS]
         agreeing = torch.zeros(view.depth.numel(), dtype=torch.int32)
-        for other in (views[j] for j in nearest):
+        for other in nearest:
             depths = [launch.view(seen.depth, wp.float32) for seen in (view, other)]
             pose = relative(view.camera, other.camera)
             inputs = [TOLERANCE, *pose, lens_of(view.camera), lens_of(other.camera), *depths]
@@ -167,8 +167,11 @@ def closed(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor) 
     return [voxels[beside], distances.ravel()[beside], colors[nearest[beside]]]
 
 
-def surface_of(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor, voxel: float) -> Surface:
-    """Marching cubes in the cells of which all corners are seen: holes stay holes."""
+def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, watertight: bool = False) -> Surface:
+    """Marching cubes in the cells of which all corners are seen: holes stay holes, unless it is to be watertight."""
+    distances, colors = fused(views, voxels, voxel)
+    if watertight and (distances.abs() < 1).any():
+        voxels, distances, colors = closed(voxels, distances, colors)
     known = (~torch.isnan(distances)).nonzero()[:, 0]
     codes, order = torch.sort(code(voxels[known]))
     voxels, distances, colors = (values[known[order]] for values in (voxels, distances, colors))

@@ -36,8 +36,7 @@ def filled(views: Sequence[Drawn], kept: list[Drawn], photographs: Sequence[View
     near, far = (float(drawn.kthvalue(1 + int(share * len(drawn))).values) for share in (0.01, 0.99))
     small, found = [_small(view, photograph) for view, photograph in zip(views, photographs, strict=True)], []
     for i, (view, known) in enumerate(zip(tqdm(small, "comparing photographs", leave=False), kept, strict=True)):
-        nearest = (small[j] for j in nearest_to(i, small))
-        facing = [other for other in nearest if other.camera.rotation[2] @ view.camera.rotation[2] > ALONG]
+        facing = [other for other in nearest_to(i, small) if other.camera.rotation[2] @ view.camera.rotation[2] > ALONG]
         depth = image_at(known.depth[..., None], view.camera)[..., 0]
         planes = _planes(view, depth, facing[:LOOKED_IN], wp.vec2(1 / far / RANGE, RANGE / near))
         nearness = _nearness(image_at(planes, known.camera), known.camera)
