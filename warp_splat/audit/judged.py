@@ -73,21 +73,20 @@ def measure(
     failures = 0
     for scene in scenes:
         workload, truth = _truth(scene, background, degree)
-        shape = (workload.camera.height, workload.camera.width)
-        if failures >= HOPELESS:
-            yield SceneRow(scene, SCENES[scene][0], f"not tried after {HOPELESS} failures in a row", "error")
-            continue
-        given, start = (workload, truth.weights.reshape(*shape, 3)), time.perf_counter()
+        given = (workload, truth.weights.reshape(workload.camera.height, workload.camera.width, 3))
+        start = time.perf_counter()
         try:
+            if failures >= HOPELESS:
+                raise RendererFailed(f"not tried after {HOPELESS} failures in a row")
             answer = renderer.draw(*given, RUNS if scene in REPEATED else 1)
             if answer.runs == 1 and time.perf_counter() - start < QUICK:
                 answer = renderer.draw(*given, RUNS)
         except RendererFailed as error:
             failures += renderer.process is None
             yield SceneRow(scene, SCENES[scene][0], str(error), "error")
-            continue
-        failures = 0
-        yield _judge(scene, workload, truth, answer, options)
+        else:
+            failures = 0
+            yield _judge(scene, workload, truth, answer, options)
 
 
 def _judge(scene: str, workload: Workload, truth: Truth, answer: Answer, options: dict[str, Any]) -> SceneRow:

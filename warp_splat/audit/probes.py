@@ -32,6 +32,14 @@ KNOWN = {"1/255": 1 / 255, "1/512": 1 / 512} | {
 }
 
 
+def probe_camera(focal: float = FOCAL, seed: int | None = None, **pose) -> Camera:
+    """On whose axis CENTER lies; at the origin, unless a seed turns it."""
+    return make_camera(*PROBED, focal, seed=seed, **pose)
+
+
+PROBE = probe_camera()
+
+
 def srgb(linear: np.ndarray) -> np.ndarray:
     """Encoded for a screen."""
     return to_srgb(np.clip(linear, 0, 1), np.where)
@@ -40,15 +48,6 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 def decoded_srgb(shown: np.ndarray) -> np.ndarray:
     """The inverse of :func:`srgb`."""
     return from_srgb(np.clip(shown, 0, 1), np.where)
-
-
-def named_between(low: float, high: float) -> tuple[float, str]:
-    """The value in an interval, and its name: a known one if the interval holds it."""
-    for name, value in KNOWN.items():
-        if low * 0.999 <= value <= high * 1.001:
-            return value, name
-    middle = 0.5 * (low + high)
-    return middle, f"{middle:.3g}"
 
 
 @dataclass
@@ -66,9 +65,8 @@ class Prober:
     decoded: bool = False  # colors, before they are blended
     seen: float = SEEN[False]
 
-    def picture(self, arrays: dict[str, np.ndarray], background=(0.0, 0.0, 0.0), camera=None) -> np.ndarray:
+    def picture(self, arrays: dict[str, np.ndarray], background=(0.0, 0.0, 0.0), camera: Camera = PROBE) -> np.ndarray:
         """[H, W, 3] in the space in which it was blended."""
-        camera = camera or probe_camera()
         ring = CENTER + 4 * FOCAL * np.stack([np.cos(COMPANY), np.sin(COMPANY)], 1)
         company = balls(camera, ring, np.where(COMPANY % 2, 25.0, -25.0), 0.1, 0.01, 0.5)
         company["sh_rest"] = np.zeros((len(COMPANY), *arrays["sh_rest"].shape[1:]))
@@ -80,7 +78,7 @@ class Prober:
 
     def cover(self, pixels, depth, sigma, opacity) -> np.ndarray:
         """1 - T of green balls, [H, W]."""
-        return self.cover_of(balls(probe_camera(), np.asarray(pixels) - self.shift, depth, sigma, opacity, GREEN))
+        return self.cover_of(balls(PROBE, np.asarray(pixels) - self.shift, depth, sigma, opacity, GREEN))
 
     def cover_of(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
         """1 - T of what is green, [H, W]."""
@@ -91,9 +89,8 @@ class Prober:
         """What is blended of colors of the file."""
         return decoded_srgb(np.asarray(colors)) if self.decoded else np.asarray(colors)
 
-    def exact(self, arrays: dict[str, np.ndarray], camera=None, background=None, **view) -> oracle.Render:
+    def exact(self, arrays: dict[str, np.ndarray], camera: Camera = PROBE, background=None, **view) -> oracle.Render:
         """What float64 says of a probe, at the places where the renderer draws it."""
-        camera = camera or probe_camera()
         moved = replace(camera, cx=camera.cx + self.shift[0], cy=camera.cy + self.shift[1])
         arrays = arrays | {"scales": arrays["scales"] * NEARLY_ROUND}
         given = {name: torch.tensor(np.ascontiguousarray(array)) for name, array in arrays.items()}
@@ -105,17 +102,17 @@ class Prober:
     def alpha(self, sigma: float, opacity: float) -> np.ndarray:
         """Of a ball in the middle, [H, W], without thresholds."""
         thresholds = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0, "blur": self.options.get("blur", oracle.BLUR)}
-        ball = balls(probe_camera(), [CENTER - self.shift], 3.0, sigma, opacity, GREEN)
+        ball = balls(PROBE, [CENTER - self.shift], 3.0, sigma, opacity, GREEN)
         return self.exact(ball, **thresholds).alpha.numpy()
+
+    def measured(self, option: str, low: float, high: float) -> str:
+        """Sets an option to the middle of an interval, or to a known value that the interval holds; its name."""
+        known = [name for name, value in KNOWN.items() if low * 0.999 <= value <= high * 1.001]
+        self.options[option] = KNOWN[known[0]] if known else 0.5 * (low + high)
+        return known[0] if known else f"{self.options[option]:.3g}"
 
     def nearest(self, image: np.ndarray, candidates: dict[str, np.ndarray]) -> str:
         """The name of the candidate nearest to the picture; "other" if none is near."""
         errors = {name: float(np.abs(image - each).mean()) for name, each in candidates.items()}
-        best = min(errors, key=errors.__getitem__)
-        others = [error for name, error in errors.items() if name != best]
-        return best if errors[best] < 0.5 * min(others) else "other"
-
-
-def probe_camera(focal: float = FOCAL, seed: int | None = None, **pose) -> Camera:
-    """On whose axis CENTER lies; at the origin, unless a seed turns it."""
-    return make_camera(*PROBED, focal, seed=seed, **pose)
+        best, second = sorted(errors, key=errors.__getitem__)[:2]
+        return best if errors[best] < 0.5 * errors[second] else "other"

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import torch
 
-from warp_splat.audit.probes import CENTER, GREEN, PROBED, Prober, decoded_srgb, named_between, probe_camera, srgb
+from warp_splat.audit.probes import CENTER, GREEN, PROBE, PROBED, Prober, decoded_srgb, probe_camera, srgb
 from warp_splat.audit.renderer import Answer, RendererFailed
 from warp_splat.audit.small_scenes import balls
 from warp_splat.compare import oracle
@@ -20,7 +20,7 @@ SHOWN_AS = {"affine": "linearized at their center", "ellipsoid": "seen as ellips
 
 def find_background(prober: Prober) -> str:
     """What is behind everything, asked for light blue and for black."""
-    arrays = balls(probe_camera(), [CENTER], 3.0, 3.0, 0.9, GREEN)
+    arrays = balls(PROBE, [CENTER], 3.0, 3.0, 0.9, GREEN)
     asked, black = (prober.picture(arrays, background) for background in (ASKED, (0.0, 0.0, 0.0)))
     if not np.ptp(black, axis=(0, 1)).max() > 0:
         raise RendererFailed("shows nothing of a Gaussian in the middle, or numbers that are not finite")
@@ -37,15 +37,11 @@ def find_background(prober: Prober) -> str:
 def find_color_space(prober: Prober) -> str:
     """Whether and where the curve of sRGB is applied."""
     colors = np.array([0.2, 0.45, 0.7])
-    arrays = balls(probe_camera(), [CENTER], 3.0, 8.0, 0.7, colors)
+    arrays = balls(PROBE, [CENTER], 3.0, 8.0, 0.7, colors)
     image, exact = prober.picture(arrays), prober.exact(arrays)
     alpha, plain = exact.alpha.numpy()[..., None], exact.image.numpy()
-    candidates = {
-        "as they are": plain,
-        "encoded": srgb(plain),
-        "decoded": decoded_srgb(colors) * alpha + (1 - alpha) * prober.behind,
-        "in linear light": srgb(decoded_srgb(colors) * alpha + (1 - alpha) * prober.behind),
-    }
+    light = decoded_srgb(colors) * alpha + (1 - alpha) * prober.behind
+    candidates = {"as they are": plain, "encoded": srgb(plain), "decoded": light, "in linear light": srgb(light)}
     found = prober.nearest(image, candidates)
     prober.encoded, prober.decoded = found in ("encoded", "in linear light"), found in ("decoded", "in linear light")
     return {
@@ -67,11 +63,12 @@ def find_low_pass(prober: Prober) -> str:
         return "A Gaussian of half a pixel is as strong beside its pixel as in it: the low-pass filter was not found."
     variance = 0.5 / np.log(height / beside)
     blur, step = variance - 0.25, 4 * prober.seen / beside * variance
-    value, name = named_between(blur - step, blur + step)
+    name = prober.measured("blur", blur - step, blur + step)
+    prober.options["blur"] = max(prober.options["blur"], 1e-6)
     share = height / 0.9
     wanted = 0.25 / variance
     antialiased = abs(share - wanted) < abs(share - 1)
-    prober.options |= {"blur": max(value, 1e-6), "antialiasing": bool(antialiased and blur > 0.02)}
+    prober.options["antialiasing"] = bool(antialiased and blur > 0.02)
     if abs(share - (wanted if antialiased else 1)) > 0.05:
         prober.sentences["antialiasing"] = f"A Gaussian of half a pixel has {share:.2f} of its opacity."
     elif prober.options["antialiasing"]:
@@ -91,14 +88,12 @@ def find_cut(prober: Prober) -> str:
         gone = alpha[~drawn & (32 * alpha > 2 * max(prober.seen, 1e-3 * alpha.max()))]
         edges.append((gone.max(initial=0.0), alpha[drawn].min(initial=1.0)))
     (low, high), other = edges
+    prober.options["alpha_min"] = 0.0
     if low == 0:
-        prober.options["alpha_min"] = 0.0
         return f"No alpha is left out, down to {max(high, prober.seen / 32):.1g}."
     if not 0.8 < other[0] / low < 1.25:  # not by alpha: see find_extent
-        prober.options["alpha_min"] = 0.0
         return f"No alpha is left out for being faint, down to {min(high, other[1]):.1g}."
-    value, name = named_between(min(low, high), max(low, high))
-    prober.options["alpha_min"] = value
+    name = prober.measured("alpha_min", min(low, high), max(low, high))
     return f"An alpha below {name} is left out."
 
 
@@ -125,8 +120,7 @@ def find_clamp(prober: Prober) -> str:
     if top > OPAQUE - 2 * step:
         prober.options["alpha_max"] = 0.9999
         return f"Alpha is not clamped below {OPAQUE - 2 * step:.4g}."
-    value, name = named_between(top - step, min(top + step, 1))
-    prober.options["alpha_max"] = value
+    name = prober.measured("alpha_max", top - step, min(top + step, 1))
     return f"Alpha is clamped at {name}."
 
 
@@ -137,8 +131,7 @@ def find_stop(prober: Prober) -> str:
     if left < max(2 * prober.seen, 2e-7):
         prober.options["t_min"] = 0.0 if prober.seen < 1e-6 else oracle.STOP
         return f"A pixel does not stop while its transmittance is above {max(left, prober.seen):.1g}."
-    value, name = named_between(0.9 * left, left)
-    prober.options["t_min"] = value
+    name = prober.measured("t_min", 0.9 * left, left)
     return f"A pixel stops where its transmittance would fall below {name}."
 
 
@@ -154,15 +147,14 @@ def find_near(prober: Prober) -> str:
     if not drawn.any():
         return "Nothing nearer than 1.5 is drawn."
     low, high = depths[~drawn].max(), depths[drawn].min()
-    value, name = named_between(low, high)
-    prober.options["near"] = value
+    name = prober.measured("near", low, high)
     return f"Gaussians nearer than about {name} are left out (between {low:g} and {high:g})."
 
 
 def find_rotation(prober: Prober) -> str:
     """In which order the numbers of a rotation are read."""
     color = np.array([0.9, 0.6, 0.3])
-    arrays = balls(probe_camera(), [CENTER], 3.0, 5.0, 0.8, color) | {"scales": np.array([[0.6, 0.15, 0.05]])}
+    arrays = balls(PROBE, [CENTER], 3.0, 5.0, 0.8, color) | {"scales": np.array([[0.6, 0.15, 0.05]])}
     quat = np.array([0.8, 0.1, 0.3, 0.5]) / np.linalg.norm([0.8, 0.1, 0.3, 0.5])
     image = prober.picture(arrays | {"quats": quat[None]})
     arrays |= {"sh_dc": (prober.blended(color)[None, None] - 0.5) / SH_C0}
@@ -196,8 +188,7 @@ def find_harmonics(prober: Prober) -> str:
         if abs(found[k] - basis[k, k]) < 0.02:
             continue
         near = {sign * j: abs(found[k] - sign * basis[k, j]) for j in range(1, count) for sign in (1, -1)}
-        best = min(near, key=near.__getitem__)
-        best = -k if near[-k] < 0.02 else best
+        best = -k if near[-k] < 0.02 else min(near, key=near.__getitem__)
         what = "has the other sign" if best == -k else f"is taken for {'-' * (best < 0)}{abs(best)}"
         wrong.append(f"{k} {'is not seen' if abs(found[k]) < 0.004 else what if near[best] < 0.02 else 'is another'}")
     if wrong:
@@ -219,8 +210,8 @@ def find_sort(prober: Prober) -> str:
         return -1 if found == "other" else int(found)
 
     colors = np.array([[0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
-    arrays = balls(probe_camera(), [CENTER, CENTER], [3.0, 4.0], 8.0, 0.7, colors)
-    both = front(0, 1, probe_camera()), front(1, 0, probe_camera())
+    arrays = balls(PROBE, [CENTER, CENTER], [3.0, 4.0], 8.0, 0.7, colors)
+    both = front(0, 1, PROBE), front(1, 0, PROBE)
     if both != (0, 1):
         return {
             (0, 0): "Gaussians are not sorted: the first in the file is in front.",
@@ -245,7 +236,7 @@ def find_pixels(prober: Prober) -> str:
         shares = [cover * (np.maximum(*np.abs([x - int(a) - 0.5, y - int(b) - 0.5])) < 9) for a, b in places]
         return np.array([[(share * x).sum() / share.sum(), (share * y).sum() / share.sum()] for share in shares])
 
-    arrays = balls(probe_camera(), places, [3.0, 3.5, 4.0], 2.0, 0.9, GREEN)
+    arrays = balls(PROBE, places, [3.0, 3.5, 4.0], 2.0, 0.9, GREEN)
     seen = centers(prober.cover_of(arrays).clip(0))
     offsets = {how: seen - centers(prober.exact(arrays, projection=how).alpha.numpy()) for how in SHOWN_AS}
     how = min(offsets, key=lambda how: np.ptp(offsets[how], axis=0).max())
