@@ -26,13 +26,6 @@ LARGE = 0.1  # error in 1 / extent, from which on it costs hardly more: points t
 OPAQUE = 0.5  # alpha under which a pixel has no depth to speak of
 
 
-class Known(NamedTuple):
-    """Depths in one photograph."""
-
-    places: np.ndarray  # [M, 2] x and y as shares of its width and height
-    nearness: np.ndarray  # [M] 1 / depth, in 1 / extent
-
-
 class Target(NamedTuple):
     """Depths in an image of some size."""
 
@@ -52,7 +45,7 @@ class Depth:
             raise InputError("--depth_l1_weight_final: expected a positive number, since weights fall to it, got 0.")
         self.points = {view: points_in(view, setting.scene) for view in setting.scene.train}
         self.maps = read_inverse_depths(setting.scene, options.depths) if options.depths else {}
-        if not self.maps and not any(len(known.nearness) for known in self.points.values()):
+        if not self.maps and not any(len(places) for places, _ in self.points.values()):
             raise InputError(
                 "--parts depth: expected a scene that says which points its photographs saw, as COLMAP's does, found "
                 "none; leave it out, or name maps with --depths."
@@ -99,8 +92,8 @@ class Depth:
 
     def _points_at(self, view: View, height: int, width: int) -> Target | None:
         """Of two points in a pixel the nearer one."""
-        row, column = _pixels(self.points[view].places, height, width)
-        nearness = self.points[view].nearness
+        places, nearness = self.points[view]
+        row, column = _pixels(places, height, width)
         nearest = np.argsort(-nearness, kind="stable")
         pixels, first = np.unique((row * width + column)[nearest], return_index=True)
         nearness = torch.from_numpy(nearness[nearest][first].astype(np.float32)).to(self.device)
@@ -115,8 +108,12 @@ class Depth:
         return Target(slice(None), torch.from_numpy(nearness.reshape(-1)).to(self.device))
 
 
-def points_in(view: View, scene: Scene) -> Known:
-    """The points that structure from motion saw in a photograph, where its camera shows them."""
+def points_in(view: View, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Where a photograph shows the points that structure from motion saw in it, and how near they are.
+
+    Returns:
+        [M, 2] x and y as shares of its width and height, and [M] 1 / depth, in 1 / extent.
+    """
     camera, seen = view.camera, scene.tracks.get(view.name)
     points = seen.points[visible(camera, seen.points)] if seen else np.empty((0, 3))
     inside = (camera.rotation[:, :, None] * points.T).sum(1).T + camera.translation
@@ -126,7 +123,7 @@ def points_in(view: View, scene: Scene) -> Known:
     if view.mask is not None:
         counts = view.mask[_pixels(places, camera.height, camera.width)] > 0
         places, depths = places[counts], depths[counts]
-    return Known(places, scene.extent / depths)
+    return places, scene.extent / depths
 
 
 def _pixels(places: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
