@@ -5,7 +5,6 @@ cost nothing where they are not asked for. Channels go in groups, so that memory
 """
 
 from collections.abc import Iterator
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -101,8 +100,8 @@ def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, 
 
 def _launch(blending: Blending, pixels: torch.Tensor, group: Group, strongest: tuple[torch.Tensor, ...] = ()) -> None:
     """Fill ``pixels`` [H, W, C] with a group of channels; or, with ``strongest``, ranks and median, with weights."""
-    new, (_, count) = partial(torch.empty, dtype=torch.int32, device=pixels.device), blending.view_walk()
-    ranks, median = strongest or (new(0, 0, 0), new(0, 0))
+    none, (_, count) = torch.empty(0, 0, 0, dtype=torch.int32, device=pixels.device), blending.view_walk()
+    ranks, median = strongest or (none, none.flatten(1))
     at_most = ranks.shape[2] if strongest else None
     kernel = blending.driver.kernels.channels.make_beside(variant_of(blending.options), at_most)
     inputs = [blending.bins.view(), alphas_of(blending.options), count, view(blending.steps, wp.int32)]
@@ -223,29 +222,24 @@ def _differentiate(
 ) -> tuple[list[torch.Tensor], torch.Tensor]:
     """Gradients of means2d, conics and opacities, and those of a group of channels [N, count].
 
-    With ``ranks``, by the weights of those Gaussians instead of channels.
+    With ``ranks``, by the weights of those Gaussians instead of channels. Raises InputError if there is no room.
     """
     bins, options, driver = blending.bins, blending.options, blending.driver
     mode = mode or ("manual" if blending.adjoint == "manual" else "stepwise")
     most = 0 if ranks is None else group.count
     width = 0 if most or mode == "absolute" else next(width for width in WIDTHS if width >= group.count)
-    slots = _new_slots(bins, CHANNEL + width)
+    count, columns = len(bins.instances), CHANNEL + width
+    if (needed := 4 * count * columns) > MANY:
+        check_memory(f"rasterize: the gradients of {count} tile instances take", needed, bins.instances.device, LESS)
+    slots = adj_pixels.new_empty(count, columns)  # a row per tile instance
     kernel = driver.kernels.channels.make_adj_channels(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
     inputs = [bins.view(), alphas_of(options), *blending.view_walk(), view(blending.steps, wp.int32)]
     inputs += [view(group.rows, wp.float32), view(ranks, wp.float32), group.begin, group.count]
     driver.launch_tiles(kernel, bins, [*inputs, view(adj_pixels, wp.float32)], [view(slots, wp.float32)])
-    tables = [slots.new_empty(bins.gaussian_count, columns) for columns in (2, 3, 1, width) if columns]
+    tables = [slots.new_empty(bins.gaussian_count, size) for size in (2, 3, 1, width) if size]
     geometry = driver.gather(bins, slots, tables)[:3]
     return geometry, tables[-1][:, : group.count]
-
-
-def _new_slots(bins: Bins, columns: int) -> torch.Tensor:
-    """A row of gradients per tile instance. Raises InputError if there is no room for them."""
-    count, device = len(bins.instances), bins.instances.device
-    if (needed := 4 * count * columns) > MANY:
-        check_memory(f"rasterize: the gradients of {count} tile instances take", needed, device, LESS)
-    return torch.empty(count, columns, dtype=torch.float32, device=device)
 
 
 def _without_bad(adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:
