@@ -221,11 +221,9 @@ def find_sort(prober: Prober) -> str:
     wide = probe_camera(30.0)
     arrays = balls(wide, [[56.5, 30.5], [24.5, 19.5]], [3.0, 3.3], [14.0, 16.0], 0.7, colors)
     arrays["scales"] = arrays["scales"] * [1.0, 1.0, 0.1]  # balls as large would reach behind the camera
-    key = front(0, 1, wide), front(1, 0, wide)
-    return {
-        (0, 1): "Gaussians are sorted by depth along the axis.",
-        (1, 0): "Gaussians are sorted by distance from the camera.",
-    }.get(key, "Gaussians are sorted by depth, and by neither the axis nor the distance alone.")
+    keys = {(0, 1): "depth along the axis", (1, 0): "distance from the camera"}
+    key = keys.get((front(0, 1, wide), front(1, 0, wide)), "depth, and by neither the axis nor the distance alone")
+    return f"Gaussians are sorted by {key}."
 
 
 def find_pixels(prober: Prober) -> str:
