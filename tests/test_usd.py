@@ -4,6 +4,7 @@ import os
 import shlex
 import subprocess
 import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -179,6 +180,13 @@ def test_refused_in_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     refuse("need the package usd-core; `pip install")
     refusal(lambda: save_gaussians(tmp_path / "b.usdz", some_file()), "need the package usd-core")
+
+
+def test_a_package_does_not_tell_when_it_was_written(tmp_path):
+    save_gaussians(tmp_path / "a.usdz", some_file())
+    with zipfile.ZipFile(tmp_path / "a.usdz") as package:
+        (stage,) = package.infolist()
+    assert stage.date_time[:2] == (1989, 1)
 
 
 @pytest.mark.parametrize("ending", [".usda", ".usdz"])
