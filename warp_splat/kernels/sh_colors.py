@@ -184,7 +184,8 @@ def make_adj_rest() -> wp.Kernel:
         radii: wp.array[int],  # [N]
         colors: wp.array[wp.vec3],  # [N]
         adj_colors: wp.array[wp.vec3],  # [N]
-        rest_out: wp.array2d[wp.vec3],  # [N, K - 1], zero as those of `adj_shade`
+        # out: gradients, zero as those of `adj_shade`
+        rest_out: wp.array2d[wp.vec3],  # [N, K - 1]
     ):
         i, mine = (first + wp.tid()) // rest_out.shape[1], (first + wp.tid()) % rest_out.shape[1]
         adj = wp.vec3(0.0)
