@@ -405,6 +405,11 @@ def test_refused_in_one_sentence(simulation):
         lambda: update(**images(2, color_image=wp.vec3)), match=r"color_image: expected .* of uint32, got .* of vec3f"
     )
     refusal(lambda: simulation.sensor.update(state, transforms, [camera]), "camera: expected one, or 2 of one size")
+    for wrong in (7, [camera, None]):
+        refusal(lambda wrong=wrong: simulation.sensor.update(state, transforms, wrong), "camera: expected a warp_splat")
+    refusal(lambda: simulation.sensor.update(state, np.zeros((2, 7)), camera), "expected a Warp array of transforms")
+    refusal(partial(update, rgb_image=np.zeros(3)), "rgb_image: expected (2, 32, 40) of vec3f, got ndarray")
+    refusal(lambda: SensorSplatCamera(simulation.model, background=0), "background: expected three numbers")
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
     refusal(partial(update, shape_index_image=named, mesh_index=named), "mesh_index: expected mesh_depth beside it")
     for worlds in ([0, 2], [0.5, 1.0], [0], 1):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
 from warp_splat import tape
@@ -21,7 +22,7 @@ from warp_splat.errors import InputError, imported
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.stored import sigmoid, unit_quats
 from warp_splat.kernels.place import ShapeView, make_place, name_shapes, put_among_meshes
-from warp_splat.raster.checks import check_options
+from warp_splat.raster.checks import check_background, check_options
 from warp_splat.raster.worlds import takes
 from warp_splat.runtime.launch import launch_on_tape, open_tape
 
@@ -71,7 +72,7 @@ class SensorSplatCamera:
 
     Raises:
         InputError: if the model has no Gaussian shape, or one with a scale that is not the same along all axes; for an
-            option that there is not.
+            option or a background that there is not.
     """
 
     def __init__(
@@ -83,7 +84,8 @@ class SensorSplatCamera:
         adjoint: str = "manual",
     ):
         self.model, self.device, self.adjoint = model, model.device, adjoint
-        self.background, self.options = wp.vec3(*background), check_options(adjoint, options)
+        self.background = wp.vec3(*check_background(background, torch.device("cpu")).tolist())
+        self.options = check_options(adjoint, options)
         self._layout_of, self._owners_of = _kept(self._layout), _kept(self._find_owners)
         self._places_of = lru_cache(PLACES)(self._places)
         bodies, worlds = model.shape_body.numpy(), model.shape_world.numpy()
@@ -142,21 +144,27 @@ class SensorSplatCamera:
             world_indices: world of each view, which the host reads; by default view i is world i.
 
         Raises:
-            InputError: if an image is of another shape, one of meshes has no depth, or a view is of no world.
+            InputError: if an image is of another shape, one of meshes has no depth, a view is of no world, or an
+                argument is of another type.
         """
         given = {"rgb_image": rgb_image, "color_image": color_image, "forward_depth_image": forward_depth_image}
         given |= {"shape_index_image": shape_index_image}
         given |= {"mesh_color": mesh_color, "mesh_depth": mesh_depth, "mesh_index": mesh_index}
         given = {name: array for name, array in given.items() if array is not None}
-        cameras = [camera] * len(camera_transforms) if isinstance(camera, Camera) else list(camera)
+        if getattr(camera_transforms, "dtype", None) is not wp.transform:
+            found = type(camera_transforms).__name__
+            raise InputError(f"camera_transforms: expected a Warp array of transforms, got {found}.")
+        cameras = list(camera) if isinstance(camera, Sequence) else [camera] * len(camera_transforms)
+        if others := [type(one).__name__ for one in cameras if not isinstance(one, Camera)]:
+            raise InputError(f"camera: expected a warp_splat.Camera, or a list of them, got {others[0]}.")
         sizes = {(one.height, one.width) for one in cameras}
         if len(cameras) != (count := len(camera_transforms)) or len(sizes) != 1:
             raise InputError(f"camera: expected one, or {count} of one size, got {len(cameras)} of {len(sizes)} sizes.")
         shape = (*camera_transforms.shape[::-1], *sizes.pop())  # pyright: ignore[reportAttributeAccessIssue]
         for name, array in given.items():
-            kind = KINDS.get(name, wp.uint32)
-            if (array.shape, array.dtype) != (shape, kind):
-                found = f"{array.shape} of {array.dtype.__name__}"
+            kind, is_array = KINDS.get(name, wp.uint32), isinstance(array, wp.array)
+            if not is_array or (array.shape, array.dtype) != (shape, kind):
+                found = f"{array.shape} of {array.dtype.__name__}" if is_array else type(array).__name__
                 raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
             if name in ("mesh_color", "mesh_index") and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
