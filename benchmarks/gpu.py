@@ -136,7 +136,9 @@ def check_by_sanitizer(results: Results) -> None:
     for tool in TOOLS:
         command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", *WARPS, sys.executable]
         command += [__file__, "--small"]
-        results.attempt(tool, lambda tool=tool, command=command: run_checked(results, tool, command, PATIENCE), 30)
+        results.attempt(
+            tool, lambda tool=tool, command=command: run_checked(results, tool, command, PATIENCE), 30, True
+        )
 
 
 def measure(results: Results, device: str, real: bool, check_more: Callable[[], None]) -> None:
@@ -241,10 +243,10 @@ def main() -> None:
 
     def check_more() -> None:
         if real:
-            results.attempt("pytest", lambda: run_checked(results, "pytest", tests), 60)
+            results.attempt("pytest", lambda: run_checked(results, "pytest", tests), 60, True)
             check(results, device, case, {} if apart else expectation(arguments.expected, case))
 
-    results.attempt("first call", lambda: run_checked(results, "first call", first), 10)
+    results.attempt("first call", lambda: run_checked(results, "first call", first), 10, True)
     with driver:
         results.attempt("self-test", lambda: test_itself(results, device), 10)
         if device == "cuda":

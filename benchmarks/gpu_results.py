@@ -73,14 +73,17 @@ class Results:
         """A row of the checks; one that fails stops nothing, for a card may be at hand only now, but ends in code 1."""
         self.add("Checks", [(what, found if right else f"WRONG: {found}")])
 
-    def attempt(self, what: str, run: Callable[[], None], needs: float) -> None:
-        """Run, if ``needs`` seconds are left; what runs out of memory is a row, too."""
+    def attempt(self, what: str, run: Callable[[], None], needs: float, starts: bool = False) -> None:
+        """Run, if ``needs`` seconds are left; what runs out of memory is a row, too.
+
+        What ``starts`` a process itself needs no other around it, which takes nine seconds to begin on a GPU machine.
+        """
         if self.only and what != self.only:
             return
         if self.left < needs:
             self.add("Left out", [(what, "no time left")])
             return
-        if self.apart:
+        if self.apart and not starts:
             self._start(what)
             return
         start = time.monotonic()

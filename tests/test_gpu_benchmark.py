@@ -136,6 +136,9 @@ def test_an_attempt_in_a_process_of_its_own_ends_no_other():
     results.attempt("that", lambda: pytest.fail("was run here"), needs=1)
     assert results.tables["Checks"] == [["this", "WRONG: 1"], ("that", "WRONG: illegal address")]
     assert results.wrong == ["this", "that"]
+    end = [sys.executable, "-c", "raise SystemExit('illegal address')"]
+    results.attempt("tests", lambda: gpu.run_checked(results, "tests", end), needs=1, starts=True)
+    assert results.tables["Checks"][2:] == [("tests", "WRONG: illegal address")]
 
 
 def test_what_is_stored_is_what_the_cpu_says():
