@@ -165,13 +165,15 @@ def write_summary(out: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("targets", nargs="*", default=list(ALL))
-    parser.add_argument("--scenes", nargs="*", default=list(SCENES))
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=SCENES, metavar="SCENE")
     parser.add_argument("--more", action="store_true", help="keep what was measured of the same version, add the rest")
     parser.add_argument("--pictures", type=int, default=PICTURES, help="of three Gaussians, for the camera")
     parser.add_argument("--out", type=Path, default=Path("docs/benchmarks"))
     arguments = parser.parse_args()
     if unknown := [name for name in arguments.targets if name not in ALL]:
         parser.error(f"expected targets among {', '.join(ALL)}, found {', '.join(unknown)}")
+    if arguments.pictures < 2:
+        parser.error(f"--pictures: expected 2 or more, found {arguments.pictures}")
     for name in arguments.targets:
         measured(name, arguments.scenes, arguments.out, arguments.more, arguments.pictures)
     write_summary(arguments.out)

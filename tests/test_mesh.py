@@ -272,12 +272,13 @@ def test_fewer_triangles_than_there_can_be(model, scene, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_convex_pieces(model, scene, tmp_path):
+@pytest.mark.parametrize("ending", [".obj", ".ply", ".glb"])
+def test_convex_pieces(model, scene, tmp_path, ending):
     pytest.importorskip("vhacdx", reason="no vhacdx: pip install 'warp-splat[mesh]'")
     path, radius, _center = model
-    arguments = [str(path), str(tmp_path / "ball.obj"), "-s", scene, "--triangles", "400"]
+    arguments = [str(path), str(tmp_path / f"ball{ending}"), "-s", scene, "--triangles", "400"]
     assert main(["mesh", *arguments, "--collision", "2"]) == 0
-    pieces = trimesh.load(tmp_path / "ball_collision.obj", force="mesh").split()
+    pieces = trimesh.load(tmp_path / f"ball_collision{ending}", force="mesh").split()
     assert 1 <= len(pieces) <= 2 and all(piece.is_convex for piece in pieces)
     volume = sum(piece.volume for piece in pieces)
     assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.3)
