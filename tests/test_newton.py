@@ -409,6 +409,7 @@ def test_refused_in_one_sentence(simulation):
         refusal(lambda wrong=wrong: simulation.sensor.update(state, transforms, wrong), "camera: expected a warp_splat")
     refusal(lambda: simulation.sensor.update(state, np.zeros((2, 7)), camera), "expected a Warp array of transforms")
     refusal(partial(update, rgb_image=np.zeros(3)), "rgb_image: expected (2, 32, 40) of vec3f, got ndarray")
+    refusal(lambda: simulation.sensor.update(empty.state(), transforms, camera), "state: expected one of the model's")
     refusal(lambda: SensorSplatCamera(simulation.model, background=0), "background: expected three numbers")
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
     refusal(partial(update, shape_index_image=named, mesh_index=named), "mesh_index: expected mesh_depth beside it")

@@ -9,6 +9,7 @@ The schema has no word for Mip-Splatting, nor for where in the world a scene is:
 # usd-core has no types
 import json
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,7 +32,7 @@ HINTS = {"projectionModeHint": "perspective", "sortingModeHint": "zDepth"}  # wh
 MOST_DEGREE = 10  # of harmonics that are read, of which the first 3 are kept
 FINITE = float(np.finfo(np.float32).max)
 REACH = 3  # standard deviations within the extent
-PACKED_AT = 600_000_000  # s since 1970, the time that a package tells: the same bytes whenever it is written
+PACKED_AT = (1989, 1, 5, 0, 0, 0, 0, 0, 0)  # local time that a package tells: the same bytes, whenever it is written
 
 
 def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
@@ -78,7 +79,7 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
             inner = f"{folder}/gaussians.usdc" if package else str(temporary)
             written = layer.Export(inner)
             if package:
-                os.utime(inner, (PACKED_AT, PACKED_AT))
+                os.utime(inner, 2 * (time.mktime(PACKED_AT),))
                 written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary))
             if not written:
                 raise OSError("by USD")

@@ -151,7 +151,10 @@ class SensorSplatCamera:
         given |= {"shape_index_image": shape_index_image}
         given |= {"mesh_color": mesh_color, "mesh_depth": mesh_depth, "mesh_index": mesh_index}
         given = {name: array for name, array in given.items() if array is not None}
-        if getattr(camera_transforms, "dtype", None) is not wp.transform:
+        bodies = 0 if (placed := getattr(state, "body_q", None)) is None else len(placed)
+        if bodies < self.model.body_count:
+            raise InputError(f"state: expected one of the model's, of {self.model.body_count} bodies, got {bodies}.")
+        if not isinstance(camera_transforms, wp.array) or camera_transforms.dtype is not wp.transform:
             found = type(camera_transforms).__name__
             raise InputError(f"camera_transforms: expected a Warp array of transforms, got {found}.")
         cameras = list(camera) if isinstance(camera, Sequence) else [camera] * len(camera_transforms)
