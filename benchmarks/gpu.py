@@ -23,6 +23,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -136,9 +137,8 @@ def check_by_sanitizer(results: Results) -> None:
     for tool in TOOLS:
         command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", *WARPS, sys.executable]
         command += [__file__, "--small"]
-        results.attempt(
-            tool, lambda tool=tool, command=command: run_checked(results, tool, command, PATIENCE), 30, True
-        )
+        run = partial(run_checked, results, tool, command, PATIENCE)
+        results.attempt(tool, run, 30, starts=True)
 
 
 def measure(results: Results, device: str, real: bool, check_more: Callable[[], None]) -> None:
@@ -243,10 +243,10 @@ def main() -> None:
 
     def check_more() -> None:
         if real:
-            results.attempt("pytest", lambda: run_checked(results, "pytest", tests), 60, True)
+            results.attempt("pytest", lambda: run_checked(results, "pytest", tests), 60, starts=True)
             check(results, device, case, {} if apart else expectation(arguments.expected, case))
 
-    results.attempt("first call", lambda: run_checked(results, "first call", first), 10, True)
+    results.attempt("first call", lambda: run_checked(results, "first call", first), 10, starts=True)
     with driver:
         results.attempt("self-test", lambda: test_itself(results, device), 10)
         if device == "cuda":

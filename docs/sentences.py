@@ -304,7 +304,7 @@ def _cuda() -> list[tuple]:
         ),
         ("Now ours takes {} and {} ms, with no", ours["forward ms"], ours["forward + backward ms"]),
         (
-            "take {} ms for the ball, atomic additions {}; for the crowd {} and {}. So",
+            "take {} ms for the ball, atomic additions {}; for the crowd {} and {}; on",
             *(f.two(float(way)) for way in ways),
         ),
         (
@@ -340,9 +340,10 @@ def _cuda() -> list[tuple]:
         ("the longest tiles first, {} (crowd)", f.loads("crowd", "one for a tile, the longest first")[1]),
         ("registers, {} % (`stored` {}).", f.resident("manual"), f.resident("stored")),
         (
-            "projection and colors have {} and {} registers, {} %:",
-            *f.registers("project", "adjoint of shade"),
+            "The adjoint of projection has {} registers, {} %, that of colors {}.",
+            f.registers("project")[0],
             f.resident("project"),
+            f.registers("adjoint of shade")[0],
         ),
     ]
 

@@ -147,12 +147,13 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
                             weights[8 + k, lane] = wp.dot(sh.degree3[i][k], adj)
                             adj3[k] = functions[8 + k, lane] * adj
                 sh_out.dc[i] = C0 * adj
-                if sh_out.degree1.shape[0] > 0:
-                    sh_out.degree1[i] = adj1
-                if sh_out.degree2.shape[0] > 0:
-                    sh_out.degree2[i] = adj2
-                if sh_out.degree3.shape[0] > 0:
-                    sh_out.degree3[i] = adj3
+                if wp.static(lanes > 1):  # else it is `make_adj_rest`'s
+                    if sh_out.degree1.shape[0] > 0:
+                        sh_out.degree1[i] = adj1
+                    if sh_out.degree2.shape[0] > 0:
+                        sh_out.degree2[i] = adj2
+                    if sh_out.degree3.shape[0] > 0:
+                        sh_out.degree3[i] = adj3
         # the weights of those not drawn are zero, and zero times what is not finite is not
         one = number(1.0)
         x = pick(drawn, x, one)

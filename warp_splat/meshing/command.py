@@ -192,7 +192,7 @@ def exported(shape: Any, suffix: str) -> bytes:
     more = {}
     if suffix.lower() == ".glb":
         shape = shape.copy().apply_transform(GLTF_AXES)
-        if getattr(getattr(shape, "visual", None), "kind", None) == "vertex":  # a scene of pieces has none
+        if hasattr(shape, "visual"):  # a mesh; a scene of convex pieces has no colors
             colors = shape.visual.vertex_colors[:, :3] / np.float32(255)
             shape.vertex_attributes["_COLOR_0"] = from_srgb(colors, np.where)
             shape.visual = None

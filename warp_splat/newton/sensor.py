@@ -83,6 +83,8 @@ class SensorSplatCamera:
         options: RasterOptions | None = None,
         adjoint: str = "manual",
     ):
+        if not isinstance(getattr(model, "shape_scale", None), wp.array):
+            raise InputError(f"model: expected a newton.Model, as finalized, got {type(model).__name__}.")
         self.model, self.device, self.adjoint = model, model.device, adjoint
         self.background = wp.vec3(*check_background(background, torch.device("cpu")).tolist())
         self.options = check_options(adjoint, options)
@@ -155,7 +157,7 @@ class SensorSplatCamera:
         if bodies < self.model.body_count:
             raise InputError(f"state: expected one of the model's, of {self.model.body_count} bodies, got {bodies}.")
         if not isinstance(camera_transforms, wp.array) or camera_transforms.dtype is not wp.transform:
-            found = type(camera_transforms).__name__
+            found = f"{type(camera_transforms).__name__} of {getattr(camera_transforms, 'dtype', 'no dtype')}"
             raise InputError(f"camera_transforms: expected a Warp array of transforms, got {found}.")
         cameras = list(camera) if isinstance(camera, Sequence) else [camera] * len(camera_transforms)
         if others := [type(one).__name__ for one in cameras if not isinstance(one, Camera)]:

@@ -228,10 +228,9 @@ class Project(torch.autograd.Function):
             tensors = (given.means, splats.colors, adj_splats.colors)
             means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
             inputs = [it.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
-            by_number = lanes == 1 and rest.shape[1] > 0
-            outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest[:, :0] if by_number else adj_rest)]
+            outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
             _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
-            if by_number:
+            if lanes == 1 and rest.shape[1] > 0:
                 numbers = [it.cam, means, seen, colors, adj_colors], [view(adj_rest, wp.vec3)]
                 launch(make_adj_rest(), adj_rest[..., 0].numel(), *numbers, device=device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
