@@ -9,6 +9,7 @@ import pytest
 
 from warp_splat.config import SfmConfig
 from warp_splat.sfm import mapping
+from warp_splat.sfm.matching import fitting
 
 COUNT = 20
 CONFIG = SfmConfig("", "", threads=1, quiet=True)
@@ -68,6 +69,23 @@ def test_what_hardly_anything_holds_together_is_no_part_of_a_model(truth):
                 some.delete_observation(image, place)
     assert mapping.held_together(truth[1]) == set(truth[1].reg_image_ids())
     assert mapping.held_together(some) == set(some.reg_image_ids()) - apart
+
+
+def test_pairs_that_may_fit_by_chance_are_left_out(tmp_path):
+    """A walk 0 to 5 whose neighbors surely fit: (0, 2) shares 1 with them, (0, 5) nothing; only (0, 6) knows 6."""
+    sure, doubtful = [(k, k + 1) for k in range(5)], [(0, 2), (0, 5), (0, 6)]
+    with pycolmap.Database.open(tmp_path / "database.db") as connection:
+        camera = connection.write_camera(pycolmap.Camera.create_from_model_name(0, "PINHOLE", 100, 100, 100))
+        images = [connection.write_image(pycolmap.Image(f"{k}.jpg", camera_id=camera)) for k in range(7)]
+        for pair in (*sure, *doubtful):
+            count = mapping.SURE - (pair in doubtful)
+            geometry = pycolmap.TwoViewGeometry(
+                config=2, inlier_matches=np.repeat(np.arange(count)[:, None], 2, axis=1)
+            )
+            connection.write_two_view_geometry(images[pair[0]], images[pair[1]], geometry)
+    mapping.leave_out_doubtful(tmp_path / "database.db")
+    left = {(images.index(a), images.index(b)) for a, b in fitting(tmp_path / "database.db")}
+    assert left == {*sure, (0, 2), (0, 6)}
 
 
 def test_the_better_mapper_is_taken_and_completed(truth, tmp_path, monkeypatch):

@@ -14,7 +14,9 @@ from warp_splat.sfm.matching import match, pairs_compared
 
 TRIED = 6  # photographs, of which each pair is matched
 LEAST = 30  # of fewer a trial would take too large a share of the work itself
-MAPPING = 1.3e-4, 4.5e-4  # seconds for each feature, the least and the most of five captures (AMD EPYC, Intel Xeon)
+# Seconds of mapping for each feature, over the cube root of how many photographs there are: the least and the most of
+# eight captures of 25 to 3,000 (Intel Xeon). Six take 5e-5 or less; a loop in one room and a blurred video the most.
+MAPPING = 3e-5, 1.4e-4
 OF_FEATURE = 2048  # bytes in mapping, for each: 0.92 to 1.04 of the peaks of four captures of 25 to 1,000 photographs
 
 
@@ -39,7 +41,7 @@ def time_of_cameras(source: Path, say: Callable[[str], object]) -> None:
         return
     _, pairs = pairs_compared("auto", count)
     extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
-    least, most = (extraction + matching + rate * features * count / 60 for rate in MAPPING)
+    least, most = (extraction + matching + rate * features * count ** (4 / 3) / 60 for rate in MAPPING)
     memory = max(peak_memory() or 0, before + OF_FEATURE * features * count / 2**20) / 1024
     if features:
         say(

@@ -65,7 +65,7 @@ def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> in
     else:
         pairing = pycolmap.ExhaustivePairingOptions(block_size=BLOCK)
         _run(database, pycolmap.match_exhaustive, pairing, pairs, config)
-    return len(_matched(database))
+    return len(fitting(database))
 
 
 def pairs_compared(matching: str, images: int) -> tuple[str, int]:
@@ -86,7 +86,7 @@ def _run(database: Path, run: Callable, pairing: object, total: int, config: Sfm
         run_watched("matches", total, work, connection.num_matched_image_pairs, config.quiet)
 
 
-def _matched(database: Path) -> dict[tuple[int, int], int]:
+def fitting(database: Path) -> dict[tuple[int, int], int]:
     """How many features fit together, of the pairs of images of which some do."""
     with opened(database) as connection:
         numbers, counts = connection.read_two_view_geometry_num_inliers()
@@ -117,7 +117,7 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
     while pairs:
         tried.update(pairs)
         _match_pairs(database, [(names[a], names[b]) for a, b in pairs], len(tried), config)
-        found = {tuple(sorted(map(places.__getitem__, pair))): count for pair, count in _matched(database).items()}
+        found = {tuple(sorted(map(places.__getitem__, pair))): count for pair, count in fitting(database).items()}
         matched = {pair: count for pair, count in found.items() if pair in tried}
         pairs = looks.beyond(matched, tried)
     every = len(images) * (len(images) - 1) // 2
