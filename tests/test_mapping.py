@@ -113,9 +113,12 @@ def test_incremental_mapping_is_spared_where_it_could_add_little(truth, tmp_path
     monkeypatch.setattr(mapping, "MANY", COUNT - 1)
     monkeypatch.setattr(mapping, "_map_stepwise", lambda *a, **k: pytest.fail("incremental mapping was begun"))
     lines: list[str] = []
+    copies: list[Path] = []
+    monkeypatch.setattr(mapping, "leave_out_doubtful", copies.append)
     models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
     assert models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-3
     assert "incremental" not in lines[0]
+    assert len(copies) == 1 and copies[0].parent != tmp_path and not copies[0].exists()
 
 
 def test_a_mapper_that_was_complete_is_not_begun_again(truth, tmp_path, monkeypatch):
