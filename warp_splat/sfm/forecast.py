@@ -14,8 +14,8 @@ from warp_splat.sfm.matching import match, pairs_compared
 
 TRIED = 6  # photographs, of which each pair is matched
 LEAST = 30  # of fewer a trial would take too large a share of the work itself
-# Seconds of mapping for each feature, over the cube root of how many photographs there are: the least and the most of
-# eight captures of 25 to 3,000 (Intel Xeon). Six take 5e-5 or less; a loop in one room and a blurred video the most.
+# Seconds of mapping for each feature, divided by the cube root of how many photographs there are: the least and the
+# most of eight captures of 25 to 3,000 (Intel Xeon). A loop in one room and a blurred video take the most.
 MAPPING = 3e-5, 1.4e-4
 OF_FEATURE = 2048  # bytes in mapping, for each: 0.92 to 1.04 of the peaks of four captures of 25 to 1,000 photographs
 

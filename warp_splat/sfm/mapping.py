@@ -29,8 +29,8 @@ LINK = 30  # points that two photographs of one model share at least, one by one
 SURE = 50  # features of a pair that are no chance: of 6,419 wrong pairs among 60 rooms alike, none had as many
 SHARED = 3  # photographs that two models need to have in common to become one
 RELAXED = {"abs_pose_min_num_inliers": 15, "abs_pose_min_inlier_ratio": 0.1, "abs_pose_max_error": 16.0}  # 30, 0.25, 12
-# Seconds of global mapping, for the time that the bar says is left, over the cube root of how many photographs there
-# are. Of seven captures of 25 to 3,000: 1.1e-5 to 2.9e-5 (Intel Xeon).
+# Seconds of global mapping, divided by the cube root of how many photographs there are, for the time that the bar says
+# is left. Of seven captures of 25 to 3,000: 1.1e-5 to 2.9e-5 (Intel Xeon).
 SECONDS_PER_MATCH = 2e-5
 
 
