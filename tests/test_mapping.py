@@ -107,6 +107,22 @@ def test_the_better_mapper_is_taken_and_completed(truth, tmp_path, monkeypatch):
     assert len(lines) == 1 and "global mapping" in lines[0] and "global 12" in lines[0] and "incremental 9" in lines[0]
 
 
+def test_what_both_mappers_found_apart_is_written_once(truth, tmp_path, monkeypatch):
+    """Two groups that share nothing, each a model of either mapper."""
+    database, model = truth
+
+    def found(database, root, config, part, *start, **_):
+        for number, group in enumerate((range(12), range(12, COUNT))):
+            if not start:
+                part_of(model, part / str(number), group)
+
+    monkeypatch.setattr(mapping, "_map_globally", found)
+    monkeypatch.setattr(mapping, "_map_stepwise", found)
+    shutil.copy(database, tmp_path)
+    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, print)
+    assert [models[number].num_reg_images() for number in sorted(models)] == [12, COUNT - 12]
+
+
 def test_incremental_mapping_is_spared_where_it_could_add_little(truth, tmp_path, monkeypatch):
     database, model = truth
     shutil.copy(database, tmp_path)

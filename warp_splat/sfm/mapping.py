@@ -180,10 +180,13 @@ def _finish(
             model = more if more.num_reg_images() > model.num_reg_images() else model
             model.write(part / "0")
         shutil.rmtree(part / "more")
-    seen = set(model.reg_image_ids())
-    for number, other in enumerate([each for each in others if not seen.intersection(each.reg_image_ids())], 1):
-        (part / str(number)).mkdir()
-        other.write(part / str(number))
+    number, seen = 0, set(model.reg_image_ids())
+    for other in others:
+        if seen.isdisjoint(other.reg_image_ids()):  # both mappers may have found it
+            number += 1
+            seen.update(other.reg_image_ids())
+            (part / str(number)).mkdir()
+            other.write(part / str(number))
 
 
 def joined(
