@@ -75,6 +75,7 @@ OPTIONS = st.fixed_dictionaries(
         "max_steps": st.sampled_from([None, 7]),
         "antialiasing": st.booleans(),
         "projection": st.sampled_from(["affine", "ellipsoid", "unscented"]),
+        "tolerance": st.sampled_from([None, 0.3, 1e-3]),
     }
 )
 
@@ -87,6 +88,10 @@ OPTIONS = st.fixed_dictionaries(
 @example(  # the short axes of long needles count
     options={"alpha_min": 0.0, "antialiasing": True, "projection": "unscented"}, seed=37, count=37, largest=60.0,
     opacity=(0.001, 0.02), aspect=1e-4, bright=0.0, behind=0.0,
+)  # fmt: skip
+@example(  # within a tolerance, the cut is another than alpha_min
+    options={"alpha_min": 0.0, "tolerance": 0.3}, seed=0, count=1, largest=1.0, opacity=(0.05, 0.9), aspect=1e-4,
+    bright=0.0, behind=0.0,
 )  # fmt: skip
 @given(
     options=OPTIONS,
@@ -121,13 +126,15 @@ def test_the_image_is_the_same_and_threads_change_nothing(same_by_threads):
     assert (image - plain).abs().max() < 1e-6 and bound is None
 
 
-def test_kernels_of_cuda_find_a_bound_as_well():
+@pytest.mark.parametrize("tolerance", [None, 1e-2])
+def test_kernels_of_cuda_find_a_bound_as_well(tolerance):
     camera = look(24, 20)
     gaussians = made_up(5, 60, (0.5, 6.0), (0.05, 0.9), 0.2, 1.0, camera)
-    on_cpu = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True)).bound
+    options = RasterOptions(bound=True, tolerance=tolerance)
+    on_cpu = render(gaussians, camera, torch.zeros(3), options).bound
     with using(drivers.CUDA):
-        ratios(gaussians, camera, torch.zeros(3), RasterOptions())
-        on_cuda = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True)).bound
+        ratios(gaussians, camera, torch.zeros(3), options)
+        on_cuda = render(gaussians, camera, torch.zeros(3), options).bound
     assert np.median(on_cuda / on_cpu) < 1.5
 
 

@@ -43,9 +43,9 @@ class Certificate:
 
 def far_reaching(options: RasterOptions) -> RasterOptions:
     """Options for the projection: for the bound, what is too faint to be drawn counts, too."""
-    if options.bound or options.tolerance is not None:
-        return replace(options, alpha_min=min(options.alpha_min, FAINT))
-    return options
+    if options.tolerance is not None:  # which finds a cut of its own
+        return replace(options, alpha_min=FAINT)
+    return replace(options, alpha_min=min(options.alpha_min, FAINT)) if options.bound else options
 
 
 def looking(options: RasterOptions) -> RasterOptions:

@@ -49,7 +49,7 @@ def paint_within(
     allowed = allowed.expand(camera.height, camera.width)
     degree = next((degree for degree, least in DEGREES if float(allowed.min()) >= least), 5)
     by_polynomial = {} if options.exp_degree is None else {"exp_degree": min(degree, options.exp_degree)}
-    cut, uniform = FIRST * float(allowed.max()), bool(allowed.min() == allowed.max())
+    cut, uniform = max(FIRST * float(allowed.max()), FAINT), bool(allowed.min() == allowed.max())
     done = paint(replace(options, bound=True, **_cuts(options, cut), **by_polynomial), None)
     tiles = None
     for left in range(MOST_ROUNDS, 0, -1):
