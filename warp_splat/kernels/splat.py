@@ -40,7 +40,8 @@ class BlendVariant(NamedTuple):
     falloff: Falloff | int | None = 5  # the user's, or the degree of the Gaussian's polynomial (see make_falloff)
     keep: bool = False  # every transmittance is stored
     bound: bool = False  # how wrong a pixel can be is found
-    floor: bool = False  # compared with what has nothing below an alpha
+    ideal: bool = False  # and the ideal differs from the picture before a pixel stops
+    floor: bool = False  # and the ideal has nothing below an alpha
     hides: bool = False  # each pixel stops where it is told to
 
     @property

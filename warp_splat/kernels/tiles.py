@@ -26,12 +26,12 @@ MARGIN = wp.constant(1.0e-3)  # px, far more than the rounding of a span's ends;
 
 
 @wp.func
-def pixels(low: Any, high: Any, size: int):
-    """First and last pixel of a row of ``size`` whose center lies in [low, high]; empty if first > last."""
+def pixels(low: Any, high: Any, size: int, margin: float):
+    """First and last pixel of a row of ``size`` whose center is within ``margin`` of [low, high]; or first > last."""
     last = float(size)
     # clamped as floats: a huge extent has no int
-    first = wp.min(wp.max(rounded_up(low - fill(0.5, low) - fill(MARGIN, low)), fill(0.0, low)), fill(last, low))
-    up_to = wp.max(rounded_down(high - fill(0.5, low) + fill(MARGIN, low)), fill(-1.0, low))
+    first = wp.min(wp.max(rounded_up(low - fill(0.5, low) - fill(margin, low)), fill(0.0, low)), fill(last, low))
+    up_to = wp.max(rounded_down(high - fill(0.5, low) + fill(margin, low)), fill(-1.0, low))
     return whole(first), whole(wp.min(up_to, fill(last - 1.0, low)))
 
 
@@ -89,7 +89,7 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
         v = first + wp.tid()
         splat = packed(splats2d, gaussians[v], alpha_min, square)
         splats_out[v] = splat
-        top, bottom = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
+        top, bottom = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height, MARGIN)
         rows_out[v] = wp.max(bottom // TILE - top // TILE + 1, 0)
 
     return pack
@@ -115,12 +115,13 @@ def outline(x_extent: Any, y_extent: Any, root0: Any, root1: Any, root2: Any):
 
 @wp.func
 def cut(
-    x: Any, y: Any, x_extent: Any, y_extent: Any, slope: Any, half: Any, turn: Any, row: Any, width: int, square: int
-):
+    x: Any, y: Any, x_extent: Any, y_extent: Any, slope: Any, half: Any, turn: Any, row: Any,
+    width: int, square: int, margin: float,
+):  # fmt: skip
     """First and last pixel between which the outline, or the square around it, touches a row of tiles."""
     one = fill(1.0, x)
-    low = times(row, float(TILE)) + fill(0.5, x) - y - fill(MARGIN, x)
-    high = low + fill(float(TILE - 1), x) + fill(2.0 * MARGIN, x)
+    low = times(row, float(TILE)) + fill(0.5, x) - y - fill(margin, x)
+    high = low + fill(float(TILE - 1), x) + fill(2.0 * margin, x)
     low = wp.max(low, -y_extent)
     high = wp.min(high, y_extent)
     dy_right = wp.min(wp.max(turn, low), high)
@@ -132,7 +133,7 @@ def cut(
     if square != 0:
         right = x_extent
         left = -x_extent
-    first, last = pixels(x + left, x + right, width)
+    first, last = pixels(x + left, x + right, width, margin)
     return first, last
 
 

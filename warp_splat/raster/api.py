@@ -17,7 +17,7 @@ from warp_splat.raster.behind import put_behind
 from warp_splat.raster.beside import blend_beside
 from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.certificate import certify, far_reaching, looking
+from warp_splat.raster.certificate import certify, drawing, far_reaching, looking
 from warp_splat.raster.data import Dropped, Gaussians, Room, Splats2D
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
@@ -192,7 +192,7 @@ def render(
             if certificate:
                 bins.bound = certificate.view(bins)
         with stage("blend"):
-            blending = Blending(bins, seen, chosen, driver, adjoint, dropped)
+            blending = Blending(bins, seen, drawing(chosen), driver, adjoint, dropped)
             return Painted(blend(drawn, color, blending), drawn, blending, certificate)
 
     (image, alpha, depth), drawn, blending, certificate = (

@@ -51,7 +51,7 @@ def bin_by_counting(
     check_count(row_count, camera, count, splats2d.radii.device)
     begins = _put(begins, order)
     spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
-    inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, _boxes(options)]
+    inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, square]
     groups = -(-count // LANES)
     launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=even_slices(groups, each=LANES))
     pictures = max(len(worlds), 1)
@@ -115,7 +115,7 @@ def _count_tiles(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> 
     gaussians, splats = empty(total, int, device), empty(total, Splat2D, device)
     counts = torch.empty(total, dtype=torch.int64, device=device)
     inputs = [view(order, wp.int64), splats2d.view(), camera.width, camera.height, options.alpha_min]
-    inputs += [int(options.extent == "square"), _boxes(options)]
+    inputs.append(int(options.extent == "square"))
     kernel = make_count_tiles(falloff_of(options).reach_of)
     launch(kernel, total, inputs, [gaussians, splats, view(counts, wp.int64)], device=device)
     return gaussians, splats, counts
@@ -129,7 +129,7 @@ def _list_tiles(
     ``counts`` [N], or [0], are counted anew.
     """
     begins, ranks = (torch.empty(size, dtype=torch.int32, device=ends.device) for size in (len(ends) + 1, len(listed)))
-    inputs = [splats, camera.width, camera.height, _boxes(options), view(ends, wp.int64)]
+    inputs = [splats, camera.width, camera.height, int(options.extent == "square"), view(ends, wp.int64)]
     outputs = [view(begins, wp.int32), _listed(listed), view(ranks, wp.int32), view(counts, wp.int32)]
     launch(make_list_tiles(listed.dtype == torch.int16), len(begins), inputs, outputs, device=ends.device)
     return begins, ranks
@@ -139,11 +139,6 @@ def _first_tiles(worlds: Sequence[int], tiles: int, device: torch.device) -> tor
     """The first tile of the picture that each Gaussian belongs to, [N] int32."""
     firsts, counts = torch.arange(0, tiles * len(worlds), tiles), torch.tensor(worlds)
     return torch.repeat_interleave(*(send(t, device) for t in (firsts.int(), counts)), output_size=sum(worlds))
-
-
-def _boxes(options: RasterOptions) -> int:
-    """Whether a Gaussian is listed by all tiles of its box; the bound takes those for seen."""
-    return int(options.extent == "square" or options.bound)
 
 
 def _listed(tiles: torch.Tensor):

@@ -18,6 +18,7 @@ from warp_splat.runtime.pool import even_slices
 #: Where maps of depth begin, as shares of the Gaussians: most is hidden by what is near.
 STARTS = (0.06, 0.15, 0.3, 0.55)
 BAND = 1e-4  # around 1/255, where rounding decides what the reference leaves out
+SURE = (1.0 + BAND) * ALPHA_MIN
 SAMPLE = 2048  # Gaussians that tell depths and colors
 #: Relative error of alpha by the degree of its exponential (kernels/falloff.py).
 EXP_ERRORS = {3: 7.6e-5, 4: 3.1e-6, 5: 1.8e-7, 6: 1.8e-7, None: 1.8e-7}
@@ -53,6 +54,11 @@ def looking(options: RasterOptions) -> RasterOptions:
     if not options.bound:
         return options
     return replace(options, alpha_min=0.9 * ALPHA_MIN if options.of == "trained" else SEEN * options.alpha_min)
+
+
+def drawing(options: RasterOptions) -> RasterOptions:
+    """Options for the blend: within a tolerance, all that it looks at is drawn."""
+    return replace(options, alpha_min=FAINT) if options.tolerance is not None and options.of == "ideal" else options
 
 
 def certify(
@@ -116,7 +122,7 @@ def certify(
         "darkest": float(background.min()),
         "behind": behind,
         "everywhere": float(lost) + (0.0 if rules.floor else 2.0 * count * faint),
-        "floor": wp.vec2((1.0 - BAND) * rules.floor, (1.0 + BAND) * rules.floor) if rules.floor else wp.vec2(faint),
+        "floor": wp.vec2((1.0 - BAND) * ALPHA_MIN, SURE) if rules.floor else wp.vec2(faint),
     }
     bound, rounding = (torch.empty(camera.height, camera.width, device=device) for _ in range(2))
     return splats._replace(extents=extents, radii=radii), Certificate(bound, rounding, errors, fields)

@@ -7,17 +7,17 @@ from typing import NamedTuple
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import ALPHA_MIN, TILE, RasterOptions
+from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.bin import balanced_slices
 from warp_splat.raster.blend import Blending
-from warp_splat.raster.certificate import BAND, FAINT, Certificate
+from warp_splat.raster.certificate import FAINT, SURE, Certificate
 from warp_splat.raster.data import Bins, Pixels, Splats2D
 
 #: From which tolerance on the exponential's polynomial may be of that degree; its error is a tenth at most.
 DEGREES = ((3, 2e-3), (4, 1e-4))
-FIRST = 1.0 / 150.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
-STOP = 0.005  # where pixels stop, likewise: the Gaussian that crosses it may take 100 times as much
+FIRST = 1.0 / 70.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
+STOP = 0.0007  # where pixels stop, likewise: the Gaussian that crosses it may take 100 times as much
 LOWER = 0.6  # of what the bound asks for, the cut of tiles that are drawn again
 MOST_ROUNDS = 4
 PER_PIXEL = ("bound", "rounding")  # of a certificate
@@ -68,8 +68,7 @@ def paint_within(
 
 def _cuts(options: RasterOptions, cut: float) -> dict[str, float]:
     """Where opacities are cut and where pixels stop."""
-    alpha = max(cut, (1.0 + BAND) * ALPHA_MIN) if options.of == "trained" else cut
-    return {"alpha_min": min(alpha, 0.5), "t_min": min(STOP / FIRST * cut, 0.5)}
+    return {"alpha_min": SURE if options.of == "trained" else min(cut, 0.5), "t_min": min(STOP / FIRST * cut, 0.5)}
 
 
 def _worst_of_tiles(pixels: torch.Tensor) -> torch.Tensor:

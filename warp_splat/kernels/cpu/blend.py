@@ -144,8 +144,9 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     STATE = IDEAL + SETTLED * variant.bound
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
     fall_at, way = make_falloff(variant.falloff).value, 1
-    prepare, expect, conclude = make_settle(RGB, IDEAL, AHEAD)
-    IDEAL_T, _, IDEAL_RGB, _, TOTAL, ADDED, *_ = rows_from(IDEAL)
+    rows = rows_from(IDEAL, None if variant.ideal else RGB)
+    prepare, expect, conclude = make_settle(RGB, rows, AHEAD)
+    IDEAL_T, _, IDEAL_RGB, _, TOTAL, ADDED, *_ = rows
 
     def begin(k, here, out, s, bound, tile, bins, near, length):
         """Instances walked."""
@@ -157,16 +158,17 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
         raw = fall * splat.opacity
         alpha = alpha_of(raw, alphas)
-        if wp.static(variant.bound):
+        if wp.static(variant.floor):
+            may = unsure(raw, bound)
+            s[TOTAL + block] = s[TOTAL + block] + may
+            may = times(may, brightness(splat.color, bound.usual))
+            left = wp.max(s[IDEAL_T + block], -s[IDEAL_T + block])
+            s[ADDED + block] = own_light(left, may, bound.usual, s[ADDED + block])
+        if wp.static(variant.ideal):
             ideal = times(sure(raw, alphas, bound), s[IDEAL_T + block])
             for channel in range(3):
                 row = IDEAL_RGB + channel * BLOCKS + block
                 s[row] = fma(ideal, splat.color[channel], s[row])
-            if wp.static(variant.floor):
-                may = unsure(raw, bound)
-                s[TOTAL + block] = s[TOTAL + block] + may
-                may = times(may, brightness(splat.color, bound.usual))
-                s[ADDED + block] = own_light(s[IDEAL_T + block], may, bound.usual, s[ADDED + block])
             s[IDEAL_T + block] = s[IDEAL_T + block] - ideal
         behind = advance(s[T + block], alpha, t_min)
         if wp.static(variant.hides):

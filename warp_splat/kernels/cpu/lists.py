@@ -24,7 +24,7 @@ from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.simd import LANES, vec16, vec16i
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.kernels.tiles import cut, outline, pixels
+from warp_splat.kernels.tiles import MARGIN, cut, outline, pixels
 
 wp.set_module_options(FORWARD_ONLY)
 
@@ -69,13 +69,14 @@ def find_spans(
         root2[lane] = splat.root[2]
         most = wp.max(most, rows[v])
     slope, half, turn = outline(x_extent, y_extent, root0, root1, root2)
-    tops, _bottoms = pixels(y - y_extent, y + y_extent, height)
+    tops, _bottoms = pixels(y - y_extent, y + y_extent, height, MARGIN)
     top = vec16()
     found = vec16i()
     for lane in range(LANES):
         top[lane] = float(tops[lane] // TILE)
     for row in range(most):
-        firsts, lasts = cut(x, y, x_extent, y_extent, slope, half, turn, top + vec16(float(row)), width, square)
+        here = top + vec16(float(row))
+        firsts, lasts = cut(x, y, x_extent, y_extent, slope, half, turn, here, width, square, MARGIN)
         lane = int(0)
         while lane < LANES:
             v = group + lane

@@ -1,4 +1,4 @@
-"""The bound beside the CPU's blend, which keeps the ideal beside the picture: transmittance and color.
+"""The bound beside the CPU's blend, which keeps the ideal beside the picture, if it differs: transmittance and color.
 
 What the blend does not see is settled where a map of depth begins, and at the end. Sixteen rows each, one for every
 block of pixels.
@@ -22,25 +22,30 @@ BLOCKS = TILE * TILE // LANES
 SETTLED = 12 * BLOCKS + 1  # rows
 
 
-def rows_from(first: int) -> list[int]:
-    """The first of each: T, that at the last settlement, colors, those, sums of what is not seen, and of the bound."""
-    return [first + row * BLOCKS for row in (0, 1, 2, 5, 8, 9, 10, 11)]
+def rows_from(first: int, rgb: int | None = None) -> tuple[int, ...]:
+    """The first of each: T, that at the last settlement, colors, those, sums of what is not seen, and of the bound.
+
+    With ``rgb``, the first of the picture's colors, those and its T, which come first of all, are the ideal's, too.
+    """
+    rows = tuple(first + row * BLOCKS for row in (0, 1, 2, 5, 8, 9, 10, 11))
+    return rows if rgb is None else (0, rows[1], rgb, *rows[3:])
 
 
 @functools.cache
-def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
+def make_settle(rgb: int, rows: tuple[int, ...], ahead: int) -> tuple[wp.Function, ...]:
     """What starts, settles before entries, and concludes.
 
-    ``rgb`` and ``ideal``: the first rows of the colors, and of what is kept for the bound. Transmittances are the first
-    of all. ``ahead``: entries of the list that are read together.
+    ``rgb``: the first row of the colors; ``rows``: those that :func:`rows_from` names. Transmittances are the first of
+    all. ``ahead``: entries of the list that are read together.
     """
-    T, BEFORE, LIGHT, SEEN, TOTAL, ADDED, TAKEN, ROUNDING = rows_from(ideal)
+    T, BEFORE, LIGHT, SEEN, TOTAL, ADDED, TAKEN, ROUNDING = rows
 
     @wp.func
     def at_start(s: wp.array[vec16]):
         """The rows, which are zeros, before the first entry."""
-        for row in range(T, LIGHT):
-            s[row] = vec16(1.0)
+        for block in range(BLOCKS):
+            s[T + block] = vec16(1.0)
+            s[BEFORE + block] = vec16(1.0)
 
     @wp.func
     def settle(s: wp.array[vec16], bound: BoundView, since: Since, tile: int, tiles_x: int, end: int):
@@ -48,7 +53,7 @@ def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
         begin = since.map
         block = int(0)
         while block < BLOCKS:  # Warp would unroll a range
-            t = s[T + block]
+            t = wp.max(s[T + block], -s[T + block])  # negative where the picture stopped
             gained = vec16(0.0)
             light = vec16(0.0)
             for channel in range(3):
@@ -102,7 +107,7 @@ def make_settle(rgb: int, ideal: int, ahead: int) -> tuple[wp.Function, ...]:
         top = (tile // tiles_x) * TILE
         block = int(0)
         while block < BLOCKS:
-            t = s[T + block]
+            t = wp.max(s[T + block], -s[T + block])
             through = t - wp.max(s[block], -s[block])
             stopped = where_less(s[block], vec16(0.0), t, times(t, wp.where(cut, 1.0, 0.0)))
             last = wp.max(times(stopped, bound.brightest), times(t, bound.behind))

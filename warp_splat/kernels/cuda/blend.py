@@ -12,7 +12,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, Since
 from warp_splat.kernels.cuda import warps
-from warp_splat.kernels.cuda.settle import EACH, at_start, blend_ideal, conclude, expect
+from warp_splat.kernels.cuda.settle import EACH, at_start, conclude, expect, make_ideal, vec_each
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
@@ -22,8 +22,6 @@ from warp_splat.kernels.tiles import first_pixel_of
 THREADS = wp.constant(TILE * TILE)  # of a block of other kernels: one per pixel
 BATCH = wp.constant(TILE * TILE // 4)  # Gaussians that the blend stages at once, and its threads
 TOUCHED = wp.constant(10)  # which blocks: behind a slot's columns, of what is staged
-vec12 = wp.types.vector(length=12, dtype=float)
-vec_each = wp.types.vector(length=EACH, dtype=float)
 
 #: Of modules whose kernels run in blocks. No regrouping of sums: it would change what CPU fibers check.
 BLOCK_OPTIONS = {"enable_backward": False, "block_dim": TILE * TILE}
@@ -45,7 +43,7 @@ def with_blocks(row: warps.vec10, touched: int):
 
     Shared memory takes and gives twelve numbers by four, without conflicts of banks.
     """
-    staged = vec12()
+    staged = warps.vec12()
     for column in range(warps.COLUMNS):
         staged[column] = row[column]
     staged[TOUCHED] = wp.cast(touched, float)
@@ -84,6 +82,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     falloff, CHANNELS = make_falloff(variant.falloff), variant.channels
     fall_at, reach_of = falloff.value, falloff.reach_of
+    of_picture, blend_ideal = make_ideal(variant)
 
     @wp.kernel(module="unique", module_options=dict(BLEND_OPTIONS))
     def blend(
@@ -126,10 +125,10 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         for batch in range((length + BATCH - 1) // BATCH):
             first = batch * BATCH
             if wp.static(variant.bound):
-                settled, since = expect(
-                    settled, bound, since, bins, tile, lane, half, start + first, wp.min(BATCH, length - first)
-                )
-            mine = vec12(0.0)
+                settled = of_picture(settled, ts, reds, greens, blues)
+                count = wp.min(BATCH, length - first)
+                settled, since = expect(settled, bound, since, bins, tile, lane, half, start + first, count)
+            mine = warps.vec12(0.0)
             if first + thread < length:
                 splat = bins.splats[bins.instances[start + first + thread]]
                 touched = int(-1)  # every T is kept, or every pixel's bound
@@ -156,8 +155,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
                             fall = fall_at(exponent(dx, dy, g[XX], g[XY], g[YY]))
                             alpha = alpha_of(fall * g[OPACITY], alphas)
                             if wp.static(variant.bound):
-                                color = wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2])
-                                settled = blend_ideal(settled, p, fall * g[OPACITY], alphas, color, bound)
+                                settled = blend_ideal(settled, p, ts[p], fall, g, alphas, bound)
                             behind = advance(ts[p], alpha, t_min)
                             if wp.static(variant.hides):
                                 behind = wp.where(here < limits[tile, place_of(lane, half + p)], behind, -wp.abs(ts[p]))
@@ -176,6 +174,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             votes = wp.tile(going)
             if (votes[0] | votes[warps.WARP]) == 0:
                 break
+        settled = of_picture(settled, ts, reds, greens, blues)
         for p in range(EACH):
             place = place_of(lane, half + p)
             final_out[tile, place] = wp.abs(ts[p])

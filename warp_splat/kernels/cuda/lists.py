@@ -16,13 +16,13 @@ from warp_splat.config import TILE
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import Splats2DView
-from warp_splat.kernels.tiles import SPELLED_OUT, cut, make_packed, outline, pixels
+from warp_splat.kernels.tiles import MARGIN, SPELLED_OUT, cut, make_packed, outline, pixels
 
 
 @wp.func
 def tile_rows_of(splat: Splat2D, height: int):
     """The first row of tiles that a splat touches, and the one after the last."""
-    top, bottom = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height)
+    top, bottom = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height, MARGIN)
     return top // TILE, bottom // TILE + 1
 
 
@@ -32,7 +32,7 @@ def tiles_of_row(splat: Splat2D, row: int, width: int, square: int):
     x_extent, y_extent = splat.extent[0], splat.extent[1]
     slope, half, turn = outline(x_extent, y_extent, splat.root[0], splat.root[1], splat.root[2])
     left, right = cut(
-        splat.mean[0], splat.mean[1], x_extent, y_extent, slope, half, turn, float(row), width, square
+        splat.mean[0], splat.mean[1], x_extent, y_extent, slope, half, turn, float(row), width, square, MARGIN
     )  # fmt: skip
     return left // TILE, wp.max(right // TILE - left // TILE + 1, 0)
 
@@ -51,7 +51,6 @@ def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
         height: int,
         alpha_min: float,
         square: int,  # 1: look at the square of the reference instead of the ellipse
-        boxes: int,  # 1: list all tiles of the box
         # out
         gaussians_out: wp.array[int],  # [N] that order
         splats_out: wp.array[Splat2D],  # [N]; undefined where not drawn
@@ -64,7 +63,7 @@ def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
         if splats2d.radii[i] > 0:
             top, below = tile_rows_of(splat, height)
             for row in range(top, below):
-                _left, count = tiles_of_row(splat, row, width, boxes)
+                _left, count = tiles_of_row(splat, row, width, square)
                 found += count
         gaussians_out[rank] = i
         splats_out[rank] = splat

@@ -1,17 +1,22 @@
 """The bound beside CUDA's blend, as ``kernels/cpu/settle.py`` keeps it: a row for each sum, a column for each pixel."""
 
+import functools
+
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels import bound as bounds
 from warp_splat.kernels.bound import BoundView, Since
-from warp_splat.kernels.cuda.warps import across_of, down_of
+from warp_splat.kernels.cuda.warps import across_of, down_of, vec12
 from warp_splat.kernels.simd import where_less
+from warp_splat.kernels.slots import CHANNEL, OPACITY
+from warp_splat.kernels.splat import BlendVariant
 from warp_splat.kernels.structs import BinsView
 
 EACH = 4  # pixels of a lane of the blend, each in a block of 8 x 4
 T, BEFORE, TOTAL, TAKEN, ADDED, ROUNDING, LIGHT = (wp.constant(row) for row in range(7))
 SEEN = wp.constant(9)
+vec_each = wp.types.vector(length=EACH, dtype=float)
 mat_settled = wp.types.matrix(shape=(12, EACH), dtype=float)
 
 
@@ -65,17 +70,37 @@ def expect(
     return m, bounds.watch(bound, since, bins, k, count)
 
 
-@wp.func
-def blend_ideal(m: mat_settled, p: int, raw: float, alphas: wp.vec2, color: wp.vec3, bound: BoundView):
-    """With one more Gaussian of the ideal."""
-    weight = bounds.sure(raw, alphas, bound) * m[T, p]
-    for channel in range(3):
-        m[LIGHT + channel, p] += weight * color[channel]
-    may = bounds.unsure(raw, bound)
-    m[TOTAL, p] += may
-    m[ADDED, p] = bounds.own_light(m[T, p], may * bounds.brightness(color, bound.usual), bound.usual, m[ADDED, p])
-    m[T, p] -= weight
-    return m
+@functools.cache
+def make_ideal(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
+    """What keeps the ideal: from the picture's sums, if those are its own, and with one more Gaussian."""
+
+    @wp.func
+    def of_picture(m: mat_settled, ts: vec_each, reds: vec_each, greens: vec_each, blues: vec_each):
+        if wp.static(not variant.ideal):
+            for p in range(EACH):
+                m[T, p] = wp.abs(ts[p])
+                m[LIGHT, p] = reds[p]
+                m[LIGHT + 1, p] = greens[p]
+                m[LIGHT + 2, p] = blues[p]
+        return m
+
+    @wp.func
+    def blend_ideal(m: mat_settled, p: int, shown: float, fall: float, g: vec12, alphas: wp.vec2, bound: BoundView):
+        t, raw = wp.abs(shown), fall * g[OPACITY]
+        color = wp.vec3(g[CHANNEL], g[CHANNEL + 1], g[CHANNEL + 2])
+        if wp.static(variant.ideal):
+            t = m[T, p]
+            weight = bounds.sure(raw, alphas, bound) * t
+            for channel in range(3):
+                m[LIGHT + channel, p] += weight * color[channel]
+            m[T, p] -= weight
+        if wp.static(variant.floor):
+            may = bounds.unsure(raw, bound)
+            m[TOTAL, p] += may
+            m[ADDED, p] = bounds.own_light(t, may * bounds.brightness(color, bound.usual), bound.usual, m[ADDED, p])
+        return m
+
+    return of_picture, blend_ideal
 
 
 @wp.func

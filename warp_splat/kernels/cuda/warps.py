@@ -16,6 +16,7 @@ PIXELS = wp.constant(TILE * TILE // 32)  # of a lane; or warps of a block
 ACROSS, DOWN = wp.constant(8), wp.constant(4)  # pixels of a block
 COLUMNS, AT_ONCE = wp.constant(10), wp.constant(16)  # of a slot; channels beside the color: registers
 vec10 = wp.types.vector(length=10, dtype=float)
+vec12 = wp.types.vector(length=12, dtype=float)
 vec_channels = wp.types.vector(length=16, dtype=float)
 vec_pixels = wp.types.vector(length=TILE * TILE // 32, dtype=float)
 mat_pixels = wp.types.matrix(shape=(4, TILE * TILE // 32), dtype=float)  # for red, green, blue, and depth
