@@ -97,7 +97,7 @@ def measure(
         stages.append(dict(profile))
     peak, instances = peak_memory(), count_instances(trainer)
     per_pixel = pixel_floats("masked" in kinds, "composited" in kinds, "linear" in kinds)
-    needed = step_memory(count, 16, instances, width * height, per_pixel=per_pixel)
+    needed = step_memory(count, instances, width * height, trainer.config, per_pixel)
     return {
         "gaussians": count,
         "width": width,

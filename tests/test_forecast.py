@@ -56,7 +56,7 @@ def test_grounds(scene, options, count, reason):
 
 
 def test_what_does_not_fit_is_told(scene, monkeypatch):
-    pair = memory.step_memory(10**6, 16, 3 * 10**6, 600 * 400) * 2
+    pair = memory.step_memory(10**6, 3 * 10**6, 600 * 400, TrainConfig()) * 2
     own = memory.GIB
     monkeypatch.setattr(memory.psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=own)))
     trainer = Trainer(scene, TrainConfig(device="cpu", max_gaussians=10**6))
@@ -70,5 +70,5 @@ def test_what_does_not_fit_is_told(scene, monkeypatch):
 
 
 def test_stored_states_are_counted():
-    more = memory.step_memory(10, 16, 1000, 100, "stored") - memory.step_memory(10, 16, 1000, 100)
-    assert more == 1000 * 1024
+    needed = [memory.step_memory(10, 1000, 100, TrainConfig(adjoint=adjoint)) for adjoint in ("manual", "stored")]
+    assert needed[1] - needed[0] == 1000 * 1024

@@ -19,7 +19,7 @@ from warp_splat.scene.images import target_size
 from warp_splat.scene.photos import READABLE, find_files
 from warp_splat.text import few
 from warp_splat.training.memory import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
-from warp_splat.training.options import LearnOptions, ModelOptions
+from warp_splat.training.options import TrainConfig
 
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
@@ -28,7 +28,8 @@ ROUNDED = 1e-4  # of the distance between cameras, which may be lost by rounding
 AT_LEAST = 20  # images; fewer train, but show little from new sides
 BASE = 0.7 * GIB  # Python, torch, Warp and their kernels
 SECONDS_PER_PIXEL = 6.7e-7  # of a thread, for each step: 1216 s for 7,000 steps of 518,400 px on two
-RUNS = {"--preset fast": PRESETS["fast"]["iterations"], "the default": LearnOptions.iterations}
+DEFAULTS = TrainConfig()
+RUNS = {"--preset fast": PRESETS["fast"]["iterations"], "the default": DEFAULTS.learn.iterations}
 
 
 def check_cameras(subject: Subject) -> Iterator[Finding]:
@@ -179,19 +180,17 @@ def forecast(
     areas = [width * height for width, height in targets]
     gaussians, _ = expected_gaussians(points, max(areas))
     per_pixel = pixel_floats(masked, False, linear)
-    coefficients = (ModelOptions.sh_degree + 1) ** 2
-    step = step_memory(gaussians, coefficients, INSTANCES * gaussians, max(areas), per_pixel=per_pixel)
+    step = step_memory(gaussians, INSTANCES * gaussians, max(areas), DEFAULTS, per_pixel)
     photographs = sum(areas) * ((3 * FLOAT if linear else 3) + masked + alpha)
     available = psutil.virtual_memory().available
     needed = BASE + min(photographs, SHARE * available) + step
     seconds = sum(areas) / len(areas) * SECONDS_PER_PIXEL / CORES
     times = ", ".join(f"{_span(steps * seconds)} for {name} ({steps} iterations)" for name, steps in RUNS.items())
+    less = "; take smaller images (-r 2) or fewer Gaussians (--max_gaussians)" * (needed > available)
     text = (
         f"about {needed / GIB:.1f} GiB of memory for {gaussians} Gaussians, {available / GIB:.1f} GiB are free; "
-        f"roughly {times} on {CORES} CPU threads."
+        f"roughly {times} on {CORES} CPU threads{less}."
     )
-    if needed > available:
-        text = f"{text[:-1]}; take smaller images (-r 2) or fewer Gaussians (--max_gaussians)."
     return text, needed <= available
 
 

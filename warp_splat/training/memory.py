@@ -15,6 +15,7 @@ import torch
 
 from warp_splat.config import TILE
 from warp_splat.runtime.launch import available_memory
+from warp_splat.training.options import TrainConfig
 from warp_splat.training.seams import having
 
 if TYPE_CHECKING:
@@ -37,29 +38,19 @@ def pixel_floats(masked: bool, composited: bool, linear: bool) -> int:
     return PER_PIXEL + MASKED * masked + COMPOSITED * composited + LINEAR * linear
 
 
-def step_memory(
-    gaussians: int,
-    coefficients: int,
-    instances: int,
-    pixels: int,
-    adjoint: str = "manual",
-    per_pixel: int = PER_PIXEL,
-    half_moments: bool = False,
-) -> int:
+def step_memory(gaussians: int, instances: int, pixels: int, config: TrainConfig, per_pixel: int = PER_PIXEL) -> int:
     """Bytes that training steps take on the CPU, beyond what the process takes before the first.
 
     Args:
         gaussians: N.
-        coefficients: of spherical harmonics, K for each channel.
         instances: pairs of a Gaussian and a tile that it touches.
         pixels: of a view.
-        adjoint: one of ADJOINTS.
+        config: says how many harmonics there are, how steps are differentiated, and whether moments have 16 bits.
         per_pixel: see :func:`pixel_floats`.
-        half_moments: whether Adam's are kept in 16 bits.
     """
-    parameters = 3 + 4 + 3 + 1 + 3 * coefficients  # means, quats, scales, opacities, sh
-    of_gaussian = (PER_PARAMETER - half_moments) * parameters + PER_GAUSSIAN
-    of_instance = PER_INSTANCE + (STATES if adjoint == "stored" else 0)
+    parameters = 3 + 4 + 3 + 1 + 3 * (config.model.sh_degree + 1) ** 2  # means, quats, scales, opacities, sh
+    of_gaussian = (PER_PARAMETER - config.learn.half_moments) * parameters + PER_GAUSSIAN
+    of_instance = PER_INSTANCE + (STATES if config.model.adjoint == "stored" else 0)
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
 
@@ -77,9 +68,7 @@ def describe(trainer: "Trainer") -> str:
     per_pixel = pixel_floats(masked, composited, scene.linear)
 
     def step(gaussians: int) -> int:
-        coefficients, instances = (config.model.sh_degree + 1) ** 2, INSTANCES * gaussians
-        adjoint, halves = config.model.adjoint, config.learn.half_moments
-        return step_memory(gaussians, coefficients, instances, pixels, adjoint, per_pixel, halves)
+        return step_memory(gaussians, INSTANCES * gaussians, pixels, config, per_pixel)
 
     base, needed = psutil.Process().memory_info().rss, step(count) + scene.memory.later
     each = f" in each of {processes} processes" if processes > 1 else ""
