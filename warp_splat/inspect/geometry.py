@@ -121,7 +121,7 @@ def check_exposure(subject: Subject) -> Iterator[Finding]:
         yield Finding("exposure", "note", "photographs share too few points to compare how bright they are.")
         return
     subject.stops = {name: float(gains.stops[name][brightness.GREEN]) for name in sorted(gains.stops)}
-    subject.exif = dict(_exif(subject))
+    subject.exif = _exif(subject)
     least, most = (choose(subject.stops, key=lambda name: subject.stops[name]) for choose in (min, max))
     text = (
         f"photographs differ by {gains.unlike:.3f} stops from those that show the same points: "
@@ -137,17 +137,15 @@ def check_exposure(subject: Subject) -> Iterator[Finding]:
     yield Finding("exposure", "warning" if needed else "ok", f"{text}{'; train with --parts exposure' * needed}.")
 
 
-def _exif(subject: Subject) -> Iterator[tuple[str, float]]:
-    """The exposures that files tell [stops], shifted to the mean of those that were subject."""
+def _exif(subject: Subject) -> dict[str, float]:
+    """The exposures that files tell [stops], shifted to the mean of those that were measured."""
     told = {}
     for photo in subject.photos:
         with suppress(InputError):  # said elsewhere
-            stops = read_exposure(photo.path)
-            if stops is not None and photo.name in subject.stops:
+            if photo.name in subject.stops and (stops := read_exposure(photo.path)) is not None:
                 told[photo.name] = stops
-    if told:
-        shift = np.mean([subject.stops[name] - stops for name, stops in told.items()])
-        yield from ((name, float(stops + shift)) for name, stops in told.items())
+    shift = np.mean([subject.stops[name] - stops for name, stops in told.items()] or [0.0])
+    return {name: float(stops + shift) for name, stops in told.items()}
 
 
 def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:

@@ -125,8 +125,7 @@ def _on_photos(subject: Subject) -> Figure:
             axes.scatter(*pixels.T * small.shape[1] / photo.camera.width, c=ORANGE, s=1.5)
             title = photo.name
         axes.set_title(title, fontsize=7, color=INK, pad=2)
-        axes.set_xlim(0, small.shape[1])
-        axes.set_ylim(small.shape[0], 0)
+        axes.set(xlim=(0, small.shape[1]), ylim=(small.shape[0], 0))
     if dots is not None:
         bar = figure.colorbar(dots, ax=cells, shrink=0.4, aspect=40, location="bottom")
         bar.set_label("reprojection error [px]", fontsize=7)
@@ -148,9 +147,7 @@ def _map(subject: Subject) -> Figure:
         plain_axes(axes, title)
         axes.scatter(*((points - middle) @ plane).T, s=0.5, color=BLUE, alpha=0.4)
         axes.quiver(*((centers - middle) @ plane).T, *(forward @ plane).T, color=ORANGE, width=0.004, scale=25)
-        axes.set_xlim(-reach, reach)
-        axes.set_ylim(-reach, reach)
-        axes.set_aspect("equal")
+        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     return figure
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -12,20 +12,17 @@ from PIL import Image
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
 from warp_splat.scene import colmap, images, takes_colmap, transforms, with_masks
+from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_sampling
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.text import few
 
-if TYPE_CHECKING:
-    import pycolmap
-
 Level = Literal["ok", "note", "warning", "error"]
 THUMBNAIL = 240  # px, the longer side
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """A verdict: which check, how bad, and one sentence."""
 
     check: str
@@ -62,31 +59,26 @@ class Subject:
 
 def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
     """Read what can be read of the scene in ``source``, with its images in ``folder`` if it is COLMAP's."""
-    if takes_colmap(source):
-        subject = Subject(source, source / folder, folder)
-        findings = list(_read_colmap(subject))
-    else:
-        subject, findings = Subject(source, source, random_points=(source / transforms.TRAIN).is_file()), []
-        try:
+    of_colmap, findings = takes_colmap(source), []
+    subject = Subject(source, source / folder if of_colmap else source, folder)
+    try:
+        if of_colmap:
+            findings += _read_colmap(subject)
+        else:
+            subject.random_points = (source / transforms.TRAIN).is_file()
             train, test, points, _ = transforms.read_transforms(source, lambda line: None)
-            subject.points = points.astype(np.float64)
-            subject.photos = train + test
-        except InputError as error:
-            findings.append(Finding("transforms", "error", str(error)))
+            subject.points, subject.photos = points.astype(np.float64), train + test
+    except InputError as error:
+        findings.append(Finding("model" if of_colmap else "transforms", "error", str(error)))
     subject.photos = with_masks(subject.photos, source, lambda line: None)
     findings += _decode(subject)
     return subject, findings
 
 
 def _read_colmap(subject: Subject) -> Iterator[Finding]:
-    """Read the largest model and what belongs to it."""
+    """Read the largest model and what belongs to it. Raises InputError if there is none."""
     models: dict[str, pycolmap.Reconstruction] = {}
-    try:
-        folders = colmap.find_models(subject.source / "sparse")
-    except InputError as error:
-        yield Finding("model", "error", str(error))
-        return
-    for path in folders:
+    for path in colmap.find_models(subject.source / "sparse"):
         try:
             models[path.relative_to(subject.source).as_posix()] = colmap.read_model(path)
         except InputError as error:
@@ -143,28 +135,25 @@ def _match_files(subject: Subject) -> Iterator[Finding]:
 def _decode(subject: Subject) -> Iterator[Finding]:
     """Read every image and every mask to its end; fills the thumbnails and what the images are."""
 
-    def read(photo: Photo) -> tuple[np.ndarray, list[list[str]]] | str:
+    def read(photo: Photo) -> tuple[np.ndarray, list[list[str]]]:
         """A thumbnail, and the lists that the photo belongs to."""
-        try:
-            image, alpha, linear = images.read_pixels(photo.path, 0.0)
-            lists = [subject.alpha] * (alpha is not None) + [subject.linear] * linear
-            if photo.mask and not images.read_mask(photo.mask, (image.shape[1], image.shape[0]), False).any():
-                lists.append(subject.black)
-            image = to_srgb(image.clip(0), np.where) if linear else image
-            small = Image.fromarray(np.rint(255 * image.clip(0, 1)).astype(np.uint8))
-            small.thumbnail((THUMBNAIL, THUMBNAIL))
-            return np.array(small), lists
-        except InputError as error:
-            return str(error)
+        image, alpha, linear = images.read_pixels(photo.path, 0.0)
+        lists = [subject.alpha] * (alpha is not None) + [subject.linear] * linear
+        if photo.mask and not images.read_mask(photo.mask, (image.shape[1], image.shape[0]), False).any():
+            lists.append(subject.black)
+        image = to_srgb(image.clip(0), np.where) if linear else image
+        small = Image.fromarray(np.rint(255 * image.clip(0, 1)).astype(np.uint8))
+        small.thumbnail((THUMBNAIL, THUMBNAIL))
+        return np.array(small), lists
 
     with ThreadPoolExecutor(images.THREADS) as pool:
-        outcomes = list(pool.map(read, subject.photos))
+        outcomes = [pool.submit(read, photo) for photo in subject.photos]
     for photo, outcome in zip(subject.photos, outcomes, strict=True):
-        if isinstance(outcome, str):
-            yield Finding("files", "error", outcome)
-        else:
-            subject.thumbnails[photo.name], lists = outcome
+        try:
+            subject.thumbnails[photo.name], lists = outcome.result()
             for names in lists:
                 names.append(photo.name)
+        except InputError as error:
+            yield Finding("files", "error", str(error))
     if subject.photos and len(subject.thumbnails) == len(subject.photos):
         yield Finding("files", "ok", f"{len(subject.photos)} images of {subject.root} were read to their ends.")
