@@ -29,8 +29,9 @@ from warp_splat.runtime.launch import launch_on_tape, open_tape
 AT_ONCE = 2**20  # Gaussians of views that are drawn together, or 16 times as many pixels
 TOGETHER, PLACES = 32, 1024  # that are kept: of worlds that are drawn together, and of views
 Seen = tuple[slice, dict[str, wp.array]]  # views, and their pixels by their names, on black
-#: Of what images are; others are of uint32.
-KINDS = {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}
+#: Of what images are.
+KINDS = dict.fromkeys(("color_image", "shape_index_image", "mesh_color", "mesh_index"), wp.uint32)
+KINDS |= {"rgb_image": wp.vec3, "forward_depth_image": wp.float32, "mesh_depth": wp.float32}
 
 
 @dataclass(eq=False)
@@ -47,15 +48,6 @@ class Piece:
 def count_of(pieces: Sequence[Piece]) -> int:
     """How many Gaussians they have."""
     return sum(piece.source.count for piece in pieces)
-
-
-@dataclass
-class Layout:
-    """What the same Gaussians in the same order share, and room for what a camera sees of them."""
-
-    scales: wp.array  # [N] vec3
-    opacities: wp.array  # [N]
-    room: tuple[wp.array, wp.array, wp.array]  # means, quats and colors in a camera's frame
 
 
 class SensorSplatCamera:
@@ -149,10 +141,7 @@ class SensorSplatCamera:
             InputError: if an image is of another shape, one of meshes has no depth, a view is of no world, or an
                 argument is of another type.
         """
-        given = {"rgb_image": rgb_image, "color_image": color_image, "forward_depth_image": forward_depth_image}
-        given |= {"shape_index_image": shape_index_image}
-        given |= {"mesh_color": mesh_color, "mesh_depth": mesh_depth, "mesh_index": mesh_index}
-        given = {name: array for name, array in given.items() if array is not None}
+        given = {name: array for name, array in locals().items() if name in KINDS and array is not None}
         bodies = 0 if (placed := getattr(state, "body_q", None)) is None else len(placed)
         if bodies < self.model.body_count:
             raise InputError(f"state: expected one of the model's, of {self.model.body_count} bodies, got {bodies}.")
@@ -167,7 +156,7 @@ class SensorSplatCamera:
             raise InputError(f"camera: expected one, or {count} of one size, got {len(cameras)} of {len(sizes)} sizes.")
         shape = (*camera_transforms.shape[::-1], *sizes.pop())  # pyright: ignore[reportAttributeAccessIssue]
         for name, array in given.items():
-            kind, is_array = KINDS.get(name, wp.uint32), isinstance(array, wp.array)
+            kind, is_array = KINDS[name], isinstance(array, wp.array)
             if not is_array or (array.shape, array.dtype) != (shape, kind):
                 found = f"{array.shape} of {array.dtype.__name__}" if is_array else type(array).__name__
                 raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
@@ -244,16 +233,16 @@ class SensorSplatCamera:
 
     def _place(self, state, camera_transforms, first: int, table: Sequence[list[Piece]]) -> tuple[wp.array, ...]:
         """The Gaussians of pieces, view after view, in the camera's frame; on a tape, in arrays of their own."""
-        layout = self._layout_of(*(tuple((piece.source, piece.size) for piece in pieces) for pieces in table))
-        made = layout.room
+        sources = (tuple((piece.source, piece.size) for piece in pieces) for pieces in table)
+        scales, opacities, *made = self._layout_of(*sources)
         if open_tape():
-            made = tuple(wp.empty_like(array, requires_grad=True) for array in layout.room)
+            made = [wp.empty_like(array, requires_grad=True) for array in made]
         for splats, where in self._places_of(first, *map(tuple, table)):
             count, coefficients = splats.sh.shape
             inputs = [where, splats, self.model.shape_transform, state.body_q, camera_transforms]
             launch_on_tape(make_place(coefficients), count * len(where), inputs, made, self.device)
         means, quats, sh = made
-        return means, quats, layout.scales, layout.opacities, sh
+        return means, quats, scales, opacities, sh
 
     def _places(self, first: int, *table: tuple[Piece, ...]) -> list[tuple[ShapeView, wp.array]]:
         """The Gaussians of each source, and where they are placed; see :func:`make_place`."""
@@ -276,17 +265,18 @@ class SensorSplatCamera:
         view.sh = wp.array(sh, dtype=wp.vec3, device=self.device)
         return view
 
-    def _layout(self, *views: tuple[tuple[Any, float], ...]) -> Layout:
-        """Of the Gaussians of sources, each in its size, view after view."""
+    def _layout(self, *views: tuple[tuple[Any, float], ...]) -> tuple[wp.array, ...]:
+        """Of the Gaussians of sources, each in its size, view after view: what they share in this order, and room.
+
+        Their scales [N] and opacities [N]; for means, quats and colors in a camera's frame.
+        """
         parts = [part for view in views for part in view]
         scales = np.concatenate([np.empty((0, 3)), *(size * source.scales for source, size in parts)])
         opacities = np.concatenate([np.empty(0), *(source.opacities for source, _ in parts)])
+        scales = wp.array(scales, dtype=wp.vec3, device=self.device)
         new = partial(wp.empty, len(opacities), device=self.device)
-        return Layout(
-            wp.array(scales, dtype=wp.vec3, device=self.device),
-            wp.array(opacities, dtype=float, device=self.device),
-            (new(dtype=wp.vec3), new(dtype=wp.quat), new(dtype=wp.vec3).reshape((-1, 1))),
-        )
+        room = new(dtype=wp.vec3), new(dtype=wp.quat), new(dtype=wp.vec3).reshape((-1, 1))
+        return scales, wp.array(opacities, dtype=float, device=self.device), *room
 
     def _find_owners(self, *worlds: int) -> wp.array:
         """The shape of each Gaussian of these worlds, [W, most]."""
