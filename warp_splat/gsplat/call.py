@@ -159,28 +159,21 @@ def _tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:
     if request.packed:
         ids = dict(zip(ids, seen.drawn.nonzero().unbind(1), strict=True))
         numbers = seen.drawn.flatten().cumsum(0) - 1  # of those that are packed
-    listed, depths, sizes, begins = [], [], [], 0
-    per_gaussian = torch.zeros(scenes * cameras, count, dtype=torch.int32, device=numbers.device)
-    offsets = torch.empty(scenes * cameras, tiles_x * tiles_y, dtype=torch.int32, device=numbers.device)
-    for view, bins in enumerate(lists):
-        gaussians = wp.to_torch(bins.gaussians).long()[bins.instances.long()]
-        listed.append(numbers[gaussians + view * count])
-        depths.append(seen.depths.detach().flatten(0, 1)[view, gaussians])
-        sizes.append(bins.ranges[:, 1] - bins.ranges[:, 0])
-        per_gaussian[view] = torch.bincount(gaussians, minlength=count).int()
-        offsets[view] = bins.ranges[:, 0] + begins
-        begins += len(gaussians)
+    listed = [wp.to_torch(bins.gaussians)[bins.instances.long()].long() for bins in lists]
+    gaussians = torch.cat([places + view * count for view, places in enumerate(listed)])  # of all views
+    sizes = torch.cat([bins.ranges[:, 1] - bins.ranges[:, 0] for bins in lists])
+    per_gaussian = torch.bincount(gaussians, minlength=len(numbers)).int()
     keys = torch.arange(scenes * cameras * tiles_x * tiles_y, device=numbers.device)
     bits = max((tiles_x * tiles_y - 1).bit_length(), 1)
-    keys = ((keys // (tiles_x * tiles_y)) << bits | keys % (tiles_x * tiles_y)).repeat_interleave(torch.cat(sizes))
+    keys = ((keys // (tiles_x * tiles_y)) << bits | keys % (tiles_x * tiles_y)).repeat_interleave(sizes)
     return {
         **ids,
         "tile_width": tiles_x,
         "tile_height": tiles_y,
-        "tiles_per_gauss": _placed(request, seen, per_gaussian.view(scenes, cameras, count)),
-        "isect_ids": (keys << 32) | torch.cat(depths).view(torch.int32).long(),
-        "flatten_ids": torch.cat(listed).int(),
-        "isect_offsets": offsets.view(*shape, tiles_y, tiles_x),
+        "tiles_per_gauss": _placed(request, seen, per_gaussian.view(seen.drawn.shape)),
+        "isect_ids": (keys << 32) | seen.depths.detach().flatten()[gaussians].view(torch.int32).long(),
+        "flatten_ids": numbers[gaussians].int(),
+        "isect_offsets": (sizes.cumsum(0) - sizes).int().view(*shape, tiles_y, tiles_x),
         "width": request.width,
         "height": request.height,
         "tile_size": TILE,

@@ -81,9 +81,8 @@ def _draw_view(
     bins = driver.bin(splats, frame, options)
     blending = Blending(bins, frame, options, driver)
     image, alpha, depth = blend(splats, background, blending)
-    alpha, depth, others = alpha[..., None], depth[..., None], image[..., :0]
-    if colors.shape[1] > 3:
-        others = blend_channels(splats, colors[:, 3:], blending)
+    alpha, depth = alpha[..., None], depth[..., None]
+    others = blend_channels(splats, colors[:, 3:], blending) if colors.shape[1] > 3 else image[..., :0]
     if into is not None:
         channels = [first, colors[:, 3:], *([seen.depths[:, None]] if options.depth else []), first.new_ones(count, 1)]
         channels = torch.cat(channels, 1)
