@@ -60,7 +60,7 @@ def image_loss(
         counts = mask != 0
         image, target = (torch.where(counts, picture, picture.new_zeros(())) for picture in (image, target))
     loss = LossInBlocks if driver_of(image.device).lanes == 1 else ImageLoss
-    return loss.apply(image, target, lambda_dssim, (0.0, 1.0) if clamped else (-math.inf, math.inf))
+    return loss.apply(image, target, lambda_dssim, wp.vec2(0.0, 1.0) if clamped else wp.vec2(-math.inf, math.inf))
 
 
 def _problem(image, target, lambda_dssim: float, mask) -> str | None:
@@ -169,21 +169,19 @@ def _bands(height: int) -> tuple[torch.Tensor, int]:
     return torch.tensor(bounds, dtype=torch.int32, device="cpu"), len(bounds) - 1
 
 
-def _pictures(image: torch.Tensor, limits: tuple[float, float], target: torch.Tensor, centers) -> ssim.Pictures:
+def _pictures(image: torch.Tensor, limits: wp.vec2, target: torch.Tensor, centers) -> ssim.Pictures:
     """What both kernels read of [H, L]: the target as floats or as bytes, the other is empty."""
     floats, levels = _by_type(target)
     return pack_struct(
-        ssim.Pictures, image=image, image_taps=_taps(image), limits=wp.vec2(*limits), centers=wp.vec2(*centers),
+        ssim.Pictures, image=image, image_taps=_taps(image), limits=limits, centers=wp.vec2(*centers),
         target=floats, target_taps=_taps(floats), levels=levels, level_taps=_taps(levels, ssim.vec16b),
     )  # fmt: skip
 
 
-def _dense(image: torch.Tensor, target: torch.Tensor, centers: torch.Tensor, limits: tuple[float, float]):
+def _dense(image: torch.Tensor, target: torch.Tensor, centers: torch.Tensor, limits: wp.vec2):
     """Likewise for the kernels of a GPU."""
     floats, levels = _by_type(target)
-    return pack_struct(
-        PicturesView, image=image, limits=wp.vec2(*limits), target=floats, levels=levels, centers=centers
-    )
+    return pack_struct(PicturesView, image=image, limits=limits, target=floats, levels=levels, centers=centers)
 
 
 def _by_type(target: torch.Tensor) -> list[torch.Tensor]:
