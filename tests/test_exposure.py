@@ -18,7 +18,7 @@ from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
 from warp_splat.errors import InputError
-from warp_splat.formats.exposures import read_exposures
+from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.finished import as_photographed, make_renderer
@@ -299,8 +299,9 @@ def test_the_viewer_shows_it_within_the_photograph(fake_viser, monkeypatch):
     model, frames = GaussianModel.from_splats(small_splats(50)), []
     draw = make_renderer(model)
     for factor in (1.0, 0.25):
-        exposed = lambda image, view, factor=factor: image * factor  # noqa: E731
-        with server.Viewer(draw, lambda: model.parameters["means"], some_scene(), 8080, exposed=exposed) as viewer:
+        maps = {"0.png": np.array([factor - 1], np.float32)}
+        exposures = lambda maps=maps: Exposures("gain", 0.0, np.zeros(2, np.float32), maps)  # noqa: E731
+        with server.Viewer(draw, model, some_scene(), 8080, exposures=exposures) as viewer:
             client = entered(viewer, some_scene().train[1].camera, size=(120, 60))
             drawn(viewer)
             free = client.frames[-1][0]

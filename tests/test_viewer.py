@@ -28,7 +28,7 @@ from warp_splat.viewer.watcher import MOST
 def viewer(fake_viser):
     model, scene = GaussianModel.from_splats(small_splats(50)), some_scene()
     draw = make_renderer(model)
-    with server.Viewer(draw, lambda: model.parameters["means"], scene, 8080) as viewer:
+    with server.Viewer(draw, model, scene, 8080) as viewer:
         yield viewer
     assert viewer.server.stopped
 
@@ -180,7 +180,7 @@ def test_small_models(fake_viser, count, coefficients):
     """Also an empty one, and one without spherical harmonics."""
     model = GaussianModel.from_splats(small_splats(count, coefficients))
     draw = make_renderer(model)
-    with server.Viewer(draw, lambda: model.parameters["means"], None, 8080) as viewer:
+    with server.Viewer(draw, model, None, 8080) as viewer:
         client = entered(viewer)
         for kind in ("image", "depth", "alpha"):
             viewer.watchers[1].kind.value = kind

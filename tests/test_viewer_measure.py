@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from fake_viser import PHOTO, at_rest, drawn, entered
 from splat_files import some_splats
 
@@ -43,7 +42,8 @@ def test_a_click_finds_what_it_shows(draw, lens):
 
 def test_two_clicks_are_a_distance_and_two_corners_a_box(draw, fake_viser, monkeypatch):
     at_rest(monkeypatch)
-    with server.Viewer(draw, lambda: torch.from_numpy(PLACES), None, 8080) as viewer:
+    model = GaussianModel.from_splats(some_splats(2)._replace(means=np.float32(PLACES)))
+    with server.Viewer(draw, model, None, 8080) as viewer:
         client = entered(viewer, PHOTO, (600, 400))
         ruler = viewer.watchers[1].ruler
         camera = viewer.watchers[1].camera(1e9)[0]

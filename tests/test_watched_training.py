@@ -18,7 +18,7 @@ from warp_splat.viewer import server
 
 
 def watch_training(trainer, run):
-    viewer = server.Viewer(trainer.look, lambda: trainer.model.parameters["means"], trainer.scene, 8080)
+    viewer = server.Viewer(trainer.look, trainer.model, trainer.scene, 8080)
     return viewer, TrainingViewer(trainer, run, viewer)
 
 

@@ -4,13 +4,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 
-import torch
 from tqdm import tqdm
 
-from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime import timers
 from warp_splat.runtime.interrupts import interruptible
-from warp_splat.scene.types import View
 from warp_splat.training.record import Run
 from warp_splat.training.trainer import Trainer
 from warp_splat.viewer.server import Viewer
@@ -46,8 +43,11 @@ class TrainingViewer:
         """Draw what is due; return when training may go on, or must end."""
         if not self.viewer.watchers and not self.paused:
             return
-        self._refresh_if_due()
-        told = False
+        now, told = time.monotonic(), False
+        if now >= self._refresh_at + max(REFRESH, self._drawing / SHARE):
+            self._refresh_at, self._drawing = now, 0.0
+            self._tell()
+            self.viewer.refresh()
         while not interrupted:
             if self.paused and not told:  # by a click that came while a frame was drawn, too
                 told = True
@@ -90,14 +90,6 @@ class TrainingViewer:
             self._drawing += time.monotonic() - start
         return drawn
 
-    def _refresh_if_due(self) -> None:
-        now = time.monotonic()
-        if now < self._refresh_at + max(REFRESH, self._drawing / SHARE):
-            return
-        self._refresh_at, self._drawing = now, 0.0
-        self._tell()
-        self.viewer.refresh()
-
     def _tell(self) -> None:
         run, end = self.run, self.trainer.config.learn.end_or_plan
         self._bar.value = 100.0 * run.iteration / end
@@ -117,12 +109,7 @@ def watched(trainer: Trainer, run: Run) -> Iterator[TrainingViewer | None]:
     Raises:
         InputError: if no port is free.
     """
-    scene, port = trainer.scene, trainer.config.report.port
-
-    def exposed(image: torch.Tensor, view: View) -> torch.Tensor:
-        return as_photographed(image, trainer.exposures, view.name)
-
-    means = lambda: trainer.model.parameters["means"]  # noqa: E731
-    viewer = trainer.lead(lambda: Viewer(trainer.look, means, scene, port, scene.linear, exposed))
+    scene, port, exposures = trainer.scene, trainer.config.report.port, lambda: trainer.exposures
+    viewer = trainer.lead(lambda: Viewer(trainer.look, trainer.model, scene, port, scene.linear, exposures))
     with viewer or nullcontext():
         yield TrainingViewer(trainer, run, viewer) if viewer else None

@@ -2,21 +2,17 @@
 
 from dataclasses import replace
 
-import torch
-
 from warp_splat.config import ViewConfig
 from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.finished import Finished, as_photographed
+from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
-from warp_splat.scene.types import Scene, View
-from warp_splat.viewer.server import Viewer, free_port
+from warp_splat.scene.types import Scene
+from warp_splat.viewer.server import AS_GIVEN, Viewer, free_port
 from warp_splat.viewer.watcher import LARGEST
-
-AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
 
 
 def view_model(config: ViewConfig) -> int:
@@ -36,14 +32,10 @@ def view_model(config: ViewConfig) -> int:
     options = replace(finished.options, of="trained", tolerance=config.tolerance or None)
     print("Preparing kernels (compiled once on a machine, about 40 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
-
-    def exposed(image: torch.Tensor, view: View) -> torch.Tensor:
-        return as_photographed(image, finished.exposures, view.name.removesuffix(AS_GIVEN))
-
     with memory_explained(device, model, [LARGEST], advice):
         draw, linear = finished.renderer(model, options), finished.is_linear(scene)
-        means = lambda: model.parameters["means"]  # noqa: E731
-        with Viewer(draw, means, scene, config.port, linear, exposed) as viewer, interruptible() as interrupted:
+        exposures = lambda: finished.exposures  # noqa: E731
+        with Viewer(draw, model, scene, config.port, linear, exposures) as viewer, interruptible() as interrupted:
             print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
             while not interrupted:
                 if not viewer.draw():

@@ -44,7 +44,7 @@ class Ruler:
     """
 
     def __init__(self, client: "viser.ClientHandle", subject: np.ndarray, touched: Callable[[], None]):
-        self.client, self.touched = client, touched
+        self.client, self.scene, self.touched = client, client.scene, touched
         self.clicks: list[tuple[float, float]] = []  # that wait for their points
         self.points: list[np.ndarray] = []
         self.corners: list[viser.TransformControlsHandle] = []
@@ -56,12 +56,12 @@ class Ruler:
         self.boxed.on_update(self._show_box)
 
     async def _switch(self, _) -> None:
-        self.points, scene = [], self.client.scene
+        self.points = []
         if self.measuring.value:
-            self.marks = scene.add_frame("/distance", show_axes=False)
-            scene.on_click()(self._click)
+            self.marks = self.scene.add_frame("/distance", show_axes=False)
+            self.scene.on_click()(self._click)
         else:
-            scene.remove_click_callback()
+            self.scene.remove_click_callback()
             self.marks.remove()
 
     def _click(self, event) -> None:
@@ -83,9 +83,8 @@ class Ruler:
         text, ends = " ".join(f"{value:.6g}" for value in points[0]), np.array([points[0], points[-1]])
         if len(points) == 2:
             text = f"{np.linalg.norm(ends[1] - ends[0]):.4g}{unit}"
-        scene = self.client.scene
-        scene.add_line_segments("/distance/line", ends[None], COLOR, thickness=2.0, thickness_units="screen")
-        scene.add_label("/distance/label", text, position=ends[1])
+        self.scene.add_line_segments("/distance/line", ends[None], COLOR, thickness=2.0, thickness_units="screen")
+        self.scene.add_label("/distance/label", text, position=ends[1])
         self.note.content = text
 
     async def _show_box(self, _) -> None:
@@ -94,11 +93,11 @@ class Ruler:
             self.box.remove()
             self.note.content = ""
             return
-        self.box = self.client.scene.add_frame("/box", show_axes=False)
+        self.box = self.scene.add_frame("/box", show_axes=False)
         reach = REACH * float(np.linalg.norm(self.subject - np.asarray(self.client.camera.position)))
         options = {"scale": reach, "disable_rotations": True}
         self.corners = [
-            self.client.scene.add_transform_controls(f"/box/{i}", position=self.subject + side * reach, **options)
+            self.scene.add_transform_controls(f"/box/{i}", position=self.subject + side * reach, **options)
             for i, side in enumerate((-1, 1))
         ]
         for corner in self.corners:
@@ -110,7 +109,5 @@ class Ruler:
         if not self.boxed.value:  # dragged as it went
             return
         ends = np.sort([corner.position for corner in self.corners], axis=0)
-        self.client.scene.add_box(
-            "/box/edges", COLOR, dimensions=ends[1] - ends[0], position=ends.mean(0), wireframe=True
-        )
+        self.scene.add_box("/box/edges", COLOR, dimensions=ends[1] - ends[0], position=ends.mean(0), wireframe=True)
         self.note.content = f"`--crop {' '.join(f'{value:.6g}' for value in ends.ravel())}`"

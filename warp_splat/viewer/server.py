@@ -14,13 +14,15 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from warp_splat.camera import Camera
 from warp_splat.config import LAST_PORT, TILE
 from warp_splat.errors import InputError
+from warp_splat.formats.exposures import Exposures
+from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
 from warp_splat.rendering.camera_paths import focus_point
+from warp_splat.rendering.finished import as_photographed
 from warp_splat.scene.types import Scene, View
 from warp_splat.viewer.browser_camera import look_at_all, look_from
 from warp_splat.viewer.picture import KINDS, overlay, paint
@@ -34,9 +36,9 @@ PORTS = 100  # that are tried, from the one asked for
 IDLE = 0.2  # seconds between two looks at Ctrl-C
 DESERTED = 10.0  # seconds after the last browser has left; one that loads the page again takes less
 MOVING_QUALITY, SHARP_QUALITY = 75, 95  # of JPEG
+AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
 
 Draw = Callable[..., RenderOutput]
-Exposed = Callable[[torch.Tensor, View], torch.Tensor]  # an image [H, W, 3] as the camera of a photograph took it
 
 
 class Viewer:
@@ -44,11 +46,11 @@ class Viewer:
 
     Args:
         draw: renders a camera, with or without depth; with ``median=True``, with the median depth.
-        means: where the Gaussians are at present, [N, 3].
+        model: the Gaussians as they are at present.
         scene: its photographs can be jumped to; None if there are none.
         port: where to serve; if it is busy, the next free one.
         linear: the colors are in linear light.
-        exposed: how a photograph's own colors come about, where its camera is shown.
+        exposures: how photographs were exposed, as far as it is known at present: so are frames of their cameras.
 
     Raises:
         InputError: if no port is free.
@@ -57,13 +59,13 @@ class Viewer:
     def __init__(
         self,
         draw: Draw,
-        means: Callable[[], torch.Tensor],
+        model: GaussianModel,
         scene: Scene | None,
         port: int,
         linear: bool = False,
-        exposed: Exposed = lambda image, view: image,
+        exposures: Callable[[], Exposures | None] = lambda: None,
     ):
-        self.draw_camera, self.means, self.linear, self.exposed = draw, means, linear, exposed
+        self.draw_camera, self.model, self.linear, self.exposures = draw, model, linear, exposures
         self.unit = " m" if scene and scene.coordinates else ""
         self.views: dict[str, View] = {}
         if scene:
@@ -71,7 +73,7 @@ class Viewer:
             self.subject, up, _ = focus_point(scene)
             look = look_from(scene.train[0].camera, self.subject, up)
         else:
-            look = look_at_all(means().detach().cpu().numpy())
+            look = look_at_all(model.parameters["means"].detach().cpu().numpy())
             self.subject = look.target
         self.watchers: dict[int, Watcher] = {}
         self.left_at = -DESERTED  # when the last browser did, on time.monotonic
@@ -83,7 +85,8 @@ class Viewer:
         self.announcement = f"Viewer at {self.address}" + f" (port {port} is taken)" * (served != port)
         self.gui = self.server.gui
         self.gui.configure_theme(show_share_button=False)  # a click on it would show the page to the internet
-        self._facts = self.gui.add_markdown(self._describe())
+        self._facts = self.gui.add_markdown("")
+        self.refresh()
         self.server.scene.set_up_direction(look.up)
         start = self.server.initial_camera
         start.position, start.look_at, start.up, start.fov = look
@@ -108,9 +111,6 @@ class Viewer:
         """Whether nobody has been looking for DESERTED seconds."""
         return not self.watchers and time.monotonic() - self.left_at >= DESERTED
 
-    def _describe(self) -> str:
-        return f"{len(self.means()):,} Gaussians"
-
     async def _enter(self, client: "viser.ClientHandle") -> None:
         self.watchers[client.client_id] = Watcher(client, self.views, self.subject, self.wake)
 
@@ -130,7 +130,7 @@ class Viewer:
 
     def refresh(self) -> None:
         """The Gaussians have changed: draw again what was drawn at rest."""
-        self._facts.content = self._describe()
+        self._facts.content = f"{len(self.model):,} Gaussians"
         for watcher in self._present():
             watcher.sharp = False
 
@@ -162,7 +162,8 @@ class Viewer:
         kind = watcher.kind.value
         out = self.draw_camera(camera, kind == "depth")
         if view is not None:
-            out.image[box] = self.exposed(out.image[box].clone(), view)
+            name = view.name.removesuffix(AS_GIVEN)
+            out.image[box] = as_photographed(out.image[box].clone(), self.exposures(), name)
         frame, note = paint(out, kind, self.linear)
         if view is not None and watcher.opacity.value > 0:
             frame = overlay(frame, view.picture, box, watcher.opacity.value)
