@@ -38,10 +38,10 @@ TASK, COST = Task(500_000, 10_000, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.
 def test_costs_are_found_again():
     places = [(10_000, 30_000), (10_000, 500_000), (200_000, 500_000)]
     found = Cost.of([StepTime(n, p, COST.step + COST.gaussian * n + COST.pixel * p) for n, p in places])
-    assert vars(found) == pytest.approx(vars(COST))
+    assert found == pytest.approx(COST)
     seconds = (0.021, 0.02, 0.05)  # fewer pixels took longer
     noisy = Cost.of([StepTime(*place, took) for place, took in zip(places, seconds, strict=True)])
-    assert min(vars(noisy).values()) >= 0
+    assert min(noisy) >= 0
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.7])
@@ -83,7 +83,7 @@ def test_short_plans_reach_their_budget(factor, start):
 
 
 def test_a_slower_machine_gets_fewer_steps_and_gaussians():
-    slow = Cost(*(10 * value for value in vars(COST).values()))
+    slow = Cost(*(10 * value for value in COST))
     few, many = (plan_for(FAST, cost, 60.0, TASK) for cost in (slow, COST))
     assert few.learn.iterations < many.learn.iterations / 4 and few.grow.max_gaussians < many.grow.max_gaussians
 

@@ -9,7 +9,6 @@ double. A clock decides on the end itself
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +35,7 @@ class StepTime(NamedTuple):
     seconds: float
 
 
-@dataclass(frozen=True)
-class Cost:
+class Cost(NamedTuple):
     """Seconds of a step: a part of its own, one of each Gaussian, and one of each pixel."""
 
     step: float

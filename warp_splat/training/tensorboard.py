@@ -2,12 +2,8 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from warp_splat.errors import imported
-
-if TYPE_CHECKING:
-    from tensorboardX import SummaryWriter
 
 
 class EventLog:
@@ -34,8 +30,8 @@ class EventLog:
             self.writer.close()
 
 
-def writer_class() -> "type[SummaryWriter]":
-    """What writes event files.
+def writer_class() -> type:
+    """What writes event files, tensorboardX's ``SummaryWriter``.
 
     Raises:
         InputError: if tensorboardX is not installed.
