@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from warp_splat.formats.coordinates import AXES, MODEL_FROM_WORLD
 from warp_splat.formats.files import Unexpected, reading
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.sfm.stages import opened
-from warp_splat.text import few
+from warp_splat.text import Report, few
 
 POSITIONS, DISTANCES = ["name", "x", "y", "z"], ["name", "other", "distance"]  # first lines of files
 LEAST = 3  # positions
@@ -24,9 +23,7 @@ COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
 
 
-def georeference(
-    model: pycolmap.Reconstruction, database: Path, source: str, seed: int, say: Callable[[str], object]
-) -> dict | None:
+def georeference(model: pycolmap.Reconstruction, database: Path, source: str, seed: int, say: Report) -> dict | None:
     """Turn, scale and move ``model`` into the frame of ``formats/coordinates.py``.
 
     Args:

@@ -16,14 +16,13 @@ from scipy.ndimage import laplace
 from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.files import atomic_write
+from warp_splat.text import Report
 
 SHARPNESS_WIDTH = 960  # px; frames are shrunk to this width before they are judged, and noise with them
 QUALITY = 97  # of the JPEG files, 0 to 100
 
 
-def sample_frames(
-    path: Path, folder: Path, config: SfmConfig, report: Callable[[str], object], advance: Callable[[int], object]
-) -> int:
+def sample_frames(path: Path, folder: Path, config: SfmConfig, report: Report, advance: Callable[[int], object]) -> int:
     """Write the sharpest frame of each of ``config.frames`` equal spans of a video, as JPEG named by its number.
 
     Args:

@@ -4,7 +4,7 @@ They see small images, and are judged on training photographs that are held back
 them together take SHARE of the training's own work at most, by a count of steps and pixels.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from warp_splat.evaluation.metrics import cc_psnr, ssim
 from warp_splat.flags import default_of
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.types import Scene, as_shown
+from warp_splat.text import Report
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import AUTO, PARTS
 from warp_splat.training.photographs import shares_of_size, shrink_at
@@ -32,9 +33,7 @@ SHORTEST, LONGEST = 100, 1500  # steps of a training
 GAIN = 0.1  # dB of CC_PSNR, in every round
 
 
-def settle_parts(
-    config: TrainConfig, scene: Scene, processes: Processes, say: Callable[[str], None]
-) -> tuple[TrainConfig, list[str]]:
+def settle_parts(config: TrainConfig, scene: Scene, processes: Processes, say: Report) -> tuple[TrainConfig, list[str]]:
     """The options with names in place of ``--parts auto``; sentences on what was weighed, and on idle options."""
     verdicts: dict[str, Verdict] = {}
     if config.model.parts == AUTO:
@@ -73,7 +72,7 @@ def _changed(options: Any) -> list[str]:
 
 
 def _tried(
-    config: TrainConfig, scene: Scene, sure: list[str], suggested: dict[str, Verdict], say: Callable[[str], None]
+    config: TrainConfig, scene: Scene, sure: list[str], suggested: dict[str, Verdict], say: Report
 ) -> dict[str, Verdict]:
     """A verdict by trainings on each part that is suggested, beside those that are sure and those taken before it."""
     count = FOLDS * (1 + len(suggested))
