@@ -125,10 +125,9 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
         files = [(source.name, source)]
     record = {"options": options, "files": {name: path.stat().st_size for name, path in files}}
     if (work / "input.json").is_file():
-        try:
+        before = None
+        with suppress(ValueError):
             before = json.loads((work / "input.json").read_text(encoding="utf-8"))
-        except ValueError:
-            before = None
         if before != record:
             raise InputError(
                 f"{scene}: expected a folder begun with the same photographs and options, but this one was begun with "

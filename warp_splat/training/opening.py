@@ -50,9 +50,8 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         writer_class()
     if machine.portable and not PORTABLE:
         raise InputError("portable: expected to be set before kernels are loaded; set WARP_SPLAT_PORTABLE=1 instead.")
-    begun = None
-    if data.start_checkpoint:  # whole, without its arrays: beside the trainer's they would take as much memory again
-        begun = replace(load_own(data.start_checkpoint, processes), arrays={})
+    # whole, without its arrays: beside the trainer's they would take as much memory again
+    begun = replace(load_own(data.start_checkpoint, processes), arrays={}) if data.start_checkpoint else None
     if begun and (kept := load_options(begun.path)["portable"]) != PORTABLE:
         expected, here = ("1", "unset") if kept else ("unset", "1")
         raise InputError(

@@ -170,9 +170,8 @@ class Optimizer:
             table.moments = table.moments or [self._zeros(table.leaf.shape, self._kept_as(name)) for _ in MOMENTS]
             if radii is None:
                 table.steps += 1
+                biases = [1.0 - power(beta, table.steps) for beta in self.betas]
             if grad is not None and grad.numel() > 0:  # degree 0: zeros would change nothing but the count
-                if radii is None:
-                    biases = [1.0 - power(beta, table.steps) for beta in self.betas]
                 tensors = [table.leaf.detach(), *table.moments]
                 if grad.is_sparse:  # only rows that the view shows are taken out of their file, and put back
                     homes.append(tensors)

@@ -195,10 +195,9 @@ class TrainConfig:
         owners: dict[str, type] = {}
         for group in found:
             for item in fields(group):
-                if item.name in owners:
-                    names = f"{owners[item.name].__name__} and {group.__name__}"
+                if (owner := owners.setdefault(item.name, group)) is not group:
+                    names = f"{owner.__name__} and {group.__name__}"
                     raise InputError(f"--{item.name}: expected one kind of options with it, found {names}; rename one.")
-                owners[item.name] = group
         return found
 
     @property
