@@ -154,10 +154,10 @@ class AnyCamera(oracle.Pinhole):
         """A panorama once more, a turn to the left and to the right: [3 N]."""
         if camera.lens is None or camera.lens.model != AROUND:
             return splats
-        again = {name: torch.cat([getattr(splats, name)] * 3) for name in splats.__dataclass_fields__}
+        again = oracle.Splats(*(torch.cat([part] * 3) for part in splats))
         shift = torch.tensor([[camera.width, 0]], dtype=torch.float64)
         shown = torch.cat([splats.means2d, splats.means2d + shift, splats.means2d - shift])
-        return oracle.Splats(**{**again, "means2d": shown})
+        return again._replace(means2d=shown)
 
 
 EYE = AnyCamera()

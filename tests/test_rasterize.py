@@ -63,9 +63,8 @@ def truth(name, options):
         weight[out.fragile] = 0
         upstream[key] = weight / (4 if key == "depth" else 1)  # depths are about 4
     gradients = backward(out, upstream, leaves)
-    for key in ("image", "alpha", "depth", "means2d"):
-        setattr(out, key, getattr(out, key).detach())
-    return Truth(scene, out, upstream, gradients)
+    known = {key: getattr(out, key).detach() for key in ("image", "alpha", "depth", "means2d")}
+    return Truth(scene, out._replace(**known), upstream, gradients)
 
 
 def rasterize(scene, leaves=None, options=None, **more):

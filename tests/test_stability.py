@@ -83,7 +83,7 @@ def test_a_wrong_gradient_fails(monkeypatch):
 def test_a_gaussian_that_should_be_left_out_fails():
     truth = small_truth()
     drawn = int(truth.out.touches.nonzero()[0])
-    stated = replace(truth, problem=replace(truth.problem, left_out=(drawn,)))
+    stated = truth._replace(problem=replace(truth.problem, left_out=(drawn,)))
     assert any("left out" in failure for failure in verdict.judge(stated, "manual").failures)
 
 
@@ -173,7 +173,7 @@ def test_run_writes_and_counts(tmp_path, monkeypatch):
 
 def test_a_verdict_names_the_modes_that_failed():
     good = verdict.Outcome("nothing", 0.0, 0.0, None, 0.0, "-", ())
-    bad = replace(good, failures=("wrong",))
+    bad = good._replace(failures=("wrong",))
     verdicts = [
         cases.Row(cases.CASES[0], {"manual": first, "stored": second}).verdict
         for first, second in ((good, good), (good, bad), (bad, bad))

@@ -8,7 +8,7 @@ A renderer in float32 may decide otherwise where a quantity lies within rounding
 marks the pixels where that could be seen, so that a test can leave them out, and count them.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
@@ -27,8 +27,7 @@ UNSEEN = 1e-5  # a blending weight (and its gradient) too small to tell, a tenth
 BAND = 1e-3  # a Gaussian whose largest alpha is this close (relative) to 1/255 may be culled or not
 
 
-@dataclass
-class Splats:
+class Splats(NamedTuple):
     """Projected Gaussians, [N] each; ``live`` is False where the rest means nothing."""
 
     means2d: torch.Tensor  # [N, 2] px
@@ -39,8 +38,7 @@ class Splats:
     live: torch.Tensor  # [N] bool
 
 
-@dataclass
-class Render:
+class Render(NamedTuple):
     """What the renderer should return, and how sure we are."""
 
     image: torch.Tensor  # [H, W, 3]

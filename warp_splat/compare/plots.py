@@ -47,8 +47,7 @@ def plot_errors(path: Path, measurements: Sequence[Measurement]) -> None:
                 (handles[item.variant],) = axes.plot(time, error, color=color, marker=marker, markersize=5, ls="")
         axes.set(xscale="log", yscale="log", xlim=(0.7 * min(times), right), ylim=(LEAST, 3.0))
         axes.minorticks_off()
-        axes.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=NullLocator())
-        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), minor_locator=NullLocator(), major_formatter="{x:g}")
     figure.supylabel("relative error of the worst gradient", fontsize=9, color=report.INK)
     look = {"loc": "outside lower center", "ncols": 5, "fontsize": 8, "frameon": False}
     figure.legend(list(handles.values()), list(handles), **look)

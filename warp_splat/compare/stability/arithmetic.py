@@ -1,7 +1,6 @@
 """Extremes outside the pixel loop: SSIM, Adam, and more tile instances than fit."""
 
 import re
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -58,7 +57,7 @@ def loss(scale: float, noise: float, _mode: str) -> Outcome:
     outcome = bounded(says, "loss", value_error, LOSS_LIMIT)
     failures = outcome.failures + bounded(says, "gradient", gradient_error, GRADIENT_LIMIT).failures
     failures += () if value.isfinite().all() and leaf.grad.isfinite().all() else ("not finite",)
-    return replace(outcome, gradient_error=gradient_error, gradient_limit=GRADIENT_LIMIT, failures=failures)
+    return outcome._replace(gradient_error=gradient_error, gradient_limit=GRADIENT_LIMIT, failures=failures)
 
 
 def exact_adam(gradient: float, rate: float, sparse: bool) -> float:

@@ -7,8 +7,8 @@ Algorithms, 2002: n eps for a product of n rounded factors, and the condition of
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from warp_splat.compare.stability import arithmetic, pixel_loop, shapes
 from warp_splat.compare.stability.verdict import EPS, Case, Outcome
@@ -19,8 +19,7 @@ CASES = (*pixel_loop.CASES, *shapes.CASES, *arithmetic.CASES)
 NO_MODE = ""  # of a case that involves no adjoint
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A case and its outcome in every mode; in ``NO_MODE`` alone where none is involved."""
 
     case: Case
@@ -49,7 +48,7 @@ def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = prin
     rows = [Row(case, {mode: case.run(mode) for mode in modes_of(case, modes)}) for case in CASES]
     say(format_table(["case", "float64 says", "value", *modes, "limit", "counted", "verdict"], table(rows, modes)))
     flat = [
-        {"case": row.case.name, "group": row.case.group, "claim": row.case.claim, "mode": mode, **asdict(outcome)}
+        {"case": row.case.name, "group": row.case.group, "claim": row.case.claim, "mode": mode, **outcome._asdict()}
         for row in rows
         for mode, outcome in row.outcomes.items()
     ]

@@ -81,14 +81,14 @@ def stop_edge(mode: str) -> Outcome:
     chosen, counts = [], [0, 0]
     for steps, builds in EDGES.items():
         asked = edge(steps, 1.0)
-        outcomes = [check.judge(replace(truth(build), problem=asked), mode) for build in builds]
+        outcomes = [check.judge(truth(build)._replace(problem=asked), mode) for build in builds]
         decision = int(outcomes[1].value_error < outcomes[0].value_error)
         counts[decision] += 1
         chosen.append(outcomes[decision])
     worst = max(chosen, key=lambda outcome: (len(outcome.failures), outcome.gradient_error))
     value_error = max(outcome.value_error for outcome in chosen)
     says = f"T = {T_MIN:g} within rounding"
-    return replace(worst, says=says, value_error=value_error, counted=f"stopped {counts[0]}, went on {counts[1]}")
+    return worst._replace(says=says, value_error=value_error, counted=f"stopped {counts[0]}, went on {counts[1]}")
 
 
 def ordinary() -> Problem:

@@ -12,6 +12,7 @@ itself moves when its inputs move by half a unit in the last place of float32 (H
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -63,8 +64,7 @@ class Problem:
     gradient_limit: float = GRADIENT_LIMIT
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What was measured, and every statement that did not hold."""
 
     says: str  # float64
@@ -82,8 +82,7 @@ def bounded(says: str, what: str, error: float, limit: float, counted: str = "-"
     return Outcome(says, error, limit, counted=counted, failures=failures)
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A named extreme: ``run`` takes the adjoint mode, or "" where none is involved (not ``modal``)."""
 
     name: str
@@ -94,8 +93,7 @@ class Case:
     build: Callable[[], Problem] | None = None  # of a case that is rendered
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
+class Expected(NamedTuple):
     """Float64's answer, on all N rows: zero gradients for what is left out or overflows."""
 
     problem: Problem
@@ -177,7 +175,7 @@ def truth(build: Callable[[], Problem]) -> Expected:
     says = f"image {out.image.min().item():.2f}..{out.image.max().item():.2f}, gradient to {largest:.1e}"
     for name in problem.gaussians:
         gradients[name][overflows] = 0
-    out = replace(out, image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach())
+    out = out._replace(image=out.image.detach(), alpha=out.alpha.detach(), means2d=out.means2d.detach())
     limits = {name: max(problem.gradient_limit, moved.get(name, 0.0)) for name in gradients}
     return Expected(problem, says, out, upstream, gradients, overflows, max(IMAGE_LIMIT, moved_image), limits)
 
