@@ -2,7 +2,6 @@
 
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from warp_splat.config import CORES, SfmConfig
@@ -11,6 +10,7 @@ from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.scene.photos import PHOTOS, find_files, photo_root
 from warp_splat.sfm import stages
 from warp_splat.sfm.matching import match, pairs_compared
+from warp_splat.text import Report
 
 TRIED = 6  # photographs, of which each pair is matched
 LEAST = 30  # of fewer a trial would take too large a share of the work itself
@@ -20,7 +20,7 @@ MAPPING = 3e-5, 1.4e-4
 OF_FEATURE = 2048  # bytes in mapping, for each: 0.92 to 1.04 of the peaks of four captures of 25 to 1,000 photographs
 
 
-def time_of_cameras(source: Path, say: Callable[[str], object]) -> None:
+def time_of_cameras(source: Path, say: Report) -> None:
     """Say what ``warp-splat sfm`` takes with the photographs below ``source``; nothing if that cannot be told.
 
     Features and pairs of TRIED photographs are timed on this machine. The time of mapping is known by its order only.
@@ -54,15 +54,11 @@ def _measured(root: Path, tried: list[str], config: SfmConfig) -> tuple[float, f
     """Seconds of all threads for a photograph, its features, and seconds for a pair, as means of those ``tried``."""
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
-        extraction = _seconds(lambda: stages.extract(database, root, [tried], config, folder))
+        began = time.process_time()
+        stages.extract(database, root, [tried], config, folder)
+        extracted = time.process_time()
         with stages.opened(database) as connection:
             features = connection.num_keypoints()
-        matching = _seconds(lambda: match(database, config, print))
+        match(database, config, print)
+        extraction, matching = extracted - began, time.process_time() - extracted
     return extraction / len(tried), features / len(tried), matching / (len(tried) * (len(tried) - 1) / 2)
-
-
-def _seconds(work: Callable[[], object]) -> float:
-    """Of all threads."""
-    began = time.process_time()
-    work()
-    return time.process_time() - began

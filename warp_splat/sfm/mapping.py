@@ -41,7 +41,6 @@ def reconstruct(
     if not models.is_dir():
         images, matches = _sizes(database)
         begun = models.with_name("mapping")
-        begun.mkdir(exist_ok=True)
         seconds = SECONDS_PER_MATCH * matches * images ** (1 / 3)
         mappers = {"global": partial(_map_globally, seconds=seconds), "incremental": _map_stepwise}
         found: dict[str, list[pycolmap.Reconstruction]] = {}
@@ -79,7 +78,7 @@ def _made(folder: Path, make: Callable[[Path], object]) -> list[pycolmap.Reconst
     if not folder.is_dir():
         part = folder.with_suffix(".part")
         shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
+        part.mkdir(parents=True)
         make(part)
         os.replace(part, folder)
     found = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir())]
@@ -99,9 +98,8 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
         if not known:
             pycolmap.calibrate_view_graph(calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=config.seed))
         for number, model in pycolmap.global_mapping(calibrated, root, part, options).items():
-            kept = held_together(model)
-            for image in (model.image(each) for each in set(model.reg_image_ids()) - kept):
-                model.deregister_frame(image.frame_id)
+            for each in set(model.reg_image_ids()) - held_together(model):
+                model.deregister_frame(model.image(each).frame_id)
             model.write(part / str(number))
 
     began = time.monotonic()
