@@ -56,10 +56,9 @@ def draw_pictures(subject: Subject) -> Iterable[tuple[str, str]]:
     yield "The photographs, evenly chosen", _encode(_sheet(subject, [photo.name for photo in sample(shown, SHEET)]))
     if not len(subject.points):
         return
+    caption = "Points projected into photographs: they should lie on what is there"
     if subject.errors:
         caption = "Where points were seen, colored by how far from there they project (the worst images first)"
-    else:
-        caption = "Points projected into photographs: they should lie on what is there"
     yield caption, _encode(_on_photos(subject))
     yield "Cameras (with their viewing directions) and points, from two sides", _encode(_map(subject))
     if subject.errors:
@@ -76,16 +75,6 @@ def address_of(kind: str, save: Callable[[io.BytesIO], object]) -> str:
 
 def _encode(figure: Figure) -> str:
     return address_of("jpeg", partial(figure.savefig, format="jpg", dpi=PAGE_DPI, pil_kwargs={"quality": 85}))
-
-
-def _grid(count: int, columns: int, aspect: float) -> tuple[Figure, list]:
-    """A figure with ``count`` cells of height / width ``aspect``, or of TALLEST."""
-    rows = math.ceil(count / columns)
-    height = WIDTH / columns * min(aspect, TALLEST) * 0.97 + 0.2
-    figure, cells = new_panels(rows * height, rows, columns)
-    for axes in np.ravel(cells):
-        axes.set_axis_off()
-    return figure, list(np.ravel(cells)[:count])
 
 
 def _sheet(subject: Subject, names: list[str]) -> Figure:
@@ -108,9 +97,13 @@ def _sheet(subject: Subject, names: list[str]) -> Figure:
 def _on_photos(subject: Subject) -> Figure:
     photos = worst_and_best(subject, [p for p in subject.photos if p.name in subject.thumbnails], ON_PHOTOS)
     height, width = subject.thumbnails[photos[0].name].shape[:2]
-    figure, cells = _grid(len(photos), 3 if height > width else 2, height / width)
-    dots = None
-    for axes, photo in zip(cells, photos, strict=True):
+    columns, dots = 3 if height > width else 2, None
+    rows = math.ceil(len(photos) / columns)
+    figure, grid = new_panels(rows * (WIDTH / columns * min(height / width, TALLEST) * 0.97 + 0.2), rows, columns)
+    cells = list(np.ravel(grid))
+    for axes in cells:
+        axes.set_axis_off()
+    for axes, photo in zip(cells, photos, strict=False):
         small = subject.thumbnails[photo.name]
         axes.imshow(small, alpha=0.7)
         if photo.name in subject.errors:
@@ -127,7 +120,7 @@ def _on_photos(subject: Subject) -> Figure:
         axes.set_title(title, fontsize=7, color=INK, pad=2)
         axes.set(xlim=(0, small.shape[1]), ylim=(small.shape[0], 0))
     if dots is not None:
-        bar = figure.colorbar(dots, ax=cells, shrink=0.4, aspect=40, location="bottom")
+        bar = figure.colorbar(dots, ax=cells[: len(photos)], shrink=0.4, aspect=40, location="bottom")
         bar.set_label("reprojection error [px]", fontsize=7)
     return figure
 

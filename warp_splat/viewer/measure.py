@@ -96,12 +96,11 @@ class Ruler:
         self.box = self.scene.add_frame("/box", show_axes=False)
         reach = REACH * float(np.linalg.norm(self.subject - np.asarray(self.client.camera.position)))
         options = {"scale": reach, "disable_rotations": True}
-        self.corners = [
-            self.scene.add_transform_controls(f"/box/{i}", position=self.subject + side * reach, **options)
-            for i, side in enumerate((-1, 1))
-        ]
-        for corner in self.corners:
+        self.corners = []
+        for i, side in enumerate((-1, 1)):
+            corner = self.scene.add_transform_controls(f"/box/{i}", position=self.subject + side * reach, **options)
             corner.on_update(self._frame)
+            self.corners.append(corner)
         await self._frame()
 
     async def _frame(self, _=None) -> None:
