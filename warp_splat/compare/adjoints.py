@@ -176,9 +176,8 @@ def records(measurements: Sequence[Measurement]) -> list[dict[str, Any]]:
     """A row per scene, variant and parameter, for CSV and JSON."""
     rows = []
     for item in measurements:
-        times = {"forward": item.forward, "backward": item.backward}
-        ways = (("seconds", median), ("spread", half_range))
-        seconds = {f"{name}_{what}": way(values) for name, values in times.items() for what, way in ways}
+        seconds = {"forward_seconds": median(item.forward), "forward_spread": half_range(item.forward)}
+        seconds |= {"backward_seconds": median(item.backward), "backward_spread": half_range(item.backward)}
         for parameter, error in (item.errors or {"": Error()}).items():
             what = {"scene": item.scene, "variant": item.variant, "gaussians": item.gaussians, "parameter": parameter}
             errors = {"relative_error": error.relative, "largest_error": error.largest, "cosine": error.cosine}

@@ -172,17 +172,16 @@ def exact_splats(
     points = torch.where(live[:, None], points, points.new_tensor([0.3, 0, 1]))  # no division by zero, no gradient
     means2d, sharp, live = eye.shape(points, turned, quats, scales, live, camera, projection, near)
     cov2d = sharp + blur * torch.eye(2, dtype=torch.float64)
-    opacity = opacities
     if antialiasing:
         ratio = torch.linalg.det(sharp) / torch.linalg.det(cov2d)
-        opacity = opacities * ratio.clamp_min(2.5e-5).sqrt()  # the floor is the reference's
+        opacities = opacities * ratio.clamp_min(2.5e-5).sqrt()  # the floor is the reference's
 
     center = -world_to_camera.T @ translation
     degree = int(sh.shape[1] ** 0.5) - 1
     degree = degree if sh_degree is None else min(degree, sh_degree)
     basis = sh_basis(torch.nn.functional.normalize(means - center, dim=1), degree)
     color = ((basis[:, :, None] * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp_min(0)
-    return Splats(means2d, depth, cov2d, opacity, color, live)
+    return Splats(means2d, depth, cov2d, opacities, color, live)
 
 
 def _alphas(splats, order, camera, pixels):

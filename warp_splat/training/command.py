@@ -198,8 +198,7 @@ def _watched(trainer: Trainer, run: Run) -> AbstractContextManager[TrainingViewe
 
 def _memory_explained(trainer: Trainer):
     """See :func:`memory_explained`."""
-    fewer = ["fewer Gaussians (--max_gaussians)", "smaller images (-r)"]
-    if trainer.config.machine.data_device == "cuda":
-        fewer.append("--data_device cpu")
+    rest = " or --data_device cpu" * (trainer.config.machine.data_device == "cuda")
+    advice = f"train with fewer Gaussians (--max_gaussians) or smaller images (-r){rest}"
     sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
-    return memory_explained(trainer.device, trainer.model, sizes, f"train with {' or '.join(fewer)}")
+    return memory_explained(trainer.device, trainer.model, sizes, advice)
