@@ -81,6 +81,17 @@ def test_features_are_compared_without_blas(scene, monkeypatch):
     assert not matching.avoid_blas()
 
 
+def test_a_lens_is_each_groups_own_where_a_run_goes_on(photos, tmp_path):
+    """Of a run that was killed between photographs of one lens; those of the next get another."""
+    names = sorted(path.name for path in photos[0].iterdir())
+    config = SfmConfig(str(photos[0]), str(tmp_path), quiet=True)
+    for groups in ([names[:1]], [names[:2], names[2:4]]):
+        stages.extract(tmp_path / "database.db", photos[0], groups, config)
+    with stages.opened(tmp_path / "database.db") as connection:
+        lenses = [connection.read_image_with_name(name).camera_id for name in names[:4]]
+    assert lenses[0] == lenses[1] != lenses[2] == lenses[3]
+
+
 def test_photographs_may_keep_their_lens(photos, scene, tmp_path):
     config = SfmConfig(str(photos[0]), str(tmp_path), keep_lens=True, quiet=True)
     stages.write_scene(scene / "sfm" / "models" / "0", photos[0], tmp_path, tmp_path / "part", COUNT, config)

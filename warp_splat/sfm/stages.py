@@ -73,9 +73,9 @@ def rename(database: Path, old: str, new: str) -> None:
 def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig, trial: str = "") -> None:
     """Find SIFT features in the photographs below ``root``; those of a group share a lens. ``trial``: run_watched's."""
     rename(database, SPACE, " ")  # of a run that was killed while it matched
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = LENS
     for names in groups:  # first, so that images are numbered by name and not by which thread was faster
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = LENS
         with opened(database) as connection:
             new = [name for name in names if not connection.exists_image(name)]
             if len(new) < len(names):
