@@ -47,6 +47,7 @@ def variants(count: int) -> dict[str, tuple[str, RasterOptions]]:
     return found
 
 
+@torch.no_grad()
 def exact(gaussians: Gaussians, camera: Camera, pixels: torch.Tensor, alpha_min: float, at_once: int) -> torch.Tensor:
     """The ideal at ``pixels`` [P, 2], [P, 3] float64; with ``alpha_min``, what is trained."""
     means, quats, scales, opacities, sh_dc, sh_rest = (tensor.double() for tensor in gaussians)

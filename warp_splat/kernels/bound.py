@@ -312,6 +312,7 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0)  # the blend looks a tenth below a floor
                 if unsure:
                     wp.atomic_add(lost_out, 0, 1)
+                counted = rules.floor == 0.0 and not unsure
                 color = splats2d.colors[i] + wp.vec3(errors_out[i][2])
                 most = opacity * loose * brightness(color, rules.usual) * 1.001 / rules.unit
                 margin = 1.0e-2 + 1.0e-6 * (wp.max(wp.abs(mean)) + wp.max(splats2d.extents[i]))
@@ -326,13 +327,13 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 else:
                     half = wp.vec2(0.0)
                 inner = box_of(maps_out, mean, half - slack)
-                if opacity >= rules.seen and rules.square == 0 and rules.floor == 0.0:
+                if counted and opacity >= rules.seen and rules.square == 0:
                     add_corners(maps_out, here, depth, inner, mean, conic, sigma, near, most, margin)
                 carried = int(0)  # what the box before counts
                 for step in range(BOXES):
                     alpha = wp.where(step < BOXES - 1, wp.max(alpha * SHARE, rules.faint), rules.faint)
                     wider = wp.max(sigma * wp.sqrt(reach_of(opacity, alpha)), half) + slack
-                    if rules.floor == 0.0 and not unsure:
+                    if counted:
                         aside = beyond(inner[0], inner[1], maps_out.shape[3] - 1, mean[0], sigma[0], most)
                         above = beyond(inner[2], inner[3], maps_out.shape[2] - 1, mean[1], sigma[1], most)
                         outer = box_of(maps_out, mean, wider)
