@@ -29,6 +29,7 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 HEADERS = ("scene", "options", "error, worst", "error, median", "bound, worst", "bound, median", "bound : error")
 HEADERS += ("times default", "adjoint")
 PLOTTED = ("extent", "exp_degree", "max_steps")  # and not in the table
+BETWEEN = ("1e-05", "1e-08")  # likewise
 ROUNDS = 2
 MOST = 500_000  # Gaussians that are listed in all tiles, as without a cut; more do not fit
 
@@ -152,7 +153,7 @@ def plot(path: Path, rows: list[dict]) -> None:
 def write(rows: list[dict], extreme: list[dict], count: int, out: Path | None) -> None:
     """The table, and the plot."""
     keys = ("worst", "median", "bound", "bound_median", "ratio", "times", "adjoint")
-    shown = [row for row in rows if row["curve"] not in PLOTTED]
+    shown = [row for row in rows if row["curve"] not in PLOTTED and not any(map(row["options"].count, BETWEEN))]
     cells = [
         (row["scene"], row["options"], *(f"{row[key]:.2g}" if key in row else "" for key in keys)) for row in shown
     ]
