@@ -38,7 +38,8 @@ def exact(gaussians, camera, background, **cuts):
 def ratios(gaussians, camera, background, options):
     """Bound over error of the pixels whose order is beyond doubt, after a check that none is below 1."""
     out = render(gaussians, camera, background, replace(options, bound=True))
-    ideal, known = exact(gaussians, camera, background, **for_oracle(options) | IDEAL)
+    cuts = for_oracle(options) | IDEAL | {"alpha_min": 0.0 if options.of == "ideal" else ALPHA_MIN}
+    ideal, known = exact(gaussians, camera, background, **cuts)
     error = (out.image.detach().double() - ideal).abs().amax(2)
     assert out.bound is not None and out.bound.isfinite().all()
     worst = (error - out.bound)[known].max().item() if known.any() else 0.0
@@ -76,6 +77,7 @@ OPTIONS = st.fixed_dictionaries(
         "antialiasing": st.booleans(),
         "projection": st.sampled_from(["affine", "ellipsoid", "unscented"]),
         "tolerance": st.sampled_from([None, 0.3, 1e-3]),
+        "of": st.sampled_from(["ideal", "trained"]),
     }
 )
 
@@ -92,6 +94,10 @@ OPTIONS = st.fixed_dictionaries(
 @example(  # within a tolerance, the cut is another than alpha_min
     options={"alpha_min": 0.0, "tolerance": 0.3}, seed=0, count=1, largest=1.0, opacity=(0.05, 0.9), aspect=1e-4,
     bright=0.0, behind=0.0,
+)  # fmt: skip
+@example(  # the square leaves out what is above 1/255
+    options={"extent": "square", "of": "trained"}, seed=3, count=1, largest=60.0, opacity=(0.9, 1.0), aspect=0.9,
+    bright=1.0, behind=0.0,
 )  # fmt: skip
 @given(
     options=OPTIONS,
@@ -163,6 +169,13 @@ def test_cuts_stay_below_a_tolerance(of, tolerance):
     assert above.double().mean() < (0.02 if of == "trained" else 1e-9)
 
 
+def test_pixels_stop_later_where_a_tolerance_asks_for_it():
+    gaussians, camera = made_up(7, 300, (0.5, 6.0), (0.99, 1.0), 0.5, 8.0, look(70, 50)), look(70, 50)
+    options = RasterOptions(tolerance=0.1, of="trained", alpha_max=0.9999)
+    out = render(gaussians, camera, torch.zeros(3), options)
+    assert (out.bound - out.rounding).max() <= 0.1
+
+
 def test_a_tolerance_for_each_pixel_and_any_number_of_threads(same_by_threads):
     tolerance = torch.full((50, 70), 1e-1)
     tolerance[10:20, 30:50] = 1e-4
@@ -201,6 +214,7 @@ def test_pictures_of_the_bound(tmp_path):
         ({"tolerance": 0.0}, (0, 0, 0), r"options\.tolerance: expected numbers above 0, got 0\.0"),
         ({"tolerance": "much"}, (0, 0, 0), r"options\.tolerance: expected a number or a tensor \[H, W\], got str"),
         ({"tolerance": 1e-2, "normals": True}, (0, 0, 0), r"options\.tolerance: expected none of normals beside it"),
+        ({"tolerance": 1e-2, "extent": "square"}, (0, 0, 0), r"options\.tolerance: expected none of extent 'square'"),
         ({"of": "truth"}, (0, 0, 0), r"options\.of: expected one of ideal, trained, got 'truth'"),
     ],
 )

@@ -18,6 +18,12 @@ def few(names: Iterable[str]) -> str:
     return ", ".join(names[:NAMED]) + f" and {len(names) - NAMED} more" * (len(names) > NAMED)
 
 
+def upward(number: float) -> str:
+    """Two digits of a number that is not negative, which it does not exceed."""
+    step = 10.0 ** (math.floor(math.log10(number)) - 1) if number > 0.0 else 1.0
+    return f"{math.ceil(number / step) * step:.2g}"
+
+
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A table that reads well in a terminal and is Markdown: columns padded, columns of numbers to the right.
 

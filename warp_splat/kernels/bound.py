@@ -60,6 +60,7 @@ class BoundView:
     darkest: float  # of the background
     behind: float  # brightest of the background
     everywhere: float  # alpha of all Gaussians outside their last box
+    unknown: float  # Gaussians of whose place nothing is known
     bound_out: wp.array2d[float]  # [H, W]
     rounding_out: wp.array2d[float]  # [H, W] the part of it that is rounding
 
@@ -149,7 +150,7 @@ def rounding_of(t: Any, after: Any, light: Any, since: Since, brightest: float):
 @wp.func
 def all_rounding(rounding: Any, bound: BoundView):
     """What rounding changes, with that of the last sums."""
-    return (rounding + fill(8.0 * EPS * bound.brightest, rounding)) * 1.001
+    return (rounding + fill((8.0 * EPS + bound.unknown) * bound.brightest, rounding)) * 1.001
 
 
 @wp.func
@@ -306,13 +307,14 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 depth = int(0)
                 while depth + 1 < begins.shape[0] and begins[depth + 1] <= z:
                     depth += 1
-                ends_at = wp.where(rules.floor > 0.0, near, far)
+                outside = rules.floor == 0.0 or rules.square != 0  # whether the ideal has anything there
+                ends_at = wp.where(outside, far, near)
                 most_error = wp.min(alpha_error(rules, condition, shift, 0.5 * ends_at), 1.0)
                 loose = 1.0 + most_error + most_error * most_error  # above its exponential
                 unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0)  # the blend looks a tenth below a floor
                 if unsure:
                     wp.atomic_add(lost_out, 0, 1)
-                counted = rules.floor == 0.0 and not unsure
+                counted = outside and not unsure
                 color = splats2d.colors[i] + wp.vec3(errors_out[i][2])
                 most = opacity * loose * brightness(color, rules.usual) * 1.001 / rules.unit
                 margin = 1.0e-2 + 1.0e-6 * (wp.max(wp.abs(mean)) + wp.max(splats2d.extents[i]))

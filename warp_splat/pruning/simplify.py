@@ -18,7 +18,7 @@ from warp_splat.pruning.opened import Opened, output_of, print_quality, require_
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
 from warp_splat.rendering.changes import largest_change
 from warp_splat.rendering.finished import Finished
-from warp_splat.text import format_table
+from warp_splat.text import format_table, upward
 
 LEVELS = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # shares of the Gaussians that the table and the plot show
 TRIES = 6  # halvings of the range of counts, for a loss or a size: 1/64 of the Gaussians is left of it
@@ -67,9 +67,12 @@ def simplify(config: SimplifyConfig) -> int:
     write(output, file, splats)
     if config.tolerance:
         measured, bound = changed(splats)
-        print(
-            f"  largest change of a pixel, {len(views)} training views: {measured:.2g} measured, {bound:.2g} its bound"
-        )
+        found = f"{measured:.2g} measured, {upward(bound)} its bound"
+        print(f"  largest change of a pixel, {len(views)} training views: {found}")
+        if bound > config.tolerance:
+            print(
+                "  Without any change, the bound of rounding is more: nothing is left out; take a larger --tolerance."
+            )
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
     print_quality(opened.quality(file.splats), opened.quality(splats))

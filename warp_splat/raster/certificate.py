@@ -121,7 +121,8 @@ def certify(
         "brightest": brightest,
         "darkest": float(background.min()),
         "behind": behind,
-        "everywhere": float(lost) + (0.0 if rules.floor else 2.0 * count * faint),
+        "everywhere": 0.0 if rules.floor else 2.0 * count * faint,
+        "unknown": float(lost),
         "floor": wp.vec2((1.0 - BAND) * ALPHA_MIN, SURE) if rules.floor else wp.vec2(faint),
     }
     bound, rounding = (torch.empty(camera.height, camera.width, device=device) for _ in range(2))

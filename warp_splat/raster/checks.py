@@ -118,7 +118,7 @@ def check_tolerance(options: RasterOptions, features: object = None) -> None:
         raise InputError(f"options.tolerance: expected numbers above 0, got {tolerance!r:.60}.")
     beside = ("normals", "median_depth", "strongest", "max_steps")
     given = [name for name in beside if getattr(options, name) not in (False, 0, None)]
-    given += ["features"] if features is not None else []
+    given += ["features"] * (features is not None) + ["extent 'square'"] * (options.extent == "square")
     if given:
         raise InputError(f"options.tolerance: expected none of {', '.join(given)} beside it; leave one of them out.")
 

@@ -49,15 +49,15 @@ def paint_within(
     allowed = allowed.expand(camera.height, camera.width)
     degree = next((degree for degree, least in DEGREES if float(allowed.min()) >= least), 5)
     by_polynomial = {} if options.exp_degree is None else {"exp_degree": min(degree, options.exp_degree)}
-    cut, uniform = max(FIRST * float(allowed.max()), FAINT), bool(allowed.min() == allowed.max())
+    cut, least = max(FIRST * float(allowed.max()), FAINT), 0.5 * float(allowed.min())
     done = paint(replace(options, bound=True, **_cuts(options, cut), **by_polynomial), None)
-    tiles = None
     for left in range(MOST_ROUNDS, 0, -1):
         assert done.certificate
         cuts = done.certificate.bound - done.certificate.rounding
         worst = _worst_of_tiles(cuts / allowed.to(cuts.device))
-        before, tiles = tiles, worst > 1.0
-        hopeless = options.of == "trained" and (uniform or (before is not None and torch.equal(before, tiles)))
+        tiles = worst > 1.0
+        stop = _cuts(options, cut)["t_min"] / (1.0 - options.alpha_max) * done.certificate.fields["brightest"]
+        hopeless = options.of == "trained" and stop < least  # for its cut cannot be smaller
         if cut <= FAINT or hopeless or not tiles.any():
             break
         cut = max(cut * LOWER / float(worst[tiles].quantile(0.9)), FAINT) if left > 1 else FAINT

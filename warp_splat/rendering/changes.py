@@ -24,6 +24,7 @@ from warp_splat.raster.data import Gaussians
 from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 from warp_splat.rendering.finished import Finished
 from warp_splat.runtime import launch
+from warp_splat.text import upward
 
 ROUNDING = 1e-6  # smaller changes, as a share of a Gaussian's own size, are those of float32
 AROUND, DISTANCE = 4, 2.5  # cameras around a model; from its middle, times what holds three quarters of its Gaussians
@@ -71,7 +72,7 @@ def _compare(config: ConvertConfig) -> None:
     with torch.no_grad():
         before, after = (GaussianModel.from_splats(some).arranged().activated() for some in splats)
     measured, bound = largest_change(before, after, cameras, torch.zeros(3), finished.options)
-    print(f"  largest change of a pixel, {AROUND} places around: {measured:.2g} measured, {bound:.2g} its bound")
+    print(f"  largest change of a pixel, {AROUND} places around: {measured:.2g} measured, {upward(bound)} its bound")
 
 
 @torch.no_grad()

@@ -32,6 +32,7 @@ from warp_splat.rendering.popping import popping_of
 from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
+from warp_splat.text import upward
 
 SCALE = (1e-6, 1.0)  # of the colors
 DPI = 100
@@ -149,7 +150,7 @@ def _certify(config: RenderConfig, maps: dict[str, Callable[[Camera], torch.Tens
         "popping": "another order of Gaussians that overlap in depth changes no pixel by more than",
     }
     for name, find in maps.items() if config.bound else ():
-        print(f"  {sentences[name]} {write_maps(name, find, views, folder):.1e}: {folder / name}")
+        print(f"  {sentences[name]} {upward(write_maps(name, find, views, folder))}: {folder / name}")
 
 
 def _check(config: RenderConfig) -> None:
