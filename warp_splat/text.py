@@ -20,8 +20,10 @@ def few(names: Iterable[str]) -> str:
 
 def upward(number: float) -> str:
     """Two digits of a number that is not negative, which it does not exceed."""
-    step = 10.0 ** (math.floor(math.log10(number)) - 1) if number > 0.0 else 1.0
-    return f"{math.ceil(number / step) * step:.2g}"
+    if 0.0 < number < math.inf:
+        step = 10.0 ** (math.floor(math.log10(number)) - 1)
+        number = math.ceil(number / step) * step
+    return f"{number:.2g}"
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
