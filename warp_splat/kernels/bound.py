@@ -1,9 +1,9 @@
 """How wrong a pixel can be: what the cuts leave out and what rounding adds. docs/tolerance.md derives every line.
 
-A Gaussian adds to the bound wherever the blend does not look at it: in boxes around it, of which each is larger and its
-alpha outside lower. Boxes are added into differences over blocks of 4 x 4 pixels, in whole numbers, so that their order
-does not matter. There is a map for each of a few ranges of depth: what lies behind others counts as little as it shows.
-Tried:
+A Gaussian adds to the bound wherever the blend does not look at it: in the corners of its box whose tiles its ellipse
+does not touch, and in boxes around it, of which each is larger and its alpha outside lower. They are added into
+differences over blocks of 4 x 4 pixels, in whole numbers, so that their order does not matter. There is a map for each
+of a few ranges of depth: what lies behind others counts as little as it shows. Tried:
 
 - as long: sixteen Gaussians in lanes; what is added here and there decides
 - 50 % longer blends: lists of all tiles of the boxes, which leave no corners
@@ -221,9 +221,8 @@ def alpha_error(rules: Rules, condition: float, shift: float, q: float):
 
 
 @functools.cache
-def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
-    """What of each Gaussian lies outside of where the blend looks, and how far its alpha may be off."""
-    reach_of, fall_at = falloff.reach_of, falloff.value
+def make_beyond(fall_at: wp.Function) -> tuple[wp.Function, wp.Function]:
+    """What is the most beside a row of blocks, and what adds the corners of a box; ``fall_at``: the falloff."""
 
     @wp.func
     def farther(d: float, most: float):
@@ -269,6 +268,15 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
             if right < box[1]:
                 amount = aside_of(root, float(4 * right) + 0.5 - mean[0], low, high, most)
                 add_box(maps, band, depth, wp.vec4i(wp.max(right, box[0]), box[1], top, bottom), amount)
+
+    return beyond, add_corners
+
+
+@functools.cache
+def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
+    """What of each Gaussian lies outside of where the blend looks, and how far its alpha may be off."""
+    reach_of = falloff.reach_of
+    beyond, add_corners = make_beyond(falloff.value)
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def spread(
