@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import warp_splat
-from warp_splat.compare.scenes import cloud, look, tensors
+from warp_splat.compare.scenes import cloud, look, make_camera, tensors
 from warp_splat.compare.stability import cases, verdict
 from warp_splat.compare.truth import for_oracle
 from warp_splat.config import ALPHA_MIN, RasterOptions
@@ -173,6 +173,15 @@ def test_pixels_stop_later_where_a_tolerance_asks_for_it():
     gaussians, camera = made_up(7, 300, (0.5, 6.0), (0.99, 1.0), 0.5, 8.0, look(70, 50)), look(70, 50)
     options = RasterOptions(tolerance=0.1, of="trained", alpha_max=0.9999)
     out = render(gaussians, camera, torch.zeros(3), options)
+    assert (out.bound - out.rounding).max() <= 0.1
+
+
+def test_a_tolerance_decides_about_opacities_as_near_to_their_cut_as_rounding_allows():
+    camera, opacity = make_camera(41, 37, seed=None), 1.00014 * ALPHA_MIN
+    gaussians = made_up(1, 1, (0.5, 0.6), (opacity, opacity), 0.9, 0.0, camera)
+    middle = gaussians._replace(means=torch.tensor([[0.0, 0.0, 5.0]]), sh_dc=torch.full((1, 1, 3), 1e4))
+    out = render(middle, camera, torch.zeros(3), RasterOptions(tolerance=0.1, of="trained"))
+    assert out.image.max() > 1.0
     assert (out.bound - out.rounding).max() <= 0.1
 
 

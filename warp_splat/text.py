@@ -4,6 +4,7 @@ import math
 import re
 import string
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from decimal import ROUND_CEILING, Context
 
 from warp_splat.errors import InputError
 
@@ -20,10 +21,7 @@ def few(names: Iterable[str]) -> str:
 
 def upward(number: float) -> str:
     """Two digits of a number that is not negative, which it does not exceed."""
-    if 0.0 < number < math.inf:
-        step = 10.0 ** (math.floor(math.log10(number)) - 1)
-        number = math.ceil(number / step) * step
-    return f"{number:.2g}"
+    return f"{float(Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(number))):.2g}"
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

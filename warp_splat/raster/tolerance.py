@@ -15,7 +15,8 @@ from warp_splat.raster.certificate import FAINT, SURE, Certificate
 from warp_splat.raster.data import Bins, Pixels, Splats2D
 
 #: From which tolerance on the exponential's polynomial may be of that degree; its error is a tenth at most.
-DEGREES = ((3, 2e-3), (4, 1e-4))
+#: Where opacities are cut at 1/255, that error also decides what is cut, so it stays well below ``BAND``.
+DEGREES = {"ideal": ((3, 2e-3), (4, 1e-4)), "trained": ((4, 1e-4),)}
 FIRST = 1.0 / 70.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
 STOP = 0.0007  # where pixels stop, likewise: the Gaussian that crosses it may take 100 times as much
 LOWER = 0.6  # of what the bound asks for, the cut of tiles that are drawn again
@@ -47,7 +48,7 @@ def paint_within(
         wanted, given = f"[{camera.height}, {camera.width}]", list(allowed.shape)
         raise InputError(f"options.tolerance: expected a number, or one for each pixel {wanted}, got {given}.")
     allowed = allowed.expand(camera.height, camera.width)
-    degree = next((degree for degree, least in DEGREES if float(allowed.min()) >= least), 5)
+    degree = next((degree for degree, least in DEGREES[options.of] if float(allowed.min()) >= least), 5)
     by_polynomial = {} if options.exp_degree is None else {"exp_degree": min(degree, options.exp_degree)}
     cut, least = max(FIRST * float(allowed.max()), FAINT), 0.5 * float(allowed.min())
     done = paint(replace(options, bound=True, **_cuts(options, cut), **by_polynomial), None)
