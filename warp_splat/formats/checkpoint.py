@@ -14,8 +14,7 @@ import json
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -117,7 +116,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         InputError: if there is none, or it is damaged, cut short, of a newer program, or something else.
     """
     path = find_checkpoint(path)
-    with _opened(path) as file:
+    with reading(path, EXPECTED, SafetensorError), safe_open(path, framework="numpy") as file:
         (text, facts), content, arrays = _facts(file), np.memmap(path, np.uint8, "r"), {}
         end = 8 + int.from_bytes(content[:8], "little")  # of the header; without gaps, arrays follow
         for name in file.offset_keys():
@@ -138,7 +137,7 @@ def load_header(path: str | Path) -> Checkpoint:
         InputError: as :func:`load_checkpoint`, but for what follows the header.
     """
     path = find_checkpoint(path)
-    with _opened(path) as file:
+    with reading(path, EXPECTED, SafetensorError), safe_open(path, framework="numpy") as file:
         return Checkpoint(path, {}, _facts(file)[1])
 
 
@@ -175,16 +174,6 @@ def remove_leftovers(folder: str | Path) -> None:
     """Remove half-written checkpoints of a process that was killed: each may be as large as a whole one."""
     for path in Path(folder).glob(".tmp-*.safetensors"):
         path.unlink(missing_ok=True)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    with reading(path, EXPECTED):
-        try:
-            with safe_open(path, framework="numpy") as file:
-                yield file
-        except SafetensorError as error:
-            raise ValueError(str(error)) from error
 
 
 def _facts(file: Any) -> tuple[str, dict[str, Any]]:

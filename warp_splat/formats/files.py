@@ -105,7 +105,7 @@ class Unexpected(Exception):
 
 
 @contextmanager
-def reading(path: str | Path, expected: str) -> Iterator[None]:
+def reading(path: str | Path, expected: str, *damage: type[Exception]) -> Iterator[None]:
     """Turn what goes wrong in the block into an InputError about ``path``; NumPy does not warn in it.
 
     What is not finite, or no longer is, the caller leaves out.
@@ -113,16 +113,19 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
     Args:
         path: the file that is read.
         expected: what it should be: "a PLY file with ...".
+        damage: what a library raises for a file that is damaged, besides ValueError and RecursionError.
 
     Raises:
-        InputError: if the block raises it, ``Unexpected``, ValueError or RecursionError (damaged), OSError or
-            MemoryError.
+        InputError: if the block raises it, ``Unexpected``, ``damage``, OSError or MemoryError.
     """
     try:
         with np.errstate(all="ignore"):
             yield
     except InputError:
         raise
+    except (ValueError, OverflowError, RecursionError, *damage) as error:
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200] or type(error).__name__
+        raise InputError(f"{path}: the file is damaged or cut short ({reason}); copy or save it again.") from error
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path.") from error
     except OSError as error:
@@ -131,9 +134,6 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
         raise InputError(f"{path}: could not be read ({error}); it needs more memory than there is.") from error
     except Unexpected as error:
         raise InputError(f"{path}: expected {expected}, found {error}.") from error
-    except (ValueError, OverflowError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else f"{error!s:.200}"
-        raise InputError(f"{path}: the file is damaged or cut short ({reason}); copy or save it again.") from error
 
 
 def read_json(path: Path, expected: str, parse: Callable[[Any], T]) -> T:

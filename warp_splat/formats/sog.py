@@ -41,6 +41,7 @@ PALETTE_MOST = 2**16
 PALETTE_SHARE = 8  # Gaussians for an entry of the palette; of 4 or 16, files are 1.24 or 0.88 times as large
 SPARE_PIXELS = 2**16  # that an image may have beyond twice the Gaussians
 PIXEL_BYTES = 20  # of a Gaussian's images, without harmonics
+DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError)  # what a zip file raises then
 
 
 def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
@@ -105,12 +106,8 @@ def load_sog(path: str | Path, report: Report = print) -> SplatFile:
     Raises:
         InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
     """
-    with reading(path, "a .sog file of version 2"):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                return _Bundle(archive, Path(path).stat().st_size).file()
-        except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError) as error:
-            raise ValueError(str(error) or type(error).__name__) from error
+    with reading(path, "a .sog file of version 2", *DAMAGE), zipfile.ZipFile(path) as archive:
+        return _Bundle(archive, Path(path).stat().st_size).file()
 
 
 class _Bundle:

@@ -24,6 +24,7 @@ from warp_splat.formats.stored import OTHERS, clipped, from_smallest_three, logi
 from warp_splat.text import Report
 
 MAGIC = b"NGSP"
+DAMAGE = (zlib.error, EOFError, gzip.BadGzipFile)  # what a gzip file raises then
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, streams (version 4)
 HEADER4 = struct.Struct("<4sIIBBBBI12x")  # ... and where the table of sizes begins
 FLAG_ANTIALIASED = 1
@@ -88,7 +89,7 @@ def load_spz(path: str | Path, report: Report = print) -> SplatFile:
     Raises:
         InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
     """
-    with reading(path, "an SPZ file of version 2, 3 or 4"), open(path, "rb") as source:
+    with reading(path, "an SPZ file of version 2, 3 or 4", *DAMAGE), open(path, "rb") as source:
         start, file_bytes = source.read(4), os.fstat(source.fileno()).st_size
         source.seek(0)
         if start == MAGIC:
@@ -160,20 +161,17 @@ def _sizes(version: int, count: int, degree: int, file_bytes: int) -> list[int]:
 
 
 def _read_gzip(source: BinaryIO, file_bytes: int) -> Packed:
-    try:
-        with gzip.GzipFile(fileobj=source) as stream:
-            start = stream.read(HEADER.size)
-            if len(start) < HEADER.size or start[:4] != MAGIC:
-                raise Unexpected("a gzip file of something else")
-            _, version, count, degree, *_ = header = HEADER.unpack(start)
-            if version not in (2, 3):
-                raise Unexpected(f"version {version} in a gzip file")
-            streams = [_exactly(stream, size) for size in _sizes(version, count, degree, file_bytes)]
-            records = stream.read(EXTENSION_BYTES)  # extensions of version 3 come last
-            if stream.read(1):
-                raise ValueError("the gzip stream goes on after its last Gaussian")
-    except (zlib.error, EOFError, gzip.BadGzipFile) as error:
-        raise ValueError(str(error)) from error
+    with gzip.GzipFile(fileobj=source) as stream:
+        start = stream.read(HEADER.size)
+        if len(start) < HEADER.size or start[:4] != MAGIC:
+            raise Unexpected("a gzip file of something else")
+        _, version, count, degree, *_ = header = HEADER.unpack(start)
+        if version not in (2, 3):
+            raise Unexpected(f"version {version} in a gzip file")
+        streams = [_exactly(stream, size) for size in _sizes(version, count, degree, file_bytes)]
+        records = stream.read(EXTENSION_BYTES)  # extensions of version 3 come last
+        if stream.read(1):
+            raise ValueError("the gzip stream goes on after its last Gaussian")
     return header, streams, records
 
 
