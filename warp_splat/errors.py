@@ -3,6 +3,8 @@
 import importlib
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 REASON_MOST = 300  # characters of a library's own words: on a damaged file, OpenImageIO may list all that it met
@@ -30,5 +32,20 @@ def imported(package: str, problem: str) -> Any:
 
 def reason_of(error: object) -> str:
     """A library's own words as a part of one sentence: on one line, not longer than a reader will bear."""
-    words = " ".join(str(error).split()).rstrip(".")
+    words = " ".join(str(getattr(error, "strerror", None) or error).split()).rstrip(".")
     return (words if len(words) <= REASON_MOST else words[:REASON_MOST] + " ...") or "no reason given"
+
+
+@contextmanager
+def refusing(kinds: type[Exception] | tuple[type[Exception], ...], problem: str, advice: str = ".") -> Iterator[None]:
+    """Turn errors of these ``kinds`` into an InputError: the problem, its reason in brackets, the end of the sentence.
+
+    Raises:
+        InputError: as that, or of the block's own, which stays as it is.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except kinds as error:
+        raise InputError(f"{problem} ({reason_of(error)}){advice}") from error

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.errors import InputError
+from warp_splat.errors import refusing
 from warp_splat.evaluation.metrics import METRICS, Metric, masked, unit_images
 from warp_splat.formats.files import Unexpected, reading
 
@@ -67,18 +67,14 @@ def choose_metrics(lpips_weights: str) -> tuple[dict[str, Metric], list[str]]:
 def _load_lpips(path: str) -> tuple[str, Metric]:
     """LPIPS by the network whose weights these are."""
     weights = _load_weights(Path(path))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it calls torchvision as one did before 2022
-            from lpips import LPIPS  # noqa: PLC0415 - optional, seconds to load
+    problem = "--lpips_weights: LPIPS needs the packages lpips and torchvision"
+    advice = "; install them with `pip install lpips torchvision`, or leave this flag out."
+    # it calls torchvision as one did before 2022
+    with refusing(ImportError, problem, advice), warnings.catch_warnings(action="ignore"):
+        from lpips import LPIPS  # noqa: PLC0415 - optional, seconds to load
 
-            network = next(network for network, (_, layer, _) in NETWORKS.items() if layer in weights)
-            model = LPIPS(net=network, pnet_rand=True, verbose=False)  # without weights, or it would download them
-    except ImportError as error:
-        raise InputError(
-            f"--lpips_weights: LPIPS needs the packages lpips and torchvision ({error}); install them with "
-            "`pip install lpips torchvision`, or leave this flag out."
-        ) from error
+        network = next(network for network, (_, layer, _) in NETWORKS.items() if layer in weights)
+        model = LPIPS(net=network, pnet_rand=True, verbose=False)  # without weights, or it would download them
     # "slice2.5.weight" is the layer "features.5.weight" of torchvision
     layers = {layer: f"features.{layer.partition('.')[2]}" for layer in model.net.state_dict()}
     with reading(path, WEIGHTS):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, refusing
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.files import T, Unexpected, read_json, write_text
 from warp_splat.formats.splats import SplatFile, cropped
@@ -66,14 +66,10 @@ def prepare_folder(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     probe = folder / f".probe-{uuid.uuid4().hex[:12]}"
-    try:
+    with refusing(OSError, f"{folder}: expected a folder that can be written", "; choose another."):
         folder.mkdir(parents=True, exist_ok=True)
         probe.write_text("written and removed at the start of a training")
         probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"{folder}: expected a folder that can be written ({error.strerror or error}); choose another."
-        ) from error
     return folder
 
 
@@ -179,24 +175,20 @@ def read_cfg_args(folder: str | Path) -> dict[str, object]:
         InputError: if the file is missing or holds anything but ``Namespace(name=literal, ...)``.
     """
     path = Path(folder) / "cfg_args"
-    try:
+    with refusing((OSError, UnicodeDecodeError), f"{path}: could not be read", f"; is {folder} a model folder?"):
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", error)
-        raise InputError(f"{path}: could not be read ({reason}); is {folder} a model folder?") from error
     return _parse_namespace(text, path)
 
 
 def _parse_namespace(text: str, path: Path) -> dict[str, object]:
-    try:
+    kinds = (SyntaxError, ValueError, TypeError, RecursionError, MemoryError)
+    with refusing(kinds, f"{path}: expected one line Namespace(name=literal, ...), found another"):
         call = ast.parse(text.strip(), mode="eval").body
         if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name) or call.func.id != "Namespace":
             raise ValueError("no Namespace(...)")
         if call.args or any(keyword.arg is None for keyword in call.keywords):
             raise ValueError("an argument without a name")
         return {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
-    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
-        raise InputError(f"{path}: expected one line Namespace(name=literal, ...), found another ({error}).") from error
 
 
 def write_cameras(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, refusing
 from warp_splat.formats.files import atomic_write
 
 COMPRESSION = 3  # of 0 to 9; Pillow's 6 takes 2.5 times as long, for 10 % less of a photograph
@@ -37,15 +37,11 @@ def load_png(path: str | Path) -> np.ndarray:
     Raises:
         InputError: if the file is missing, damaged, or no image.
     """
-    try:
-        with Image.open(path) as image:
-            if image.mode[0] in "IF":  # Pillow would cut more than 8 bits at 255
-                raise InputError(f"{path}: expected 8 bits a channel, found {image.mode}; write it again.")
-            return np.array(image.convert("RGB"))
-    except InputError:
-        raise
-    except Exception as error:  # Pillow raises many types, SyntaxError among them
-        raise InputError(f"{path}: could not be read as an image ({reason_of(error)}); write it again.") from error
+    # Pillow raises many types, SyntaxError among them
+    with refusing(Exception, f"{path}: could not be read as an image", "; write it again."), Image.open(path) as image:
+        if image.mode[0] in "IF":  # Pillow would cut more than 8 bits at 255
+            raise InputError(f"{path}: expected 8 bits a channel, found {image.mode}; write it again.")
+        return np.array(image.convert("RGB"))
 
 
 def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> None:

@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 import torch.distributed as dist
 
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, refusing
 from warp_splat.runtime.devices import is_out_of_memory
 from warp_splat.runtime.rows import Rows
 from warp_splat.runtime.timers import stage
@@ -156,14 +156,10 @@ def join(device: str, images: int = 0, kind: type[Processes] = Processes) -> Ite
     if os.environ.get("WORLD_SIZE", "1") == "1":
         yield Processes(images=images) if images > 1 else ALONE
         return
-    try:
-        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+    names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+    problem = "WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise"
+    with refusing((KeyError, ValueError), problem, "; start several processes with torchrun, or unset it."):
         rank, count, local_rank, local_count = (int(os.environ[name]) for name in names)
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            f"WORLD_SIZE: expected RANK, LOCAL_RANK and LOCAL_WORLD_SIZE beside it, all numbers, found otherwise "
-            f"({error}); start several processes with torchrun, or unset it."
-        ) from error
     # torch loads this later anyhow. Its functions would then keep the group of that moment as a default argument.
     # Nothing would end that group or its gloo threads, which abort a process that shuts down around them.
     import torch.distributed.nn  # noqa: PLC0415 - only of use here

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, refusing
 from warp_splat.scene import images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.images import Photo
@@ -103,18 +103,15 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     for name, record_end in RECORD_ENDS.items():
         if (folder / name).is_file():
             _check_length(folder / name, record_end)
-    try:
+    advice = f"; export it again, for COLMAP {pycolmap.__version__} or older."
+    # pycolmap raises many types, IndexError and ValueError among them
+    with refusing(Exception, f"{folder}: expected a COLMAP model, but pycolmap cannot read it", advice):
         model = pycolmap.Reconstruction(folder)
         if not (folder / "images.bin").is_file():
             _restore_names(model, folder / "images.txt")
         for image in model.reg_image_ids():
             _ = model.image(image).name  # from binary files, pycolmap looks for it, and decodes it, only now
         return model
-    except Exception as error:  # pycolmap raises many types, IndexError and ValueError among them
-        raise InputError(
-            f"{folder}: expected a COLMAP model, but pycolmap cannot read it ({reason_of(error)}); export it again, "
-            f"for COLMAP {pycolmap.__version__} or older."
-        ) from error
 
 
 def _restore_names(model: pycolmap.Reconstruction, path: Path) -> None:

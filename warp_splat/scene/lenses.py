@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, refusing
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import MODELS
 from warp_splat.scene import images
@@ -110,13 +110,9 @@ def _pinhole(lens: pycolmap.Camera, pose: Pose) -> Camera:
 def _undistorted(lens: Calibration, size: tuple[int, int]) -> pycolmap.Camera:
     """The pinhole that COLMAP's image_undistorter gives ``lens``, without blank pixels."""
     camera = lens.load(*size)
-    try:
+    problem = f"expected a lens that can be undistorted, pycolmap refuses {lens.model} {camera.params.tolist()}"
+    with refusing(Exception, problem, "; correct the model or leave this image out."):
         return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    except Exception as error:
-        raise InputError(
-            f"expected a lens that can be undistorted, pycolmap refuses {lens.model} {camera.params.tolist()} "
-            f"({reason_of(error)}); correct the model or leave this image out."
-        ) from error
 
 
 def sampling_of(lens: Calibration, size: tuple[int, int], pinhole: tuple[float, ...]) -> np.ndarray:

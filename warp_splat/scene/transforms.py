@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, refusing
 from warp_splat.formats.files import reading
 from warp_splat.formats.ply import GRAY, load_points
 from warp_splat.scene import images
@@ -69,10 +69,9 @@ def _parse(path: Path) -> dict[str, Any]:
         size = path.stat().st_size
         if size > JSON_BYTES:
             raise InputError(f"{path}: expected at most {JSON_BYTES} bytes of JSON, found {size}; leave out frames.")
-        try:
+        kinds = (ValueError, RecursionError)  # of the syntax, of the encoding, or of the depth
+        with refusing(kinds, f"{path}: expected JSON, but it cannot be parsed", "; correct it."):
             content = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:  # of the syntax, of the encoding, or of the depth
-            raise InputError(f"{path}: expected JSON, but it cannot be parsed ({error!s:.200}); correct it.") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object with the key frames, found another value; correct the file.")
     return content

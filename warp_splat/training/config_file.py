@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, refusing
 from warp_splat.flags import default_of, fits, flags_of
 from warp_splat.formats.checkpoint import EXPECTED, load_header
 from warp_splat.formats.files import Unexpected, reading, write_text
@@ -24,12 +24,9 @@ def read_config(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: if it cannot be read or is no TOML; for an unknown option, or a value that it cannot have.
     """
-    try:
-        with open(path, "rb") as file:
-            found = tomllib.load(file)
-    except (OSError, ValueError, RecursionError) as error:
-        reason = reason_of(getattr(error, "strerror", None) or error)
-        raise InputError(f"--config {path}: expected a TOML file with options of training ({reason}).") from error
+    problem = f"--config {path}: expected a TOML file with options of training"
+    with refusing((OSError, ValueError, RecursionError), problem), open(path, "rb") as file:
+        found = tomllib.load(file)
     options = {item.name: item for item in flags_of(TrainConfig) if item.name != "config"}
     for name, value in found.items():
         if name not in options:

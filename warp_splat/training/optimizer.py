@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, refusing
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import CHUNK, GaussianModel
 from warp_splat.training.adam_step import HALF, load_adam, move
@@ -47,16 +47,12 @@ def zeros_in_file(folder: Path, shape: Sequence[int], dtype: torch.dtype) -> tor
         InputError: if there is no room for it.
     """
     size = dtype.itemsize * math.prod(shape)
-    try:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            if hasattr(os, "posix_fallocate"):  # a page without room on the disk would end the process
-                os.posix_fallocate(file.fileno(), 0, max(size, 1))
-            content = np.memmap(file, np.uint8, "r+" if os.fstat(file.fileno()).st_size else "w+", shape=max(size, 1))
-    except OSError as error:
-        raise InputError(
-            f"{folder}: expected {size / 2**20:.0f} MiB more on its disk for --out_of_core ({error.strerror}); free "
-            "some, or choose another folder with -m."
-        ) from error
+    problem = f"{folder}: expected {size / 2**20:.0f} MiB more on its disk for --out_of_core"
+    advice = "; free some, or choose another folder with -m."
+    with refusing(OSError, problem, advice), tempfile.TemporaryFile(dir=folder) as file:
+        if hasattr(os, "posix_fallocate"):  # a page without room on the disk would end the process
+            os.posix_fallocate(file.fileno(), 0, max(size, 1))
+        content = np.memmap(file, np.uint8, "r+" if os.fstat(file.fileno()).st_size else "w+", shape=max(size, 1))
     return torch.from_numpy(content)[:size].view(dtype).view(*shape)
 
 

@@ -19,7 +19,7 @@ import torch
 from torch.nn import functional
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError
+from warp_splat.errors import refusing
 from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.runtime.timers import stage
@@ -189,13 +189,10 @@ class Deck:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on dealing. Raises InputError if what is in the checkpoint does not fit."""
         places, words = checkpoint.fact("deck", list), checkpoint.fact("random.views", list)
-        try:
+        problem = f"{checkpoint.path}: expected a deck of views and a random state, found other values"
+        with refusing((TypeError, ValueError, LookupError, OverflowError), problem):
             self.left = list(dict.fromkeys(self.views[place] for place in places))
             self.random.setstate((3, tuple(words), None))
-        except (TypeError, ValueError, LookupError, OverflowError) as error:
-            raise InputError(
-                f"{checkpoint.path}: expected a deck of views and a random state, found other values ({error!s:.100})."
-            ) from error
 
 
 def shares_of_size(learn: LearnOptions, views: Sequence[View]) -> tuple[float, ...]:
