@@ -17,16 +17,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from warp_splat.formats.files import (
-    Unexpected,
-    atomic_write,
-    check_expansion,
-    entries_of,
-    json_object,
-    numbers_of,
-    reading,
-    whole_number,
-)
+from warp_splat.formats import files
 from warp_splat.formats.palettes import ENTRIES, codebook, palette
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.formats.stored import from_smallest_three, logit, sigmoid, smallest_three
@@ -63,15 +54,12 @@ def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
     scale_entries, scale_labels = codebook(scales)
     color_entries, color_labels = codebook(sh[:, 0])
     alphas = np.rint(255 * sigmoid(opacities.astype(np.float64))).astype(np.uint8)
-    # of each part, what the JSON says, and its images
+    # of each part, what the JSON says, and its images, or the pixels of one
     parts: dict[str, tuple[dict, dict[str, np.ndarray]]] = {
-        "means": (
-            {"mins": low.tolist(), "maxs": high.tolist()},
-            {"means_l": _laid_out(steps & 255), "means_u": _laid_out(steps >> 8)},
-        ),
-        "scales": ({"codebook": _listed(scale_entries)}, {"scales": _laid_out(scale_labels)}),
-        "quats": ({}, {"quats": _laid_out(_pack_quats(quats))}),
-        "sh0": ({"codebook": _listed(color_entries)}, {"sh0": _laid_out(np.column_stack([color_labels, alphas]))}),
+        "means": ({"mins": low.tolist(), "maxs": high.tolist()}, {"means_l": steps & 255, "means_u": steps >> 8}),
+        "scales": ({"codebook": _listed(scale_entries)}, {"scales": scale_labels}),
+        "quats": ({}, {"quats": _pack_quats(quats)}),
+        "sh0": ({"codebook": _listed(color_entries)}, {"sh0": np.column_stack([color_labels, alphas])}),
     }
     if coefficients > 1:
         entries, labels = palette(sh[:, 1:].reshape(count, -1), min(PALETTE_MOST, max(1024, count // PALETTE_SHARE)))
@@ -80,18 +68,17 @@ def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
         table = np.zeros((rows * PALETTE_ROW, coefficients - 1, 3), np.uint8)
         table[: len(entries)] = indices.reshape(-1, coefficients - 1, 3)
         indices = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels)])
-        parts["shN"] = (
-            {"count": len(entries), "bands": COEFFICIENTS.index(coefficients), "codebook": _listed(numbers)},
-            {"shN_centroids": table.reshape(rows, -1, 3), "shN_labels": _laid_out(indices)},
-        )
+        facts = {"count": len(entries), "bands": COEFFICIENTS.index(coefficients), "codebook": _listed(numbers)}
+        parts["shN"] = facts, {"shN_centroids": table.reshape(rows, -1, 3), "shN_labels": indices}
     meta = {"version": 2, "asset": {"generator": "warp-splat"}, "count": count}
     if file.antialiased:
         meta |= {"antialias": True, "model": "antialiased"}
     meta |= {part: {**facts, "files": [f"{name}.webp" for name in images]} for part, (facts, images) in parts.items()}
-    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with files.atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         # entries without a time, so that equal Gaussians give equal bytes; WebP is compressed already
         archive.writestr(zipfile.ZipInfo(META), json.dumps(meta, allow_nan=False))
-        for name, image in (image for _, images in parts.values() for image in images.items()):
+        for name, pixels in (image for _, images in parts.values() for image in images.items()):
+            image = pixels if pixels.ndim == 3 else _laid_out(pixels)
             with archive.open(zipfile.ZipInfo(f"{name}.webp"), "w") as target:
                 Image.fromarray(image).save(target, "WEBP", lossless=True, exact=True, quality=80, method=4)
 
@@ -106,7 +93,7 @@ def load_sog(path: str | Path, report: Report = print) -> SplatFile:
     Raises:
         InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
     """
-    with reading(path, "a .sog file of version 2", *DAMAGE), zipfile.ZipFile(path) as archive:
+    with files.reading(path, "a .sog file of version 2", *DAMAGE), zipfile.ZipFile(path) as archive:
         return _Bundle(archive, Path(path).stat().st_size).file()
 
 
@@ -117,20 +104,20 @@ class _Bundle:
         self.archive = archive
         self.file_bytes = file_bytes
         self.size: tuple[int, int] | None = None  # of the images that hold the Gaussians
-        self.meta = json_object(self._bytes(META, META_BYTES))
+        self.meta = files.json_object(self._bytes(META, META_BYTES))
         version = self.meta.get("version", 1)  # the first had none
         if version != 2:
-            raise Unexpected(f"version {version!r:.40}; save it with splat-transform, which writes version 2")
-        self.count = whole_number(self.meta.get("count"), "count", 2**32)
+            raise files.Unexpected(f"version {version!r:.40}; save it with splat-transform, which writes version 2")
+        self.count = files.whole_number(self.meta.get("count"), "count", 2**32)
         harmonics = self.meta.get("shN") is not None
-        self.degree = whole_number(self._part("shN").get("bands"), "bands", 3) if harmonics else 0
+        self.degree = files.whole_number(self._part("shN").get("bands"), "bands", 3) if harmonics else 0
         self.coefficients = COEFFICIENTS[self.degree]
-        check_expansion(self.count, PIXEL_BYTES + 3 * (self.coefficients - 1), file_bytes)
+        files.check_expansion(self.count, PIXEL_BYTES + 3 * (self.coefficients - 1), file_bytes)
 
     def file(self) -> SplatFile:
         """The Gaussians."""
         means, colors = self._part("means"), self._pixels("sh0", 0)
-        low, high = numbers_of(means, "mins", 3), numbers_of(means, "maxs", 3)
+        low, high = files.numbers_of(means, "mins", 3), files.numbers_of(means, "maxs", 3)
         steps = self._pixels("means", 0)[:, :3] + 256.0 * self._pixels("means", 1)[:, :3]
         sh = np.zeros((self.count, self.coefficients, 3), np.float32)
         sh[:, 0] = self._codebook("sh0")[colors[:, :3]]
@@ -149,11 +136,11 @@ class _Bundle:
     def _part(self, name: str) -> dict:
         part = self.meta.get(name)
         if not isinstance(part, dict):
-            raise Unexpected(f"no object {name!r} in its {META}")
+            raise files.Unexpected(f"no object {name!r} in its {META}")
         return part
 
     def _codebook(self, part: str) -> np.ndarray:
-        return numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
+        return files.numbers_of(self._part(part), "codebook", ENTRIES).astype(np.float32)
 
     def _pixels(self, part: str, index: int) -> np.ndarray:
         """The Gaussians' pixels [N, 4] of an image."""
@@ -162,7 +149,7 @@ class _Bundle:
     def _harmonics(self) -> np.ndarray:
         """[N, K - 1, 3] float32."""
         part = self._part("shN")
-        entries = whole_number(part.get("count"), "count of the palette", PALETTE_MOST)
+        entries = files.whole_number(part.get("count"), "count of the palette", PALETTE_MOST)
         size = (PALETTE_ROW * (self.coefficients - 1), -(-entries // PALETTE_ROW))
         table = self._image("shN", 0, size).reshape(-1, self.coefficients - 1, 4)[:entries, :, :3]
         labels = self._pixels("shN", 1)
@@ -173,9 +160,9 @@ class _Bundle:
 
     def _image(self, part: str, index: int, size: tuple[int, int] | None = None) -> np.ndarray:
         """An image [H, W, 4] uint8 of ``size`` (width, height), or of that which holds the Gaussians."""
-        names = entries_of(self._part(part), "files")
+        names = files.entries_of(self._part(part), "files")
         if index >= len(names) or not isinstance(names[index], str):
-            raise Unexpected(f"no name of image {index} of {part!r}")
+            raise files.Unexpected(f"no name of image {index} of {part!r}")
         data = self._bytes(names[index], self.file_bytes)
         width, height = _webp_size(data, names[index])
         wanted = size or self.size
@@ -196,9 +183,9 @@ class _Bundle:
         try:
             info = self.archive.getinfo(name)
         except KeyError:
-            raise Unexpected(f"no file {name!r:.80} in it") from None
+            raise files.Unexpected(f"no file {name!r:.80} in it") from None
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise Unexpected(f"{name!r:.80} in another compression than deflate")
+            raise files.Unexpected(f"{name!r:.80} in another compression than deflate")
         with self.archive.open(info) as source:
             data = source.read(most + 1)
         if len(data) > most:
@@ -219,14 +206,14 @@ def _laid_out(rows: np.ndarray) -> np.ndarray:
 def _webp_size(data: bytes, name: str) -> tuple[int, int]:
     """Width and height by the header: Pillow allocates an image as it opens it."""
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
-        raise Unexpected(f"an image {name!r:.80} that is no WebP")
+        raise files.Unexpected(f"an image {name!r:.80} that is no WebP")
     match data[12:16]:
         case b"VP8L":
             bits = int.from_bytes(data[21:25], "little")
             return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
         case b"VP8X" if _is_lossless(data):
             return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    raise Unexpected(f"an image {name!r:.80} whose compression changes values")
+    raise files.Unexpected(f"an image {name!r:.80} whose compression changes values")
 
 
 def _is_lossless(data: bytes) -> bool:
