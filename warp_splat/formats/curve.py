@@ -7,14 +7,8 @@ from warp_splat.runtime.rows import Rows
 
 ALONE = Rows()  # what is given is all there is
 CELLS = 2**20  # of the Morton curve, along an axis
-#: Shifts and masks that put two zeros between the bits of a number below 2^21.
-MORTON = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
+#: Masks that put two zeros between the bits of a number below 2^21, after shifts by 32, 16, 8, 4 and 2.
+MORTON = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
 
 
 def along_curve(means: torch.Tensor) -> torch.Tensor:
@@ -35,8 +29,8 @@ def keys_of(means: torch.Tensor, rows: Rows = ALONE) -> torch.Tensor:
     low, high = rows.between(values, count // 100)  # what lies far out shall not set the size of the cells
     shares = torch.nan_to_num((values - low) / (high - low).amax().clamp_min(1e-30)).clamp(0.0, 1.0)
     cells = (shares * (CELLS - 1)).long()
-    for shift, mask in MORTON:
-        cells = (cells | (cells << shift)) & mask
+    for place, mask in enumerate(MORTON):
+        cells = (cells | (cells << (32 >> place))) & mask
     return cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2)
 
 

@@ -109,16 +109,13 @@ def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:
     linear = from_srgb(shown, np.where)  # as COLOR_0 is
     attributes = {
         "POSITION": means,
-        "COLOR_0": np.rint(255 * np.concatenate([linear, opacity[:, None]], axis=1)).astype(np.uint8),
+        "COLOR_0": np.rint(255 * np.concatenate([linear, opacity[:, None]], axis=1)),
         f"{NAME}:ROTATION": unit_quats(quats)[:, [1, 2, 3, 0]],
         f"{NAME}:SCALE": np.exp(clipped("log scale", scales, *LOG_SCALES, report)),
         f"{NAME}:OPACITY": opacity,
     }
     attributes |= {name: sh[:, index] for index, name in enumerate(_harmonic_names(sh.shape[1]))}
-    return {
-        name: array if array.dtype == np.uint8 else np.ascontiguousarray(array, "<f4")
-        for name, array in attributes.items()
-    }
+    return {name: np.asarray(array, "u1" if name == "COLOR_0" else "<f4") for name, array in attributes.items()}
 
 
 def _harmonic_names(coefficients: int) -> list[str]:
@@ -140,11 +137,8 @@ def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
     extension: dict = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     if antialiased:
         extension["extras"] = {RENDER_MODE: "mip"}
-    primitive = {
-        "mode": 0,
-        "attributes": {name: index for index, name in enumerate(attributes)},
-        "extensions": {NAME: extension},
-    }
+    indices = {name: index for index, name in enumerate(attributes)}
+    primitive = {"mode": 0, "attributes": indices, "extensions": {NAME: extension}}
     return {
         "asset": {"version": "2.0", "generator": f"warp_splat {__version__}"},
         "extensionsUsed": [NAME],
@@ -180,11 +174,10 @@ def _read_primitive(document: Document, primitive: dict, report: Report) -> Spla
     missing = [name for name in kinds if name not in attributes]
     if missing:
         raise Unexpected(f"a primitive that lacks {', '.join(missing)}")
-    means, rotations, scales, opacities, *sh = (
-        document.accessor(attributes[name], kind) for name, kind in kinds.items()
-    )
-    if len({len(array) for array in (means, rotations, scales, opacities, *sh)}) > 1:
+    arrays = [document.accessor(attributes[name], kind) for name, kind in kinds.items()]
+    if len({len(array) for array in arrays}) > 1:
         raise Unexpected("attributes of different lengths")
+    means, rotations, scales, opacities, *sh = arrays
     if (scales < 0).any():
         report("scales below 0, taken as logarithms, as in drafts of the extension")
     return SplatArrays(

@@ -87,9 +87,8 @@ class Document:
         if stride < element:
             raise ValueError(f"byteStride {stride} for elements of {element} bytes")
         count = whole_number(accessor.get("count"), "count", (length - offset - element) // stride + 1)
-        data = np.fromfile(
-            buffer.path, np.uint8, max(0, (count - 1) * stride + element), offset=buffer.start + first + offset
-        )
+        size = max(0, (count - 1) * stride + element)
+        data = np.fromfile(buffer.path, np.uint8, size, offset=buffer.start + first + offset)
         values = np.ndarray((count, width), dtype, data, strides=(stride, dtype.itemsize)).astype(np.float32)
         if accessor.get("normalized") is True and dtype.kind != "f":
             values = np.maximum(values / np.float32(np.iinfo(dtype).max), -1)
