@@ -155,7 +155,7 @@ def test_results_are_json_and_keep_other_methods(tmp_path):
     (tmp_path / "results.json").write_text(other)  # the reference writes Infinity
     means = {"SSIM": 1.0, "PSNR": np.inf, "CC_PSNR": np.inf}
     per_view = {name: {"00000.png": value} for name, value in means.items()}
-    write_results(tmp_path, 30000, means, per_view, {"gaussians": 12, "seconds": 1.5})
+    write_results(tmp_path, 30000, {**means, "gaussians": 12, "seconds": 1.5}, per_view)
     ours = {"SSIM": means["SSIM"], "PSNR": None, "CC_PSNR": None, "gaussians": 12, "seconds": 1.5}
     expected = {"ours_7000": {"SSIM": 0.5, "PSNR": None}, "ours_30000": ours}
     assert read_strictly(tmp_path / "results.json") == expected

@@ -6,6 +6,7 @@ Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -99,11 +100,7 @@ METRICS: dict[str, Metric] = {"SSIM": ssim, "PSNR": psnr, "CC_PSNR": cc_psnr}  #
 
 
 def write_results(
-    model_folder: str | Path,
-    iteration: int,
-    means: Mapping[str, float],
-    per_view: Mapping[str, Mapping[str, float]],
-    extra: Mapping[str, float | int | str] | None = None,
+    model_folder: str | Path, iteration: int, figures: Mapping[str, Any], per_view: Mapping[str, Mapping[str, float]]
 ) -> None:
     """Put the metrics of one iteration into ``results.json`` and ``per_view.json``, under ``ours_<iteration>``.
 
@@ -113,17 +110,16 @@ def write_results(
     Args:
         model_folder: the model folder.
         iteration: the iteration that was rendered.
-        means: means of each metric.
+        figures: what ``results.json`` keeps: means of each metric, number of Gaussians, seconds, iterations per second.
         per_view: values of each metric for each image.
-        extra: more to keep in ``results.json`` beside the means: number of Gaussians, seconds, iterations per second.
 
     Raises:
         InputError: if an older file is not a JSON object (it is left alone), or a file cannot be written.
     """
     results_path, views_path = Path(model_folder) / "results.json", Path(model_folder) / "per_view.json"
     results, views, name = _read_object(results_path), _read_object(views_path), f"ours_{iteration}"
-    figures = {key: value for key, value in results.get(name, {}).items() if not key.isupper()}  # no old LPIPS
-    write_json(results_path, {**results, name: {**figures, **means, **(extra or {})}})
+    kept = {key: value for key, value in results.get(name, {}).items() if not key.isupper()}  # no old LPIPS
+    write_json(results_path, {**results, name: {**kept, **figures}})
     write_json(views_path, {**views, name: per_view})
 
 

@@ -78,12 +78,9 @@ def evaluate_views(
         if where_taken:
             values[POSE] = psnr(picture(where_taken(view), view.name), photo, mask)
         compared.append(Comparison(views[index], folder / "renders" / f"{index:05d}.png", values))
-    per_view = {
-        name: {f"{index:05d}.png": view.values[name] for index, view in enumerate(compared)}
-        for name in compared[0].values
-    }
+    per_view = {name: {view.render.name: view.values[name] for view in compared} for name in compared[0].values}
     means = {name: sum(values.values()) / len(values) for name, values in per_view.items()}
-    write_results(model_folder, iteration, means, per_view, extra)
+    write_results(model_folder, iteration, {**means, **extra}, per_view)
     return means, compared
 
 
