@@ -81,10 +81,8 @@ def memory_explained(
             raise
         where = getattr(error, "__notes__", ["between two stages"])[0]
         width, height = max(sizes, key=math.prod)
-        raise InputError(
-            f"Out of memory on {device.type} {where}, with {len(gaussians)} Gaussians on {width} x {height} px; "
-            f"{advice}."
-        ) from error
+        what = f"with {len(gaussians)} Gaussians on {width} x {height} px"
+        raise InputError(f"Out of memory on {device.type} {where}, {what}; {advice}.") from error
 
 
 def is_out_of_memory(error: BaseException) -> bool:

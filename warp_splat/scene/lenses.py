@@ -43,9 +43,7 @@ class Calibration:
 
 def make_sampling(native: bool = False) -> Sampling | None:
     """:func:`sampling_of`, remembering the last lenses: photographs often share one. None: nothing is resampled."""
-    if native:
-        return None
-    return functools.lru_cache(maxsize=images.THREADS)(sampling_of)
+    return None if native else functools.lru_cache(maxsize=images.THREADS)(sampling_of)
 
 
 def make_photo(

@@ -47,7 +47,7 @@ Both may have, the growth after the parts:
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -67,8 +67,7 @@ class Entry(NamedTuple):
 
     def load(self) -> Any:
         """The class."""
-        module, name = self.place.rsplit(".", 1)
-        return getattr(importlib.import_module(module), name)
+        return pkgutil.resolve_name(self.place)
 
 
 class Setting(NamedTuple):
