@@ -36,7 +36,10 @@ NO_ROWS = (FINISH, FINISH + "        return False\n\n" + FINISH.replace("finish"
 #: What is left out, as changes of the kernel's text.
 VARIANTS: dict[str, tuple] = {
     WHOLE: (),
-    "the sum over 16 lanes, of each column of a row": (("folded(s, SUMS + grad)", "s[SUMS + grad][0]"),),
+    "the sum over 16 lanes, of each column of a row": (
+        ("folded(s, SUMS + grad)", "s[SUMS + grad][0]"),
+        ("eight[grad]", "s[SUMS + grad][0]"),
+    ),
     "that, and rows of gradients": (NO_ROWS,),
     "sums in lanes, and their products": (
         ("range(CHANNEL):", "range(0):"),
@@ -92,7 +95,7 @@ def main() -> None:
         rows.append((name, f"{1e3 * took:.1f}", "" if name == WHOLE else f"{100 * (1 - took / whole):.0f} %"))
     note = (
         f"Processor time, median of {arguments.repeats} rounds. {len(model)} Gaussians, {camera.width} x "
-        f"{camera.height} px; {counts.pairs / 1e6:.1f}M pairs blended of {counts.looked_at / 1e6:.1f}M looked at."
+        f"{camera.height} px; {counts.pairs / 1e6:.1f}M pairs blended of {counts.by_adjoint / 1e6:.1f}M looked at."
     )
     write_table("adjoint_parts", arguments.out, ("left out", "ms", "saved"), rows, note)
 

@@ -60,7 +60,7 @@ class _Specialize(ast.NodeTransformer):
     """Removes docstrings, and the branches of ``if wp.static(...)`` that a mode does not take."""
 
     def __init__(self, mode: str):
-        self.known = {"mode": mode, "CHANNELS": 3, "way": -1}
+        self.known = {"mode": mode, "CHANNELS": 3, "way": -1, "known": True}
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         super().generic_visit(node)

@@ -172,7 +172,7 @@ def count_scene(model: GaussianModel, camera: Camera) -> Scene:
     with torch.no_grad():
         gaussians = Gaussians(*(tensor.detach() for tensor in model.activated()))
         bins = CPU.bin(project(gaussians, camera, options), camera, options)
-        _, (_, stopped, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
+        _, (_, stopped, *_) = CPU.blend(bins, camera, torch.zeros(3), options, False)
         stops = in_lines(stopped)
         found = torch.empty(len(bins.ranges), 4, dtype=torch.int64)
         launch(count_walked, len(found), [bins.view(), view(stops, wp.float32), ALPHA_MIN], [view(found, wp.int64)])

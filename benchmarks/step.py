@@ -116,9 +116,9 @@ def describe(name: str, trainer: Trainer, counts: Counts, times: dict[int, dict[
     return (
         f"{name}: {len(trainer.model)} Gaussians, {camera.width} x {camera.height} px; in a view {counts.drawn:.0f} "
         f"drawn, {counts.instances:.0f} tile instances, {counts.pairs / 1e6:.1f}M pairs blended of "
-        f"{counts.looked_at / 1e6:.1f}M looked at; the whole step takes {over_blends[0]:.2f} times as long as the two "
-        f"blends together (2 threads: {over_blends[1]:.2f}), two threads are "
-        f"{times[1]['whole step'] / times[2]['whole step']:.2f} times as fast as one."
+        f"{counts.looked_at / 1e6:.1f}M looked at, {counts.by_adjoint / 1e6:.1f}M by the adjoint; the whole step takes "
+        f"{over_blends[0]:.2f} times as long as the two blends together (2 threads: {over_blends[1]:.2f}), two threads "
+        f"are {times[1]['whole step'] / times[2]['whole step']:.2f} times as fast as one."
     )
 
 

@@ -49,7 +49,7 @@ def count_pairs(
     width: float,
     height: float,
     # out
-    pairs_out: wp.array2d[wp.int64],  # [T, 2] blended, and looked at in blocks
+    pairs_out: wp.array2d[wp.int64],  # [T, 3] blended, and looked at in blocks, by the adjoint
 ):
     tile = first + wp.tid()
     start = bins.ranges[tile][0]
@@ -60,6 +60,7 @@ def count_pairs(
         longest = wp.max(longest, wp.max(count[tile, block]))
     blended = wp.int64(0)
     looked_at = wp.int64(0)
+    by_adjoint = wp.int64(0)
     for k in range(start, start + int(longest)):
         splat = bins.splats[bins.instances[k]]
         box = reach(splat.mean, splat.extent, x0, y0)
@@ -76,8 +77,11 @@ def count_pairs(
                 hits += where_less(vec16(splat.mean[1]) - dy, vec16(height), hit, vec16(0.0))
                 looked_at += wp.int64(LANES)
         blended += wp.int64(total(hits))
+        for block in range(BLOCKS):
+            by_adjoint += wp.int64(LANES) * wp.int64((bins.blocks[k] >> block) & 1)
     pairs_out[tile, 0] = blended
     pairs_out[tile, 1] = looked_at
+    pairs_out[tile, 2] = by_adjoint
 
 
 @dataclass(frozen=True)
@@ -91,22 +95,21 @@ class Counts:
     instances: float  # Gaussians in tiles
     pairs: float  # Gaussians in pixels, blended
     looked_at: float  # Gaussians in pixels of blocks of 4 x 4
+    by_adjoint: float  # of these, what the adjoint looks at
 
 
 def count(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> Counts:
     """Of one view on the CPU; ``gaussians`` as :func:`warp_splat.raster.api.render` takes them."""
     with torch.no_grad():
         bins = CPU.bin(project(gaussians, camera, options), camera, options)
-        _, (_, stopped, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
-        pairs = torch.empty(len(bins.ranges), 2, dtype=torch.int64)
-        inputs = [bins.view(), alphas_of(options), view(stopped, vec16), camera.width, camera.height]
+        _, (_, stopped, blocks, _) = CPU.blend(bins, camera, torch.zeros(3), options, False)
+        pairs = torch.empty(len(bins.ranges), 3, dtype=torch.int64)
+        inputs = [bins.view(blocks=blocks), alphas_of(options), view(stopped, vec16), camera.width, camera.height]
         launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
-    blended, looked_at = pairs.sum(0).tolist()
     pixels = camera.width * camera.height
     coefficients = (camera_view(camera, gaussians.sh_rest.shape[1], options).sh_degree + 1) ** 2
-    return Counts(
-        len(gaussians.means), coefficients, len(bins.gaussians), pixels, len(bins.instances), blended, looked_at
-    )
+    drawn, instances = len(bins.gaussians), len(bins.instances)
+    return Counts(len(gaussians.means), coefficients, drawn, pixels, instances, *pairs.sum(0).tolist())
 
 
 def mean(counts: list[Counts]) -> Counts:

@@ -46,7 +46,7 @@ def test_what_is_differentiated_is_the_blend(mode):
     """The loop whose adjoint Warp generates computes the colors and transmittances of the forward kernel."""
     given = workload("dense_tile")
     bins = CPU.bin(project(given.gaussians, given.camera, PLAIN), given.camera, PLAIN)
-    (image, _, _), (final, count, kept) = CPU.blend(bins, given.camera, torch.zeros(3), PLAIN, False)
+    (image, _, _), (final, count, _, kept) = CPU.blend(bins, given.camera, torch.zeros(3), PLAIN, False)
     lists, steps = bins.view(), count.amax((1, 2)).int()
     if mode == "generated":
         lists.splats = wp.array(bins.splats.numpy()[bins.instances.numpy()], dtype=bins.splats.dtype, device="cpu")

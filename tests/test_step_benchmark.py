@@ -34,8 +34,8 @@ def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
     means, conics, opacities, _, depths, _, radii = project(gaussians, camera, RasterOptions())
     drawn = np.flatnonzero(radii.numpy() > 0)
     order = drawn[np.argsort(depths.numpy()[drawn], kind="stable")]
-    y, x = np.mgrid[:30, :40] + 0.5
-    t, running, pairs, skipped = np.ones((30, 40)), np.ones((30, 40), bool), 0, 0
+    y, x = np.mgrid[:32, :48] + 0.5  # of whole tiles
+    t, running, pairs, skipped, blocks = np.ones((32, 48)), np.ones((32, 48), bool), 0, 0, 0
     for i in order:
         dx, dy = means[i, 0].item() - x, means[i, 1].item() - y
         xx, xy, yy = conics[i].tolist()
@@ -43,11 +43,13 @@ def test_pairs_are_those_of_a_loop_over_all_gaussians_at_all_pixels():
         seen = alpha >= ALPHA_MIN
         running &= ~(seen & (t * (1 - alpha) < T_MIN))
         t = np.where(seen & running, t * (1 - alpha), t)
-        pairs += np.count_nonzero(seen & running)
+        pairs += np.count_nonzero((seen & running)[:30, :40])
+        blocks += np.count_nonzero((seen & running).reshape(8, 4, 12, 4).any((1, 3)))
         skipped += np.count_nonzero(seen & ~running)
     assert skipped > 0.1 * pairs  # else the test would not see whether stopped pixels count
     assert found.pairs == pytest.approx(pairs, rel=1e-4)  # a pair at the threshold may round to either side
-    assert found.pairs < found.looked_at < 16 * found.pairs
+    assert found.by_adjoint == 16 * blocks
+    assert found.pairs < found.by_adjoint < found.looked_at < 16 * found.pairs
     assert (found.gaussians, found.drawn, found.pixels, found.coefficients) == (3000, len(order), 1200, 16)
 
 
@@ -68,7 +70,9 @@ def test_floor_is_the_larger_of_its_two_parts():
     limit = limits.Limits(bandwidth=100.0, rate=2.0)
     assert limit.floor(300.0, 16.0) == 3.0 and limit.floor(100.0, 160.0) == 5.0
     # 2 Gaussians of degree 0, one of which is drawn, on 10 pixels: by hand
-    counts = work.Counts(gaussians=2, coefficients=1, drawn=1, pixels=10, instances=3, pairs=7, looked_at=32)
+    counts = work.Counts(
+        gaussians=2, coefficients=1, drawn=1, pixels=10, instances=3, pairs=7, looked_at=32, by_adjoint=16
+    )
     found = work.work_of(counts)
     assert found["project"] == (2 * 48 + 60, 240) and found["blend"] == (12 + 48 + 240, 7 * 31)
     assert found["Adam"][0] == 2 * 14 * 4 * 7 and found["host"] == (0, 0)
@@ -86,7 +90,7 @@ def test_table_of_a_small_step(two_threads):
     assert data["floors"][1]["whole step"] == pytest.approx(sum(data["floors"][1][stage] for stage in parts))
 
 
-COUNTS = work.Counts(500, 16, 400, 64 * 48, 900, 9000, 20000)
+COUNTS = work.Counts(500, 16, 400, 64 * 48, 900, 9000, 20000, 15000)
 
 
 def test_what_is_left_out_changes_nothing(two_threads):

@@ -80,7 +80,7 @@ class _Assembly:
         found = []
         for line in lines:
             if isinstance(line, ast.If | ast.For | ast.While):
-                line.body = self.expanded(line.body)
+                line.body, line.orelse = self.expanded(line.body), self.expanded(line.orelse)
             call = line.value if isinstance(line, ast.Assign | ast.Expr) else None
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in self.parts:
                 target = line.targets[0] if isinstance(line, ast.Assign) else None

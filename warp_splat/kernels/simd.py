@@ -63,7 +63,8 @@ def _fused(number: str, builtin: str) -> str:
     return f"auto fused = []({number} a, {number} b, {number} c) {{ return {result}; }}; "
 
 
-_VECTORS = "".join(
+#: C++: the compiler's vectors of sixteen, V of floats and I of integers.
+VECTORS = "".join(
     f"typedef {scalar} {name} __attribute__((vector_size({4 * LANES}), aligned(4), may_alias)); "
     for name, scalar in (("V", "float"), ("I", "int"))
 ) + _fused("V", "__builtin_elementwise_fma")
@@ -80,9 +81,9 @@ def _vectors(result: str, adjoint: str = ";", kind: str = "float") -> tuple[str,
         for code in (result, adjoint)
     )
     if kind == "bool":
-        return f"{_VECTORS} return {forward};", _VECTORS + reverse
+        return f"{VECTORS} return {forward};", VECTORS + reverse
     name = {"float": "V", "int": "I"}[kind]
-    return f"{_VECTORS} wp::vec_t<{LANES}, {kind}> r; ({name}&)r = {forward}; return r;", _VECTORS + reverse
+    return f"{VECTORS} wp::vec_t<{LANES}, {kind}> r; ({name}&)r = {forward}; return r;", VECTORS + reverse
 
 
 def in_lanes(result: str, adjoint: str = ";", kind: str = "float") -> Callable[[Callable], wp.Function]:
@@ -265,6 +266,18 @@ def halved(x: float, n: int):
 @wp.func_grad(halved)
 def adj_halved(x: float, n: int, adj_ret: float):
     wp.adjoint[x] += adj_ret * halved(1.0, n)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __clz(__brev(bits));  // never negative, as the compiler knows
+#else
+    return __builtin_ctz(bits);
+#endif
+""")
+def lowest(bits: int) -> int:
+    """The place of the lowest bit that is set, of one at least."""
+    ...
 
 
 @wp.func

@@ -41,6 +41,7 @@ class BinsView:
     ranges: wp.array[wp.vec2i]  # [T] first and last instance of a tile
     instances: wp.array[int]  # [M] splats, by tile, front to back
     splats: wp.array[Splat2D]  # [V]
+    blocks: wp.array[int]  # [M] blocks of its tile in which an instance is blended, a bit each: see `walk` of the CPU
 
 
 @wp.struct

@@ -21,7 +21,7 @@ from warp_splat.runtime.launch import check_memory, empty, launch, read_later, s
 from warp_splat.runtime.pool import even_slices, in_slices, slice_count, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
-BYTES = 60  # of an instance: its place, what sorting it takes, and its row of gradients
+BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
 SMALLEST_BAND = 2**14  # splats of a thread that are ordered by depth; below, launches cost more than they save

@@ -26,6 +26,7 @@ class Blending:
     # where the color stopped in each pixel, in the layout of the device, once it is blended
     final: torch.Tensor = field(init=False)  # transmittance behind the last Gaussian
     count: torch.Tensor = field(init=False)  # instances walked before the pixel stopped
+    blocks: torch.Tensor = field(init=False)  # blocks in which an instance is blended
 
     @property
     def steps(self) -> torch.Tensor:
@@ -60,7 +61,7 @@ class Blend(torch.autograd.Function):
         ctx.blending = replace(blending)  # without what it finds, which goes with the graph
         keep, background = adjoint == "stored" and differentiated, background.contiguous()
         pixels, saved = blending.driver.blend(blending.bins, blending.camera, background, options, keep)
-        blending.final, blending.count, _ = saved
+        blending.final, blending.count, blending.blocks, _ = saved
         ctx.save_for_backward(background, *saved)
         return tuple(pixels)
 

@@ -71,10 +71,11 @@ class Bins:
     pictures: int = 1  # below each other, with their tiles one after another
     bound: BoundView = field(default_factory=BoundView)  # filled in where the blend finds the bound
 
-    def view(self) -> BinsView:
-        """What every blend kernel reads first."""
+    def view(self, **saved: torch.Tensor) -> BinsView:
+        """What every blend kernel reads first; ``saved``: ``blocks``, once they are known."""
         size = {"tiles_x": self.tiles_x, "tiles": len(self.ranges) // self.pictures, "height": self.height}
-        return pack_struct(BinsView, **size, ranges=self.ranges, instances=self.instances, splats=self.splats)
+        lists = {"ranges": self.ranges, "instances": self.instances, "splats": self.splats}
+        return pack_struct(BinsView, **size, **lists, **saved)
 
     def by_pixel(self, values: torch.Tensor, width: int) -> torch.Tensor:
         """Of each tile [T] to its pixels, [H, W]."""
@@ -157,6 +158,7 @@ class Saved(NamedTuple):
 
     final: torch.Tensor  # [T, a tile's pixels] transmittance behind the last Gaussian
     count: torch.Tensor  # [T, a tile's pixels] instances walked before the pixel stopped
+    blocks: torch.Tensor  # [M] int32, blocks of its tile in which an instance is blended, a bit each; on a GPU [0]
     kept: torch.Tensor  # [M, a tile's pixels] every transmittance; [0, ...] if not asked for
 
 

@@ -69,16 +69,17 @@ class Driver:
         tile_count, new, shape = len(bins.ranges), background.new_empty, self.layout.shape
         pixels = Pixels.empty(camera, options, background)
         final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.layout.counts)
-        saved = Saved(final, count, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
+        blocks = new(len(bins.instances) if self.lanes > 1 else 0, dtype=torch.int32)
+        saved = Saved(final, count, blocks, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
         limits = new(0 if options.hidden_from is None else tile_count, *shape)
         if options.hidden_from is not None:
             inputs = [bins.view(), view(options.hidden_from.resolve_neg(), wp.float32), self.lanes]
             outputs = [view(limits.view(-1, THREADS), wp.float32)]
             launch(count_in_front, tile_count, inputs, outputs, bounds=bins.slices, device=background.device)
         variant = variant_of(options, keep, options.bound, options.hidden_from is not None)
-        inputs = [bins.view(), alphas_of(options), *limits_of(options), view(background, wp.float32), bins.bound]
-        inputs.append(view(limits, self.layout.number))
-        outputs = [pixels.view(), *self.view_walk(*saved)]
+        inputs = [bins.view(blocks=blocks), alphas_of(options), *limits_of(options), view(background, wp.float32)]
+        inputs += [bins.bound, view(limits, self.layout.number)]
+        outputs = [pixels.view(), *self.view_walk(final, count, saved.kept)]
         self.launch_tiles(self.kernels.blend.make_blend(variant), bins, inputs, outputs)
         return pixels, saved
 
@@ -126,8 +127,8 @@ class Driver:
         self, mode: str, bins: Bins, options: RasterOptions, saved: Saved, upstream, steps, slots: torch.Tensor
     ) -> None:
         """Fill ``slots`` [M, 9 or 10]; ``upstream`` and ``steps`` [T] are those of :meth:`spread_upstream`."""
-        final, count, kept = self.view_walk(*saved)
-        lists, steps, rows = bins.view(), view(steps, wp.int32), view(slots, wp.float32)
+        final, count, kept = self.view_walk(saved.final, saved.count, saved.kept)
+        lists, steps, rows = bins.view(blocks=saved.blocks), view(steps, wp.int32), view(slots, wp.float32)
         variant = variant_of(options)
         upstream = [view(upstream[0], self.layout.upstream), view(upstream[1], self.layout.number)]
         if mode in ("manual", "stepwise"):

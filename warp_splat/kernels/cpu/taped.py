@@ -14,6 +14,8 @@ skips those that a pixel did not. What a loop carries has to be an element of a 
 Pieces with a gradient by hand: the clamp (``opaque``), the falloff (``fall_known``), and the reading of a Gaussian
 (``spread`` into lanes, ``collect`` into its row). ``generated`` does without them. It reads a copy of the Gaussian per
 tile instance: Warp adds the adjoint of a read to the Gaussian's own, which would be a race between threads.
+
+Tried: no faster, ``stored`` 7 % slower: an ``if`` around the blocks in which the blend saw nothing.
 """
 
 import functools

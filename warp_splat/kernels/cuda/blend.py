@@ -14,6 +14,7 @@ from warp_splat.kernels.bound import BoundView, Since
 from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.cuda.settle import EACH, at_start, conclude, expect, make_ideal, vec_each
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
+from warp_splat.kernels.simd import lowest
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
@@ -143,7 +144,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
                 listed = staged[group * warps.WARP + lane]
                 left_over = warps.ballot(((wp.cast(listed[TOUCHED], int) >> half) & looked_at) != 0, thread)
                 while left_over != 0:
-                    j = group * warps.WARP + warps.lowest(left_over)
+                    j = group * warps.WARP + lowest(left_over)
                     left_over = left_over & (left_over - 1)
                     g = staged[j]
                     touched = (wp.cast(g[TOUCHED], int) >> half) & looked_at

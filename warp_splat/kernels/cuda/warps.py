@@ -85,18 +85,6 @@ def ballot(vote: bool, thread: int) -> int:
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __clz(__brev(bits));  // never negative, as the compiler knows
-#else
-    return __builtin_ctz(bits);
-#endif
-""")
-def lowest(bits: int) -> int:
-    """The place of the lowest bit that is set, of one at least."""
-    ...
-
-
 @wp.func
 def column_of(thread: int, columns: int):
     """The column of which :func:`lane_sum` tells ``thread`` the sum, of up to sixteen; -1: none."""
