@@ -299,10 +299,10 @@ def steps_slower(mode: str) -> float:
     return rate["manual"] / rate[mode]
 
 
-def looked_at(size: str) -> float:
-    """Pixels that lanes look at, for each in which a Gaussian is blended."""
+def looked_at(size: str, by: str = "looked_at") -> float:
+    """Pixels that lanes look at, for each in which a Gaussian is blended; or "by_adjoint"."""
     found = data("step")[size]["counts"]
-    return found["looked_at"] / found["pairs"]
+    return found[by] / found["pairs"]
 
 
 def of_two_threads(limit: str) -> float:

@@ -200,6 +200,11 @@ def _steps() -> list[tuple]:
             f.one(f.looked_at("full")),
             f.one(f.looked_at("synthetic")),
         ),
+        (
+            "saw the Gaussian: {} and {} times as many",
+            f.one(f.looked_at("full", "by_adjoint")),
+            f.one(f.looked_at("synthetic", "by_adjoint")),
+        ),
     ]
 
 
