@@ -37,6 +37,23 @@ def test_bit_identical_between_runs_and_thread_counts(name, device, threads):
 
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
+def test_an_opacity_has_its_gradient_where_its_weight_underflows(adjoint):
+    camera, in_front = scenes.make_camera(32, 32, seed=None), 6  # each of opacity 0.99 in all pixels
+    opacities = torch.tensor([1.0] * in_front + [1e-36], requires_grad=True)
+    means = torch.tensor([[0.0, 0.0, 5.0 + 0.5 * place] for place in range(in_front + 1)])
+    scales = torch.tensor([[50.0] * 3] * in_front + [[0.5] * 3])
+    quats, sh = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(in_front + 1, 1), torch.full((in_front + 1, 1, 3), 0.7)
+    options = RasterOptions(alpha_min=0.0, t_min=0.0)
+    warp_splat.rasterize(
+        means, quats, scales, opacities, sh, camera, (0.1, 0.2, 0.3), adjoint, options
+    ).image.sum().backward()
+    variance = (camera.fx * 0.5 / 8.0) ** 2 + 0.3  # px^2: all its pixels together are 2 pi of these
+    light = 3 * (0.5 + 0.7 * 0.28209479) - 0.6  # that it adds, less the background's that it hides
+    expected = 0.01**in_front * 2 * math.pi * variance * light
+    assert opacities.grad is not None and opacities.grad[-1].item() == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_defaults_of_torch_change_nothing(adjoint):
     """The inputs say of what type the numbers are, and where they lie."""
     scene = truth("degree3", PLAIN).scene.to("cpu")

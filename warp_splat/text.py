@@ -21,7 +21,7 @@ def few(names: Iterable[str]) -> str:
 
 def upward(number: float) -> str:
     """Two digits of a number that is not negative, which it does not exceed."""
-    return f"{float(Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(number))):.2g}"
+    return f"{float(Context(prec=2, rounding=ROUND_CEILING).create_decimal(repr(float(number)))):.2g}"
 
 
 def format_table(headers: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -5,6 +5,7 @@ Files are written beside their final name and moved there when complete: a reade
 
 import csv
 import errno
+import io
 import json
 import os
 import uuid
@@ -123,6 +124,8 @@ def reading(path: str | Path, expected: str, *damage: type[Exception]) -> Iterat
             yield
     except InputError:
         raise
+    except io.UnsupportedOperation as error:  # a ValueError as well
+        raise InputError(f"{path}: could not be read ({error}).") from error
     except (ValueError, OverflowError, RecursionError, *damage) as error:
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200] or type(error).__name__
         raise InputError(f"{path}: the file is damaged or cut short ({reason}); copy or save it again.") from error

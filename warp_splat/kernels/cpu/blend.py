@@ -99,9 +99,12 @@ _MARKS = (
 )
 
 
-@wp.func_native(_MARKS + VECTORS + "(*marks)[block] = __builtin_bit_cast(M, __builtin_convertvector((V&)w > 0.0f, B));")
-def mark(s: wp.array[vec16], row: int, block: int, w: vec16):
-    """Note in a row the lanes of a block in which ``w`` is positive."""
+@wp.func_native(
+    _MARKS + VECTORS + "(*marks)[block] = __builtin_bit_cast(M, "
+    "__builtin_convertvector((V&)alpha > 0.0f, B) & __builtin_convertvector((V&)behind > 0.0f, B));"
+)
+def mark(s: wp.array[vec16], row: int, block: int, alpha: vec16, behind: vec16):
+    """Note in a row the lanes of a block that blend ``alpha``: not by their weight, which may underflow."""
 
 
 @wp.func_native(_MARKS + "return __builtin_bit_cast(M, __builtin_convertvector(*marks != 0, B));")
@@ -214,7 +217,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         if wp.static(variant.hides):
             behind = where_less(here, limits[tile, block], behind, wp.min(s[T + block], -s[T + block]))
         w = weight(s[T + block], alpha, behind)
-        mark(s, SEEN, block, w)
+        mark(s, SEEN, block, alpha, behind)
         if wp.static(variant.keep):
             kept_out[k, block] = s[T + block]
         for channel in range(3):

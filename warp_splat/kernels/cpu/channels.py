@@ -88,8 +88,8 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
         else:
             behind = fma(-alpha, t, t)
             s[T + block] = behind
-            known = s[MEDIAN + block]
-            s[MEDIAN + block] = where_less(vec16(0.5), t, where_less(vec16(0.5), behind, known, here), known)
+            median = s[MEDIAN + block]
+            s[MEDIAN + block] = where_less(vec16(0.5), t, where_less(vec16(0.5), behind, median, here), median)
             place = here
             for j in range(MOST):  # each as strong as it is pushes the weaker ones down
                 best = s[WEIGHT + j * BLOCKS + block]
