@@ -15,8 +15,8 @@ from warp_splat.raster.certificate import FAINT, SURE, Certificate
 from warp_splat.raster.data import Bins, Pixels, Splats2D
 
 #: From which tolerance on the exponential's polynomial may be of that degree; its error is a tenth at most.
-#: Where opacities are cut at 1/255, that error also decides what is cut: well below ``BAND``, unless a user asks for
-#: a lower degree.
+#: Where opacities are cut at 1/255, that error also decides what is cut, so it stays well below ``BAND``, unless a user
+#: asks for a lower degree.
 DEGREES = {"ideal": ((3, 2e-3), (4, 1e-4)), "trained": ((4, 1e-4),)}
 FIRST = 1.0 / 70.0  # the cut that is tried first, as a share of the tolerance: mostly it is small enough
 STOP = 0.0007  # where pixels stop, likewise: the Gaussian that crosses it may take 100 times as much

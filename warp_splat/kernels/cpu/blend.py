@@ -104,7 +104,7 @@ _MARKS = (
     "__builtin_convertvector((V&)alpha > 0.0f, B) & __builtin_convertvector((V&)behind > 0.0f, B));"
 )
 def mark(s: wp.array[vec16], row: int, block: int, alpha: vec16, behind: vec16):
-    """Note in a row the lanes of a block that blend ``alpha``: not by their weight, which may underflow."""
+    """Note in a row the lanes of a block that blend ``alpha``; their weight would underflow sooner."""
 
 
 @wp.func_native(_MARKS + "return __builtin_bit_cast(M, __builtin_convertvector(*marks != 0, B));")
