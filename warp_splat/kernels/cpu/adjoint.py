@@ -41,7 +41,7 @@ def folded(rows: wp.array[vec16], row: int) -> float:
 
 @wp.func_native(_fold(8, "wp::vec_t<8, float> sums; for (int i = 0; i < 8; i++) sums[i] = x[i]; return sums;"))
 def folded_eight(rows: wp.array[vec16], row: int) -> vec8:
-    """Sums of eight rows of lanes, in a third of the time."""
+    """Sums of eight rows of lanes, found together."""
 
 
 @functools.cache
