@@ -16,6 +16,7 @@ from warp_splat.cli import main
 from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.subject import read_subject
 from warp_splat.inspect.verdicts import forecast
+from warp_splat.scene import load_scene
 from warp_splat.sfm import stages
 
 
@@ -200,6 +201,24 @@ def test_cameras_at_one_place_or_far_away(tmp_path, capsys, far, apart, words):
 
     findings, _ = examine(write_transforms(tmp_path / "a", frame=frame, points=False), tmp_path, capsys, 0)
     assert any(level == "warning" and words in text for level, _, text in findings), findings
+
+
+def test_a_scene_so_small_that_little_of_it_is_drawn(life, tmp_path, capsys, monkeypatch):
+    """Both training and this command say by how much it should grow; then neither does."""
+    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject: ())
+
+    def grow(times):
+        bigger = pycolmap.Sim3d(times, pycolmap.Rotation3d(), np.zeros(3))
+        change_model(life, lambda model: model.transform(bigger))
+
+    grow(0.1)
+    findings, _ = examine(life, tmp_path, capsys, 0)
+    (text,) = [what for _, _, what in findings if "never drawn" in what]
+    lines: list[str] = []
+    load_scene(life, report=lines.append)
+    assert f"Warning: {text}" in lines
+    grow(float(re.search(r"by ([\d.]+)\.$", text)[1]))
+    assert not worst(examine(life, tmp_path, capsys, 0)[0])
 
 
 def test_masks_that_a_frame_names(tmp_path, capsys):

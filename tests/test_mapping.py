@@ -59,6 +59,28 @@ def test_models_that_share_photographs_are_joined(truth, tmp_path):
     assert [other.num_reg_images() for other in others if not seen.intersection(other.reg_image_ids())] == [6]
 
 
+def torn(model, shift):
+    """All photographs of ``model``, the second half of them moved aside."""
+    moved = pycolmap.Reconstruction(model)
+    for number in sorted(moved.reg_frame_ids())[COUNT // 2 :]:
+        pose = moved.frame(number).rig_from_world
+        aside = pose.translation + pose.rotation * np.array(shift)
+        moved.frame(number).rig_from_world = pycolmap.Rigid3d(pose.rotation, aside)
+    return moved
+
+
+def test_matches_tell_a_model_that_is_torn(truth):
+    """Of all pairs that see each other, those on one side of the tear fit, the others do not."""
+    database, model = truth
+    fit, every = mapping.matches_that_fit(model, database)
+    assert every.sum() == sum(fitting(database).values()) and (fit == every).all()
+    fit, every = mapping.matches_that_fit(torn(model, (1.0, 2.0, 0.0)), database)
+    half = COUNT // 2
+    assert (
+        np.count_nonzero(fit == every) - 1 == half * (half - 1) and 10 * np.count_nonzero(2 * fit < every) > 9 * half**2
+    )
+
+
 def test_what_hardly_anything_holds_together_is_no_part_of_a_model(truth):
     """Points that the last 8 photographs share with others are left out, but for 5."""
     some = pycolmap.Reconstruction(truth[1])
@@ -135,6 +157,22 @@ def test_incremental_mapping_is_spared_where_it_could_add_little(truth, tmp_path
     assert models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-3
     assert "incremental" not in lines[0]
     assert len(copies) == 1 and copies[0].parent != tmp_path and not copies[0].exists()
+
+
+def test_of_as_many_photographs_the_model_that_fits_the_matches_is_taken(truth, tmp_path, monkeypatch):
+    """Global mapping registers all and tears the model, so incremental mapping is begun, which is right."""
+    database, model = truth
+    shutil.copy(database, tmp_path)
+
+    def found(model):
+        return lambda database, root, config, part, **_: part_of(model, part / "0", range(COUNT))
+
+    monkeypatch.setattr(mapping, "MANY", COUNT - 1)
+    monkeypatch.setattr(mapping, "_map_globally", found(torn(model, (1.0, 2.0, 0.0))))
+    monkeypatch.setattr(mapping, "_map_stepwise", found(model))
+    lines: list[str] = []
+    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
+    assert farthest(models[0], model) < 1e-6 and "cameras by incremental mapping" in lines[0]
 
 
 def test_a_mapper_that_was_complete_is_not_begun_again(truth, tmp_path, monkeypatch):

@@ -60,8 +60,8 @@ def start(photos, scene):
 
 
 def test_the_cameras_are_found(photos, scene):
-    views = load_scene(scene, report=pytest.fail).train
-    truth = photos[1]
+    loaded, truth = load_scene(scene, report=pytest.fail), photos[1]
+    views = loaded.train
     assert {view.name for view in views} == set(truth)
     found = np.array([view.camera.center for view in views])
     expected = np.array([truth[view.name] for view in views])
@@ -70,6 +70,9 @@ def test_the_cameras_are_found(photos, scene):
     assert errors.max() < 0.01  # the camera goes along 2 units
     for view in views:
         assert abs(view.camera.fx / room.FOCAL - 1) < 0.01 and abs(view.camera.fy / room.FOCAL - 1) < 0.01
+    seen = [(view.camera, loaded.tracks[view.name].points) for view in views]
+    depths = [points @ camera.rotation[2] + camera.translation[2] for camera, points in seen]
+    assert np.median(np.concatenate(depths)) == pytest.approx(5.0, rel=0.01)  # whatever the mapper's scale was
 
 
 def test_features_are_compared_without_blas(scene, monkeypatch):

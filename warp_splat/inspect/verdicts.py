@@ -13,7 +13,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.presets import PRESETS
-from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible
+from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible, too_near
 from warp_splat.scene.decoding import SHARE
 from warp_splat.scene.images import target_size
 from warp_splat.scene.photos import READABLE, find_files
@@ -137,6 +137,8 @@ def check_loading(subject: Subject) -> Iterator[Finding]:
         train, _, points, _ = read_photos(subject.source, subject.folder, notes.append)
         if len(points):
             require_visible(train, points, subject.source)
+            if near := too_near(train, points):
+                yield Finding("points", "warning", near)
         if subject.thumbnails:
             require_one_kind([(name, name in subject.linear) for name in subject.thumbnails], subject.source)
             require_unmasked(len(subject.photos), len(subject.black), subject.source)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_splat.color import from_srgb
-from warp_splat.config import LENSES
+from warp_splat.config import LENSES, NEAR
 from warp_splat.errors import InputError
 from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, ImageFinder, find_files, is_video, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, visible
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
 MASKS = "masks"  # the folder beside the images' or, for cameras in JSON, in the scene
+SAMPLE, CLOSE = 100, 20  # images that are asked what is near, and points that are no accident
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
 
 
@@ -97,6 +98,8 @@ def load_scene(
         points, colors, file = points[rows], colors[rows], file and file._replace(splats=file.splats.take(rows))
         report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")
     require_visible(train, points, start or source)
+    if near := too_near(train, points):
+        report(f"Warning: {near}")
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
     halves = (train, views[: len(train)]), (test, views[len(train) :])
     train_views, test_views = (_drop_masked(*half, invert_masks, source, report) for half in halves)
@@ -211,6 +214,21 @@ def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], lis
             "none to train on; add images or leave out --eval."
         )
     return train, photos[::HOLD_OUT]
+
+
+def too_near(photos: list[Photo], points: np.ndarray) -> str:
+    """What to tell the user if ``points`` [P, 3] come as near to the cameras as what is never drawn; else nothing."""
+    found = []
+    for camera in [photo.camera for photo in photos[:: -(-len(photos) // SAMPLE)]]:
+        depths = (points[visible(camera, points)] - camera.center) @ camera.rotation[2]
+        found += np.sort(depths)[CLOSE - 1 : CLOSE].tolist()
+    usual = np.median(found or [np.inf])
+    if usual >= 2 * NEAR:
+        return ""
+    return (
+        f"in half of the images {CLOSE} points or more are nearer than {usual:.2g}, and what is nearer than {NEAR} is "
+        f"never drawn: the scene is small; multiply the coordinates of its cameras and points by {1 / usual:.2g}."
+    )
 
 
 def require_visible(photos: list[Photo], points: np.ndarray, source: str | Path) -> None:

@@ -26,7 +26,7 @@ from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, VIDEOS, find_files, is_video, photo_root, scene_of, sfm_hint
 from warp_splat.sfm import mapping, stages
-from warp_splat.sfm.georeference import georeference
+from warp_splat.sfm.georeference import georeference, scale_as_usual
 from warp_splat.sfm.matching import match
 from warp_splat.text import few
 
@@ -192,13 +192,13 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
             f"{root}: {sizes.get(0, 0)} of {len(names)} photographs could be registered, expected at least {LEAST} "
             f"({pairs} pairs of them fit together); {ADVICE}."
         )
-    model, path = models[0], work / "models" / "0"
+    model, path = models[0], work / "placed"
     registered = {model.image(index).name for index in model.reg_image_ids()}
     where = georeference(model, database, config.coordinates, config.seed, say)
-    if where:
-        path = work / "placed"
-        path.mkdir(exist_ok=True)
-        model.write(path)
+    if not where:
+        scale_as_usual(model)
+    path.mkdir(exist_ok=True)
+    model.write(path)
     write_coordinates(scene, where)
     with _taking("images", taken):
         stages.write_scene(path, root, scene, work / "scene.part", sizes[0], config)

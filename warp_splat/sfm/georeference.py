@@ -20,6 +20,8 @@ UP = np.array((0.0, 0.0, 1.0))  # in the world
 LOOSE = 0.05  # of the positions' extent: what RANSAC takes for right
 OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
+USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
+SOME = 100  # photographs that tell it
 LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
 
 
@@ -77,6 +79,21 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     rest = f"; left out: {few(left_out)}" if left_out else ""
     say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")
     return _described(origin, reference, fitted.scale, dict(zip(names, residuals.tolist(), strict=True)), left_out)
+
+
+def scale_as_usual(model: pycolmap.Reconstruction) -> None:
+    """Scale ``model`` so that half of what its photographs show is farther away than USUAL.
+
+    Mappers scale it so that all cameras lie within a few units, whether they stood in a room or in a city. But what is
+    nearer than ``RasterOptions.near`` is never drawn.
+    """
+    numbers = sorted(model.reg_image_ids())
+    depths = []
+    for image in map(model.image, numbers[:: -(-len(numbers) // SOME)]):
+        seen = [model.point3D(point.point3D_id).xyz for point in image.get_observation_points2D()]
+        depths.append((image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2])
+    middle = float(np.median(np.concatenate(depths)))
+    model.transform(pycolmap.Sim3d(USUAL / middle, pycolmap.Rotation3d(), np.zeros(3)))
 
 
 def fit(

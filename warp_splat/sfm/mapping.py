@@ -25,6 +25,8 @@ from warp_splat.sfm.stages import opened, run_watched
 # Global mapping alone is enough if it registers this share of more photographs than that: incremental mapping takes
 # longer the more there are, and could add little.
 ENOUGH, MANY = 0.98, 100
+FITS = 4.0  # px, what a match may miss by, as when pairs were verified
+TORN = 1e-3  # share of sure pairs that need not fit. Of four sound models: 2e-4 at most, of one that is not: 4e-3
 LINK = 30  # points that two photographs of one model share at least, one by one
 SURE = 50  # features of a pair that are no chance: of 6,419 wrong pairs among 60 rooms alike, none had as many
 SHARED = 3  # photographs that two models need to have in common to become one
@@ -46,10 +48,10 @@ def reconstruct(
         found: dict[str, list[pycolmap.Reconstruction]] = {}
         for name, mapper in mappers.items():
             found[name] = _made(begun / name, partial(mapper, database, root, config))
-            if images > MANY and found[name] and found[name][0].num_reg_images() >= ENOUGH * images:
+            if images > MANY and found[name] and _is_enough(found[name][0], database, images):
                 break
-        best = max(found, key=lambda name: goodness(found[name][0]) if found[name] else (0, 0.0))
-        told = ", ".join(f"{name} {_told(each[0]) if each else 'none'}" for name, each in found.items())
+        best = max(found, key=lambda name: goodness(found[name][0], database) if found[name] else (0, 0))
+        told = ", ".join(f"{name} {_told(each[0], database) if each else 'none'}" for name, each in found.items())
         say(f"cameras by {best} mapping; photographs of {images}: {told}")
         every = found[best] + [model for name, each in found.items() if name != best for model in each]
         _made(models, partial(_finish, database, root, config, every, images))
@@ -57,15 +59,43 @@ def reconstruct(
     return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir()}
 
 
-def goodness(model: pycolmap.Reconstruction) -> tuple[int, float]:
-    """What makes one model better than another: photographs; at as many, points seen for each pixel of error."""
-    error = model.compute_mean_reprojection_error()
-    return model.num_reg_images(), model.compute_num_observations() / max(error, 1e-3)
+def goodness(model: pycolmap.Reconstruction, database: Path) -> tuple[int, int]:
+    """What makes one model better than another: photographs; at as many, matches that fit."""
+    return model.num_reg_images(), int(matches_that_fit(model, database)[0].sum())
 
 
-def _told(model: pycolmap.Reconstruction) -> str:
-    error = model.compute_mean_reprojection_error()
-    return f"{model.num_reg_images()} ({model.compute_num_observations()} points seen, {error:.2f} px)"
+def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Of each pair of registered images, how many matches fit the model's cameras, and how many there are.
+
+    A match fits if its two points lie within FITS of each other's epipolar lines (Sampson's error). A mapper leaves out
+    points that do not fit its cameras, so the reprojection error of a wrong model may be the smaller one.
+    """
+    with opened(database) as connection:
+        images = {number: model.image(number) for number in model.reg_image_ids()}
+        seen = {n: each.camera.cam_from_img(connection.read_keypoints(n)[:, :2]) for n, each in images.items()}
+        found = [(0, 0)]
+        for number, geometry in zip(*connection.read_two_view_geometries(), strict=True):
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            if a in images and b in images:
+                b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
+                ends, essential = geometry.inlier_matches.T, pycolmap.essential_matrix_from_pose(b_from_a)
+                errors = pycolmap.compute_squared_sampson_error(seen[a][ends[0]], seen[b][ends[1]], essential)
+                most = FITS / images[a].camera.mean_focal_length()
+                wrong = np.count_nonzero(np.sqrt(errors) > most)  # from one place all fit, and the errors are NaN
+                found.append((len(errors) - wrong, len(errors)))
+    return tuple(np.array(found).T)
+
+
+def _is_enough(model: pycolmap.Reconstruction, database: Path, images: int) -> bool:
+    """Whether incremental mapping could add little: photographs are there, and what surely fits does so here."""
+    fit, every = matches_that_fit(model, database)
+    torn = np.count_nonzero((2 * fit < every) & (every >= SURE))
+    return model.num_reg_images() >= ENOUGH * images and torn <= TORN * np.count_nonzero(every >= SURE)
+
+
+def _told(model: pycolmap.Reconstruction, database: Path) -> str:
+    (fit, every), error = np.sum(matches_that_fit(model, database), axis=1), model.compute_mean_reprojection_error()
+    return f"{model.num_reg_images()} ({100 * fit / max(every, 1):.1f} % of {every} matches fit, {error:.2f} px)"
 
 
 def _sizes(database: Path) -> tuple[int, int]:
@@ -82,7 +112,7 @@ def _made(folder: Path, make: Callable[[Path], object]) -> list[pycolmap.Reconst
         make(part)
         os.replace(part, folder)
     found = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir())]
-    return sorted(found, key=goodness, reverse=True)
+    return sorted(found, key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, seconds: float) -> None:
