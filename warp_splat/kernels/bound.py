@@ -333,7 +333,8 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                     radii_out[i] = wp.max(int(wp.min(radius, 1.0e9)), 1)
                     extents_out[i] = half
                     if rules.square != 0:
-                        half = square_of(half, conic, near)
+                        side = square_of(half[0], half[1], conic[0], conic[1], near)
+                        half = wp.vec2(side, side)
                 else:
                     half = wp.vec2(0.0)
                 inner = box_of(maps_out, mean, half - slack)

@@ -227,3 +227,16 @@ def reach_of(opacity: float, alpha_min: float):
     Without a cut, 1e-37 takes its place: about where float32 ends.
     """
     return wp.max(2.0 * log_of(opacity / wp.max(alpha_min, 1.0e-37)), 1.0e-6)
+
+
+def in_each_lane(reach_of: wp.Function) -> wp.Function:
+    """``reach_of`` in every lane."""
+
+    @wp.func
+    def reaches(opacity: vec16, alpha_min: float):
+        r = vec16()
+        for lane in range(LANES):
+            r[lane] = reach_of(opacity[lane], alpha_min)
+        return r
+
+    return reaches

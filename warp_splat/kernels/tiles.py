@@ -12,8 +12,8 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY
-from warp_splat.kernels.falloff import LOG2_E, reach_of
-from warp_splat.kernels.simd import fill, over, root, rounded_down, rounded_up, times, whole
+from warp_splat.kernels.falloff import LOG2_E, in_each_lane
+from warp_splat.kernels.simd import TYPES, fill, over, root, rounded_down, rounded_up, times, whole
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView, Splats2DView
 
@@ -36,63 +36,49 @@ def pixels(low: Any, high: Any, size: int, margin: float):
 
 
 @wp.func
-def square_of(extent: wp.vec2, conic: wp.vec3, reach: float):
-    """Half sides of the reference's square, 3 standard deviations of the long axis, rounded up."""
-    xx = extent[0] * extent[0] / reach
-    yy = extent[1] * extent[1] / reach
-    xy = -conic[1] * yy / conic[0]
-    side = wp.ceil(3.0 * wp.sqrt(0.5 * (xx + yy + wp.length(wp.vec2(xx - yy, 2.0 * xy)))))
-    return wp.vec2(side, side)
+def square_of(x_extent: Any, y_extent: Any, xx: Any, xy: Any, reach: Any):
+    """Half side of the reference's square, 3 standard deviations of the long axis, rounded up; of a conic."""
+    var_x = over(times(x_extent, x_extent), reach)
+    var_y = over(times(y_extent, y_extent), reach)
+    cov = over(times(-xy, var_y), xx)
+    across = root(times(var_x - var_y, var_x - var_y) + times(times(cov, 2.0), times(cov, 2.0)))
+    return rounded_up(times(root(times(var_x + var_y + across, 0.5)), 3.0))
 
 
 @functools.cache
-def make_packed(reach_of: wp.Function) -> wp.Function:
-    """A splat, as the blends read it; ``reach_of`` says where its falloff ends."""
+def make_shaped(reach_of: wp.Function, lanes: int) -> wp.Function:
+    """Half sides of the box, and the root, of a splat; ``reach_of`` says where its falloff ends."""
+    number = TYPES[lanes].number
+    reaches = in_each_lane(reach_of) if lanes > 1 else reach_of
 
     @wp.func
-    def packed(splats2d: Splats2DView, i: int, alpha_min: float, square: int):
-        splat = Splat2D()
-        splat.mean = splats2d.means2d[i]
-        splat.extent = splats2d.extents[i]
-        conic = splats2d.conics[i]
-        # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
-        scale = wp.sqrt(0.5 * LOG2_E * conic[0])
-        splat.opacity = splats2d.opacities[i]
-        reach = reach_of(splat.opacity, alpha_min)
-        splat.root = wp.vec3(scale, 0.5 * LOG2_E * conic[1] / scale, wp.sqrt(0.5 * LOG2_E * reach) / splat.extent[1])
-        if square != 0:
-            splat.extent = square_of(splat.extent, conic, reach)
-        splat.color = splats2d.colors[i]
-        splat.depth = splats2d.depths[i]
-        return splat
-
-    return packed
-
-
-@functools.cache
-def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
-    """Splats by :func:`make_packed`, and how many rows of tiles each has."""
-    packed = make_packed(reach_of)
-
-    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
-    def pack(
-        first: int,  # splat of this slice
-        gaussians: wp.array[int],  # [V] Gaussian of each splat
-        splats2d: Splats2DView,
-        height: int,
-        alpha_min: float,
-        square: int,  # 1: look at the square of the reference instead of the ellipse
-        # out
-        splats_out: wp.array[Splat2D],  # [V]
-        rows_out: wp.array[int],  # [V] rows of tiles that the box touches
+    def shaped(
+        x_extent: number, y_extent: number, xx: number, xy: number, opacity: number, alpha_min: float, square: int
     ):
-        v = first + wp.tid()
-        splat = packed(splats2d, gaussians[v], alpha_min, square)
-        splats_out[v] = splat
-        top, bottom = pixels(splat.mean[1] - splat.extent[1], splat.mean[1] + splat.extent[1], height, MARGIN)
-        rows_out[v] = wp.max(bottom // TILE - top // TILE + 1, 0)
+        # root' root = conic log2(e) / 2; its last entry, the root of yy - xy^2 / xx, by the box's height: no difference
+        scale = root(times(xx, 0.5 * LOG2_E))
+        reach = reaches(opacity, alpha_min)
+        turned = over(times(xy, 0.5 * LOG2_E), scale)
+        last = over(root(times(reach, 0.5 * LOG2_E)), y_extent)
+        if square != 0:
+            side = square_of(x_extent, y_extent, xx, xy, reach)
+            return side, side, scale, turned, last
+        return x_extent, y_extent, scale, turned, last
 
-    return pack
+    return shaped
+
+
+@wp.func
+def packed(splats2d: Splats2DView, i: int, extent: wp.vec2, root: wp.vec3):
+    """A splat, as the blends read it."""
+    splat = Splat2D()
+    splat.mean = splats2d.means2d[i]
+    splat.extent = extent
+    splat.root = root
+    splat.opacity = splats2d.opacities[i]
+    splat.color = splats2d.colors[i]
+    splat.depth = splats2d.depths[i]
+    return splat
 
 
 @wp.func

@@ -10,7 +10,6 @@ import warp as wp
 from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.kernels import tiles
 from warp_splat.kernels.cpu import lists
 from warp_splat.kernels.cpu.lists import DIGITS, count_digits, sort_digits
 from warp_splat.kernels.cuda.lists import make_count_tiles, make_gather_tiles, make_list_tiles
@@ -44,16 +43,16 @@ def bin_by_counting(
     count = len(drawn)
     splats, rows = empty(count, Splat2D, "cpu"), np.empty(count, dtype=np.int32)
     gaussians, square = in_place(drawn), int(options.extent == "square")
-    inputs = [gaussians, splats2d.view(), camera.height, options.alpha_min, square]
-    launch(tiles.make_pack(falloff_of(options).reach_of), count, inputs, [splats, in_place(rows)])
+    inputs, groups = [gaussians, splats2d.view(), camera.height, options.alpha_min, square], -(-count // LANES)
+    in_groups = even_slices(groups, each=LANES)
+    launch(lists.make_pack(falloff_of(options).reach_of), groups, inputs, [splats, in_place(rows)], bounds=in_groups)
     order = order_by_depth(_taken(splats2d.depths.detach().numpy(), drawn))
     row_ends, begins, row_count = _sums(_taken(rows, order))
     check_count(row_count, camera, count, splats2d.radii.device)
     begins = _put(begins, order)
     spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, square]
-    groups = -(-count // LANES)
-    launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=even_slices(groups, each=LANES))
+    launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=in_groups)
     pictures = max(len(worlds), 1)
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]

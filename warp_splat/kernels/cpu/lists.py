@@ -9,6 +9,7 @@ memory are asked for some rounds before. Tried:
 - 47 instead of 22 ms for 700,000 splats: spans written without asking before; 32, one splat after another
 - 39 instead of 9 ms: spans in the order of the splats, read by depth
 - no faster: a shorter way for splats in a single column of tiles
+- 4.5 instead of 1.1 ms for 70,000 splats: the box and root of one after the other
 
 The adjoint writes a row of gradients for each instance, in the order of the lists. Places tell each splat where its
 rows are. Tried:
@@ -17,19 +18,69 @@ rows are. Tried:
 - no faster: a row to a line of the cache
 """
 
+import functools
+
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
 from warp_splat.kernels.cpu.ahead import ask
+from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.simd import LANES, vec16, vec16i
 from warp_splat.kernels.splat import Splat2D
-from warp_splat.kernels.tiles import MARGIN, cut, outline, pixels
+from warp_splat.kernels.structs import Splats2DView
+from warp_splat.kernels.tiles import MARGIN, cut, make_shaped, outline, packed, pixels
 
 wp.set_module_options(FORWARD_ONLY)
 
 DIGITS = 2**11  # of the radix sort
 AHEAD = wp.constant(32)  # rounds for which memory is asked before
+
+
+@functools.cache
+def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
+    """Splats as the blends read them, and how many rows of tiles each has; ``reach_of``: where their falloff ends."""
+    shaped = make_shaped(reach_of, LANES)
+
+    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    def pack(
+        first: int,  # group of splats of this slice
+        gaussians: wp.array[int],  # [V] Gaussian of each splat
+        splats2d: Splats2DView,
+        height: int,
+        alpha_min: float,
+        square: int,  # 1: look at the square of the reference instead of the ellipse
+        # out
+        splats_out: wp.array[Splat2D],  # [V]
+        rows_out: wp.array[int],  # [V] rows of tiles that the box touches
+    ):
+        group = (first + wp.tid()) * LANES
+        last = gaussians.shape[0] - 1
+        y = vec16()
+        x_extent = vec16()
+        y_extent = vec16()
+        conic0 = vec16()
+        conic1 = vec16()
+        opacity = vec16()
+        for lane in range(LANES):
+            i = gaussians[wp.min(group + lane, last)]
+            y[lane] = splats2d.means2d[i][1]
+            x_extent[lane] = splats2d.extents[i][0]
+            y_extent[lane] = splats2d.extents[i][1]
+            conic0[lane] = splats2d.conics[i][0]
+            conic1[lane] = splats2d.conics[i][1]
+            opacity[lane] = splats2d.opacities[i]
+        x_extent, y_extent, root0, root1, root2 = shaped(x_extent, y_extent, conic0, conic1, opacity, alpha_min, square)
+        tops, bottoms = pixels(y - y_extent, y + y_extent, height, MARGIN)
+        for lane in range(LANES):
+            v = group + lane
+            if v <= last:
+                extent = wp.vec2(x_extent[lane], y_extent[lane])
+                root = wp.vec3(root0[lane], root1[lane], root2[lane])
+                splats_out[v] = packed(splats2d, gaussians[v], extent, root)
+                rows_out[v] = wp.max(bottoms[lane] // TILE - tops[lane] // TILE + 1, 0)
+
+    return pack
 
 
 @wp.kernel(module="unique", module_options=dict(IN_LANES))

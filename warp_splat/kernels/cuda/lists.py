@@ -16,7 +16,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import Splats2DView
-from warp_splat.kernels.tiles import MARGIN, SPELLED_OUT, cut, make_packed, outline, pixels
+from warp_splat.kernels.tiles import MARGIN, SPELLED_OUT, cut, make_shaped, outline, packed, pixels
 
 
 @wp.func
@@ -40,7 +40,7 @@ def tiles_of_row(splat: Splat2D, row: int, width: int, square: int):
 @functools.cache
 def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
     """Splats by rank, and the tiles of each; ``reach_of`` says where their falloff ends."""
-    packed = make_packed(reach_of)
+    shaped = make_shaped(reach_of, 1)
 
     @wp.kernel(module="unique", module_options=dict(SPELLED_OUT))
     def count_tiles(
@@ -58,7 +58,12 @@ def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
     ):
         rank = first + wp.tid()
         i = int(order[rank])
-        splat = packed(splats2d, i, alpha_min, square)
+        extent = splats2d.extents[i]
+        conic = splats2d.conics[i]
+        x_extent, y_extent, root0, root1, root2 = shaped(
+            extent[0], extent[1], conic[0], conic[1], splats2d.opacities[i], alpha_min, square
+        )
+        splat = packed(splats2d, i, wp.vec2(x_extent, y_extent), wp.vec3(root0, root1, root2))
         found = int(0)
         if splats2d.radii[i] > 0:
             top, below = tile_rows_of(splat, height)

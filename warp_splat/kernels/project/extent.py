@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from warp_splat.kernels.simd import LANES, TYPES, fill, fma, less, root, rounded_down, rounded_up, times, vec16
+from warp_splat.kernels.falloff import in_each_lane
+from warp_splat.kernels.simd import TYPES, fill, fma, less, root, rounded_down, rounded_up, times, vec16
 
 for number in (float, vec16):
 
@@ -21,16 +22,7 @@ for number in (float, vec16):
 def make_support(reach_of: wp.Function, lanes: int) -> wp.Function:
     """The box and the circle around what is at least ``alpha_min``; ``reach_of`` says where the falloff ends."""
     number = TYPES[lanes][0]
-
-    @wp.func
-    def reaches(opacity: vec16, alpha_min: float):
-        """``reach_of`` in every lane."""
-        r = vec16()
-        for lane in range(LANES):
-            r[lane] = reach_of(opacity[lane], alpha_min)
-        return r
-
-    reaches = reaches if lanes > 1 else reach_of
+    reaches = in_each_lane(reach_of) if lanes > 1 else reach_of
 
     @wp.func
     def support(opacity: number, alpha_min: float, xx: number, xy: number, yy: number):
