@@ -23,7 +23,7 @@ MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
 SLICES_PER_THREAD = 8  # of the blends: tiles differ in cost by more than their number of instances says
-SMALLEST_BAND = 2**14  # splats of a thread that are ordered by depth; below, launches cost more than they save
+IN_BANDS = 2**19  # splats from which on all threads order them by depth; below, one alone is faster than two
 BITS = DIGITS.bit_length() - 1  # of such a sort, at once
 
 
@@ -192,7 +192,9 @@ def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Where each of the counted ends, in 64 bits, because 32 wrap without a word, and begins, in 32; and their sum."""
     bounds = torch_slices(len(counts))
     ends, begins = np.empty(len(counts), dtype=np.int64), np.empty(len(counts), dtype=np.int32)
-    in_slices(lambda low, high: np.cumsum(counts[low:high], out=ends[low:high]), bounds)
+    add_up = partial(torch.cumsum, dim=0, dtype=torch.int64)  # a quarter of numpy's time
+    given, found = torch.from_numpy(counts), torch.from_numpy(ends)
+    in_slices(lambda low, high: add_up(given[low:high], out=found[low:high]), bounds)
     before = dict(zip(bounds[1:-1], np.cumsum([ends[bound - 1] for bound in bounds[1:-1]]), strict=True))
 
     def run(low: int, high: int) -> None:
@@ -259,9 +261,10 @@ def order_by_depth(depths: np.ndarray) -> np.ndarray:
     the same for any number of bands. Tried:
 
     - no faster: only the bits in which the depths differ, 25 of 32, or digits of 9 or 13 bits
-    - 2 x the time for 24,000: bands where there is one thread alone, instead of Warp's sort
+    - 2.7 instead of 0.8 ms for 70,000, 4.9 instead of 3.6 for 300,000: two bands, instead of Warp's sort on one thread
     """
-    count, bounds = len(depths), even_slices(len(depths), SMALLEST_BAND)
+    count = len(depths)
+    bounds = even_slices(count) if count >= IN_BANDS else [0, count]
     order = np.arange(count, dtype=np.int32)
     if len(bounds) == 2:
         keys, values = np.empty(2 * count, dtype=np.float32), np.empty(2 * count, dtype=np.int32)  # it needs twice
