@@ -4,6 +4,7 @@ Memory limits it: for a number that is learned, four are read and three written.
 (``halves.py``); a step of the second moment is a thousandth of it, which rounding to the nearest would lose. Tried:
 
 - 3 x the time: a loop over the numbers of a row, which LLVM does not vectorize
+- 2 x the time: a group of rows of all tables, then the next; a core follows few streams of memory at a time
 """
 
 import functools
@@ -55,7 +56,8 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adam(
-        first: int,  # group of rows of this slice
+        first: int,  # group of rows of this slice, counted through all tables, one after the other
+        groups: int,  # of a table
         start: int,  # row of the first group
         widths: wp.array[int],  # [T] numbers in a row
         keys: wp.array[int],  # [T] for rounding at random
@@ -64,32 +66,32 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
         # out
         tables_out: wp.array2d[wp.uint64],  # [T, 4] addresses of values, gradients, and moments; the gradients stay
     ):
-        group = first + wp.tid()
-        for table in range(tables_out.shape[0]):
-            width = widths[table]
-            begin = wp.uint64(4 * lanes) * wp.uint64(group) * wp.uint64(width)
-            begin_moments = wp.uint64(wp.static(2 if halves else 4) * lanes) * wp.uint64(group) * wp.uint64(width)
-            values = wp.array(ptr=tables_out[table, 0] + begin, shape=(width,), dtype=number)
-            grads = wp.array(ptr=tables_out[table, 1] + begin, shape=(width,), dtype=number)
-            firsts = wp.array(ptr=tables_out[table, 2] + begin_moments, shape=(width,), dtype=moment)
-            seconds = wp.array(ptr=tables_out[table, 3] + begin_moments, shape=(width,), dtype=moment)
-            for i in range(width):
-                grad = grads[i]
-                before = widened(firsts[i])
-                before2 = widened(seconds[i])
-                value, m, v = adam_step_of(values[i], grad, before, before2, numbers, table)
-                if wp.static(sparse):
-                    mask = drawn(radii, lanes * group, lanes * i, width)
-                    m = pick(mask, m, before)
-                    v = pick(mask, v, before2)
-                    value = pick(mask, value, values[i])
-                values[i] = value
-                if wp.static(halves):
-                    bits = noise((start + lanes * group) * width + lanes * i, keys[table], grad)
-                    firsts[i] = rounded(m, bits, 0)
-                    seconds[i] = rounded(v, bits, 16)
-                else:
-                    firsts[i] = m
-                    seconds[i] = v
+        table = (first + wp.tid()) // groups
+        group = (first + wp.tid()) % groups
+        width = widths[table]
+        begin = wp.uint64(4 * lanes) * wp.uint64(group) * wp.uint64(width)
+        begin_moments = wp.uint64(wp.static(2 if halves else 4) * lanes) * wp.uint64(group) * wp.uint64(width)
+        values = wp.array(ptr=tables_out[table, 0] + begin, shape=(width,), dtype=number)
+        grads = wp.array(ptr=tables_out[table, 1] + begin, shape=(width,), dtype=number)
+        firsts = wp.array(ptr=tables_out[table, 2] + begin_moments, shape=(width,), dtype=moment)
+        seconds = wp.array(ptr=tables_out[table, 3] + begin_moments, shape=(width,), dtype=moment)
+        for i in range(width):
+            grad = grads[i]
+            before = widened(firsts[i])
+            before2 = widened(seconds[i])
+            value, m, v = adam_step_of(values[i], grad, before, before2, numbers, table)
+            if wp.static(sparse):
+                mask = drawn(radii, lanes * group, lanes * i, width)
+                m = pick(mask, m, before)
+                v = pick(mask, v, before2)
+                value = pick(mask, value, values[i])
+            values[i] = value
+            if wp.static(halves):
+                bits = noise((start + lanes * group) * width + lanes * i, keys[table], grad)
+                firsts[i] = rounded(m, bits, 0)
+                seconds[i] = rounded(v, bits, 16)
+            else:
+                firsts[i] = m
+                seconds[i] = v
 
     return adam

@@ -1,16 +1,17 @@
 """A step of Adam on many tables: the launches of :mod:`warp_splat.kernels.adam`, on a CPU or a GPU."""
 
-from functools import partial
 from itertools import chain
 
+import numpy as np
 import torch
 import warp as wp
 
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.cuda import adam_by_number as numbered
-from warp_splat.kernels.simd import LANES, Types
+from warp_splat.kernels.simd import LANES
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch, launch_in_lanes, load, view
+from warp_splat.runtime.launch import launch, load, view
+from warp_splat.runtime.pool import even_slices
 
 HALF = torch.bfloat16
 KEY = 0x9E3779B1  # odd: what differs stays different times it
@@ -27,33 +28,30 @@ def load_adam(device: torch.device, sparse: bool, halves: bool) -> None:
 def move(
     tables: list[list[torch.Tensor]], numbers: list, count: int, radii: torch.Tensor | None, iteration: int
 ) -> None:
-    """Change tables of ``count`` rows in place.
-
-    A core follows few streams of memory at a time: all tables together take twice as long. A GPU takes them together.
-    """
+    """Change tables of ``count`` rows in place."""
     keys = [KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))]
-    together, lanes = list(zip(tables, numbers, keys, strict=True)), driver_of(tables[0][0].device).lanes
-    launch_some, at_once = (_launch, 1) if lanes > 1 else (_launch_numbers, numbered.AT_ONCE)
-    for begin in range(0, len(together), at_once):
-        launch_some(*map(list, zip(*together[begin : begin + at_once], strict=True)), count, radii)
+    if driver_of(tables[0][0].device).lanes > 1:
+        _launch(tables, numbers, keys, count, radii)
+        return
+    together = list(zip(tables, numbers, keys, strict=True))
+    for begin in range(0, len(together), numbered.AT_ONCE):
+        _launch_numbers(*map(list, zip(*together[begin : begin + numbered.AT_ONCE], strict=True)), count, radii)
 
 
-def _launch(tables: list, numbers: list, keyed: list[int], count: int, radii: torch.Tensor | None) -> None:
-    """On a CPU; ``keyed``: keys for rounding at random."""
-    sizes = [table[0].numel() // count for table in tables]
-    widths, keys = (torch.tensor(values, dtype=torch.int32, device="cpu") for values in (sizes, keyed))
-    of_tables = torch.tensor(numbers, dtype=torch.float32, device="cpu")
-
-    def addresses(_types: Types, rows: slice):
-        return view(torch.tensor(_addresses(tables, sizes, rows.start), dtype=torch.int64, device="cpu"), wp.uint64)
-
-    def shown(_types: Types, rows: slice):
-        return view(widths if radii is None else radii[rows], wp.int32)
-
-    inputs = [lambda _types, rows: rows.start, *(view(table, wp.int32) for table in (widths, keys))]
-    inputs += [view(of_tables, wp.float32), shown]
-    make = partial(make_adam, sparse=radii is not None, halves=tables[0][-1].dtype == HALF)
-    launch_in_lanes(make, LANES, count, inputs, [addresses])
+def _launch(tables: list, numbers: list, keys: list[int], count: int, radii: torch.Tensor | None) -> None:
+    """On a CPU, sixteen rows at a time, then those left over; ``keys``: for rounding at random."""
+    widths, halves = [table[0].numel() // count for table in tables], tables[0][-1].dtype == HALF
+    arrays = [view(torch.tensor(values, dtype=torch.int32, device="cpu"), wp.int32) for values in (widths, keys)]
+    arrays.append(view(torch.tensor(numbers, dtype=torch.float32, device="cpu"), wp.float32))
+    for lanes, start, stop in ((LANES, 0, count - count % LANES), (1, count - count % LANES, count)):
+        groups = (stop - start) // lanes
+        # slices of as many numbers, which the tables share out among them by their widths
+        shares = np.array(even_slices(groups, each=lanes)) / max(groups, 1) * sum(widths)
+        bounds = np.interp(shares, np.cumsum([0, *widths]), range(len(tables) + 1)) * groups
+        addresses = torch.tensor(_addresses(tables, widths, start), dtype=torch.int64, device="cpu")
+        inputs = [groups, start, *arrays, arrays[0] if radii is None else view(radii[start:stop], wp.int32)]
+        outputs, kernel = [view(addresses, wp.uint64)], make_adam(lanes, radii is not None, halves)
+        launch(kernel, len(tables) * groups, inputs, outputs, bounds=[round(bound) for bound in bounds])
 
 
 def _addresses(tables: list, widths: list[int], row: int) -> list[list[int]]:
