@@ -15,7 +15,7 @@ from warp_splat.camera import Camera
 from warp_splat.kernels.slots import CHANNEL
 from warp_splat.raster.blend import Blending
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.data import LESS, Bins, Gaussians, Splats2D, alphas_of, variant_of
+from warp_splat.raster.data import LESS, Bins, Gaussians, Splats2D, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
 from warp_splat.runtime.launch import check_memory, view
@@ -104,12 +104,7 @@ def _launch(blending: Blending, pixels: torch.Tensor, group: Group, strongest: t
     ranks, median = strongest or (none, none.flatten(1))
     at_most = ranks.shape[2] if strongest else None
     kernel = blending.driver.kernels.channels.make_beside(variant_of(blending.options), at_most)
-    inputs = [
-        blending.bins.view(blocks=blending.blocks),
-        alphas_of(blending.options),
-        count,
-        view(blending.steps, wp.int32),
-    ]
+    inputs = [*blending.view_lists(), count, view(blending.steps, wp.int32)]
     inputs += [view(group.rows, wp.float32), group.begin, group.count]
     outputs = [view(pixels, wp.float32), view(ranks, wp.int32), view(median, wp.int32)]
     blending.driver.launch_tiles(kernel, blending.bins, inputs, outputs)
@@ -239,12 +234,7 @@ def _differentiate(
     slots = adj_pixels.new_empty(count, columns)  # a row per tile instance
     kernel = driver.kernels.channels.make_adj_channels(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
-    inputs = [
-        bins.view(blocks=blending.blocks),
-        alphas_of(options),
-        *blending.view_walk(),
-        view(blending.steps, wp.int32),
-    ]
+    inputs = [*blending.view_lists(), *blending.view_walk(), view(blending.steps, wp.int32)]
     inputs += [view(group.rows, wp.float32), view(ranks, wp.float32), group.begin, group.count]
     driver.launch_tiles(kernel, bins, [*inputs, view(adj_pixels, wp.float32)], [view(slots, wp.float32)])
     tables = [slots.new_empty(bins.gaussian_count, size) for size in (2, 3, 1, width) if size]

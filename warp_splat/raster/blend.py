@@ -8,7 +8,7 @@ from torch.autograd.function import once_differentiable
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.raster.data import Bins, Dropped, Pixels, Saved, Splats2D, plus
+from warp_splat.raster.data import Bins, Dropped, Pixels, Saved, Splats2D, alphas_of, plus
 from warp_splat.raster.drivers import Driver
 from warp_splat.runtime.timers import stage
 
@@ -23,19 +23,20 @@ class Blending:
     driver: Driver
     adjoint: str = "manual"
     dropped: Dropped = field(default_factory=Dropped)  # counts what the adjoint refuses to spread
-    # where the color stopped in each pixel, in the layout of the device, once it is blended
-    final: torch.Tensor = field(init=False)  # transmittance behind the last Gaussian
-    count: torch.Tensor = field(init=False)  # instances walked before the pixel stopped
-    blocks: torch.Tensor = field(init=False)  # blocks in which an instance is blended
+    saved: Saved = field(init=False)  # once the color is blended, without the transmittances that its adjoint keeps
 
     @property
     def steps(self) -> torch.Tensor:
         """Instances of each tile that a pixel blends, [T] int32."""
-        return self.count.flatten(1).amax(1).int()
+        return self.saved.count.flatten(1).amax(1).int()
 
     def view_walk(self) -> list:
         """Final transmittances and counts, as kernels take them."""
-        return self.driver.view_walk(self.final, self.count)
+        return self.driver.view_walk(self.saved.final, self.saved.count)
+
+    def view_lists(self) -> list:
+        """What each tile lists and how opacities are cut, likewise."""
+        return [self.bins.view(blocks=self.saved.blocks), alphas_of(self.options)]
 
 
 def blend(splats: Splats2D, background: torch.Tensor, blending: Blending) -> Pixels:
@@ -61,7 +62,7 @@ class Blend(torch.autograd.Function):
         ctx.blending = replace(blending)  # without what it finds, which goes with the graph
         keep, background = adjoint == "stored" and differentiated, background.contiguous()
         pixels, saved = blending.driver.blend(blending.bins, blending.camera, background, options, keep)
-        blending.final, blending.count, blending.blocks, _ = saved
+        blending.saved = saved._replace(kept=background.new_empty(0))
         ctx.save_for_backward(background, *saved)
         return tuple(pixels)
 

@@ -102,8 +102,7 @@ class Worlds:
 
     def _draw(self) -> dict[str, torch.Tensor]:
         blending, black = Blending(self.bins, self.camera, self.options, self.driver), self.splats.depths.new_zeros(3)
-        (image, alpha, depth), saved = self.driver.blend(self.bins, self.camera, black, self.options, False)
-        blending.final, blending.count, blending.blocks, _ = saved
+        (image, alpha, depth), blending.saved = self.driver.blend(self.bins, self.camera, black, self.options, False)
         found = {"image": image, "alpha": alpha}
         if self.options.depth:
             found["depth"] = depth / alpha.clamp_min(1e-10)
