@@ -18,9 +18,9 @@ from typing import Any
 from tqdm import tqdm
 
 from warp_splat.config import CORES, SfmConfig
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, refusing
 from warp_splat.formats.coordinates import write_coordinates
-from warp_splat.formats.files import write_json
+from warp_splat.formats.files import write_json, write_text
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
@@ -90,19 +90,16 @@ def scene_for(photos: str, processes: int, **options: Any) -> str:
 @contextmanager
 def _explained(work: Path) -> Iterator[None]:
     """Turn what pycolmap raises, of a full disk or a damaged database, into a sentence; what was not begun goes."""
-    try:
-        yield
-    except InputError:
-        if not (work / "database.db").exists() and not (work / "frames").exists():
-            shutil.rmtree(work, ignore_errors=True)
-            with suppress(OSError):  # there is something else in it
-                work.parent.rmdir()
-        raise
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"{work}: pycolmap cannot go on there ({reason_of(error)}); free some space if the disk is full and run "
-            "again, or remove this folder to start anew."
-        ) from error
+    advice = "; free some space if the disk is full and run again, or remove this folder to start anew."
+    with refusing((RuntimeError, ValueError), f"{work}: pycolmap cannot go on there", advice):
+        try:
+            yield
+        except InputError:
+            if not (work / "database.db").exists() and not (work / "frames").exists():
+                shutil.rmtree(work, ignore_errors=True)
+                with suppress(OSError):  # there is something else in it
+                    work.parent.rmdir()
+            raise
 
 
 def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
@@ -123,12 +120,10 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
             raise _nothing_found(source)
     else:
         files = [(source.name, source)]
-    record = {"options": options, "files": {name: path.stat().st_size for name, path in files}}
+    sizes = {name: path.stat().st_size for name, path in files}
+    record = json.dumps({"options": options, "files": sizes}, indent=1)
     if (work / "input.json").is_file():
-        before = None
-        with suppress(ValueError):
-            before = json.loads((work / "input.json").read_text(encoding="utf-8"))
-        if before != record:
+        if (work / "input.json").read_bytes() != record.encode():
             raise InputError(
                 f"{scene}: expected a folder begun with the same photographs and options, but this one was begun with "
                 "others; choose another folder, or remove this one."
@@ -136,7 +131,7 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     elif scene.exists() and (not scene.is_dir() or any(scene.iterdir())):
         raise InputError(f"{scene}: expected a new or empty folder, found one that is in use; choose another.")
     else:
-        write_json(work / "input.json", record)
+        write_text(work / "input.json", record)
     return work
 
 

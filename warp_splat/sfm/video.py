@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.ndimage import laplace
 
 from warp_splat.config import SfmConfig
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, refusing
 from warp_splat.formats.files import atomic_write
 from warp_splat.text import Report
 
@@ -39,7 +39,8 @@ def sample_frames(path: Path, folder: Path, config: SfmConfig, report: Report, a
         InputError: if the file is not a video that PyAV (FFmpeg) can decode.
     """
     written, damaged, count = 0, [], config.frames
-    try:
+    problem = f"{path}: expected a video that FFmpeg can read, but it cannot"
+    with refusing(FFmpegError, problem, "; convert it to MP4 (H.264) or give another file."):
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: expected a video, found no video stream in it; give another file.")
@@ -58,11 +59,6 @@ def sample_frames(path: Path, folder: Path, config: SfmConfig, report: Report, a
                     Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, quality=QUALITY)
                 written += 1
                 advance(100 * (span + 1) // count)
-    except FFmpegError as error:
-        raise InputError(
-            f"{path}: expected a video that FFmpeg can read, but it cannot ({error.strerror}); convert it to MP4 "
-            "(H.264) or give another file."
-        ) from error
     if damaged:
         report(f"warning: {len(damaged)} of {total} packets of the video are damaged and were left out.")
     return written
