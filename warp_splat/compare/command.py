@@ -67,8 +67,7 @@ def _compare_modes(workloads: list[Workload], modes: list[str], out: Path, say: 
     plot_errors(out / "adjoints.png", measured)
     for workload in workloads:
         if "," in workload.name:
-            *geometry, sh_dc, sh_rest = workload.gaussians
-            scene = (*geometry, (sh_dc, sh_rest), workload.camera, workload.background)
+            scene = (*workload.gaussians[:4], workload.gaussians[4:], workload.camera, workload.background)
             check = check_gradients(*scene, options=workload.options, directions=DIRECTIONS)
             say(f"{workload.name}: along random directions, against finite differences\n\n{check}\n")
             checks[workload.name] = [asdict(row) for row in check.rows]

@@ -49,9 +49,8 @@ def draw_exactly(
     gaussians: Gaussians, camera: Any, background: torch.Tensor, options: RasterOptions, pixels=None
 ) -> oracle.Render:
     """The oracle's render, of float64."""
-    *geometry, sh_dc, sh_rest = gaussians
-    sh = torch.cat([sh_dc, sh_rest], 1)
-    return oracle.exact_render(*geometry, sh, camera, background, **for_oracle(options), pixels=pixels)
+    given = (*gaussians[:4], gaussians.sh, camera, background)
+    return oracle.exact_render(*given, **for_oracle(options), pixels=pixels)
 
 
 def random_upstream(shape: torch.Size, fragile: torch.Tensor) -> torch.Tensor:
@@ -110,8 +109,7 @@ def differentiate_on_tape(
     workload: Workload, upstream: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The image [H, W, 3], and the gradients by parameter for the upstream gradient [H, W, 3], or for ones."""
-    *geometry, sh_dc, sh_rest = workload.gaussians
-    values = (*geometry, torch.cat([sh_dc, sh_rest], 1), workload.background)
+    values = (*workload.gaussians[:4], workload.gaussians.sh, workload.background)
     given = dict(zip(PARAMETERS, values, strict=False))
     arrays = {name: wp.from_torch(tensor.clone(), requires_grad=True) for name, tensor in given.items()}
     with wp.Tape() as recorded:

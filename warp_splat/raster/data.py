@@ -36,6 +36,11 @@ class Gaussians(NamedTuple):
     sh_dc: torch.Tensor  # [N, 1, 3]
     sh_rest: torch.Tensor  # [N, K - 1, 3]
 
+    @property
+    def sh(self) -> torch.Tensor:
+        """All coefficients, [N, K, 3]; a copy."""
+        return torch.cat([self.sh_dc, self.sh_rest], 1)
+
 
 class Splats2D(NamedTuple):
     """Gaussians projected; all 0 where culled."""

@@ -70,8 +70,7 @@ class Trial:
     @property
     def gap(self) -> float:
         """How far gradient and differences are apart; never NaN."""
-        gap = abs(self.analytic - self.quotient.value)
-        return gap if gap < math.inf else math.inf
+        return min(math.inf, abs(self.analytic - self.quotient.value))  # in this order, by which NaN is not less
 
 
 def inputs_of(camera: Camera | CameraParameters) -> tuple[str, ...]:
@@ -92,8 +91,7 @@ class MovableScene:
         seed: int,
     ):
         self.options, self.adjoint = options, adjoint
-        sh = torch.cat([gaussians.sh_dc, gaussians.sh_rest], 1)
-        values = {name: getattr(gaussians, name) for name in SHAPES} | {"sh": sh, "background": background}
+        values = {name: getattr(gaussians, name) for name in (*SHAPES, "sh")} | {"background": background}
         self.camera = camera.base if isinstance(camera, CameraParameters) else camera
         values |= parts_of(camera)
         self.inputs = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
