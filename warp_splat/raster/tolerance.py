@@ -56,7 +56,8 @@ def paint_within(
     for left in range(MOST_ROUNDS, 0, -1):
         assert done.certificate
         cuts = done.certificate.bound - done.certificate.rounding
-        worst = _worst_of_tiles(cuts / allowed.to(cuts.device))
+        shares = cuts / allowed.to(cuts.device)
+        worst = torch.nn.functional.max_pool2d(shares[None], TILE, ceil_mode=True).flatten()  # of each tile
         tiles = worst > 1.0
         stop = _cuts(options, cut)["t_min"] / (1.0 - options.alpha_max) * done.certificate.fields["brightest"]
         hopeless = options.of == "trained" and stop < least  # for its cut cannot be smaller
@@ -71,14 +72,6 @@ def paint_within(
 def _cuts(options: RasterOptions, cut: float) -> dict[str, float]:
     """Where opacities are cut and where pixels stop."""
     return {"alpha_min": SURE if options.of == "trained" else min(cut, 0.5), "t_min": min(STOP / FIRST * cut, 0.5)}
-
-
-def _worst_of_tiles(pixels: torch.Tensor) -> torch.Tensor:
-    """The largest of each tile, [T], of pixels [H, W]."""
-    height, width = pixels.shape
-    tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-    whole = torch.nn.functional.pad(pixels, (0, TILE * tiles_x - width, 0, TILE * tiles_y - height))
-    return whole.view(tiles_y, TILE, tiles_x, TILE).amax((1, 3)).flatten()
 
 
 def _merged(done: Painted, found: Painted, mask: torch.Tensor) -> Painted:

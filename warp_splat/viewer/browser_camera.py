@@ -73,8 +73,7 @@ def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
 
 def is_at(camera: Camera, other: Camera, distance: float) -> bool:
     """Whether ``camera`` stands where ``other`` does, as far as one sees; ``distance`` is that to the subject."""
-    cosine = 0.5 * (np.trace(camera.rotation @ other.rotation.T) - 1.0)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    angle = Rotation.from_matrix(camera.rotation @ other.rotation.T).magnitude()
     return bool(angle < SAME_ANGLE and np.linalg.norm(camera.center - other.center) < SAME_PLACE * max(distance, 1e-12))
 
 
