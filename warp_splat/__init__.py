@@ -46,6 +46,4 @@ if TYPE_CHECKING:
 def __getattr__(name: str):
     if name not in _HOMES:
         raise AttributeError(f"module 'warp_splat' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"warp_splat.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
+    return getattr(importlib.import_module(f"warp_splat.{_HOMES[name]}"), name)

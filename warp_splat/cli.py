@@ -226,7 +226,3 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     finally:
         atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # in what ends libraries, it would be a traceback
-
-
-if __name__ == "__main__":
-    sys.exit(main())
