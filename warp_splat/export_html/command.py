@@ -70,12 +70,10 @@ def _start(splats: SplatArrays) -> Camera:
     means = splats.means.astype(np.float64) if len(splats.means) else np.zeros((1, 3))
     middle = np.median(means, axis=0)
     radius = np.percentile(np.linalg.norm(means - middle, axis=1), 80) or 1.0
-    width, height = START_SIZE
-    focal = 0.5 * height / np.tan(0.5 * START_FOV)
+    center = 0.5 * np.array(START_SIZE)
+    focal = center[1] / np.tan(0.5 * START_FOV)
     distance = radius / np.sin(0.5 * START_FOV)
-    return Camera(
-        width, height, focal, focal, 0.5 * width, 0.5 * height, np.eye(3), np.array([0, 0, distance]) - middle
-    )
+    return Camera(*START_SIZE, focal, focal, *center, np.eye(3), np.array([0, 0, distance]) - middle)
 
 
 def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]], options: dict[str, object]) -> str:

@@ -105,11 +105,8 @@ def _matched(splats: SplatArrays, starts: np.ndarray) -> SplatArrays:
     covariances = axes @ axes.transpose(0, 2, 1) + offsets[:, :, None] * offsets[:, None]
     variances, axes = np.linalg.eigh(average(covariances.reshape(-1, 9)).reshape(-1, 3, 3))
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
-    matched = SplatArrays(
-        means.astype(np.float32),
-        average(splats.sh[:, 0].astype(np.float64))[:, None].astype(np.float32),
-        np.full(len(starts), 100.0, np.float32),
-        (0.5 * np.log(np.maximum(variances, FLATTEST))).astype(np.float32),
-        Rotation.from_matrix(axes).as_quat(scalar_first=True).astype(np.float32),
-    )
-    return matched._replace(opacities=logit(np.minimum(sums / sections(matched.scales), 1.0)))
+    scales = (0.5 * np.log(np.maximum(variances, FLATTEST))).astype(np.float32)
+    opacities = logit(np.minimum(sums / sections(scales), 1.0))
+    colors = average(splats.sh[:, 0].astype(np.float64))[:, None].astype(np.float32)
+    quats = Rotation.from_matrix(axes).as_quat(scalar_first=True).astype(np.float32)
+    return SplatArrays(means.astype(np.float32), colors, opacities, scales, quats)
