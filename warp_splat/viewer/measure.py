@@ -47,7 +47,6 @@ class Ruler:
         self.client, self.scene, self.touched = client, client.scene, touched
         self.clicks: list[tuple[float, float]] = []  # that wait for their points
         self.points: list[np.ndarray] = []
-        self.corners: list[viser.TransformControlsHandle] = []
         self.measuring = client.gui.add_checkbox("Measure", False, hint="click on two points")
         self.boxed = client.gui.add_checkbox("Box", False, hint="drag two corners around what --crop is to keep")
         self.note = client.gui.add_markdown("")
@@ -96,7 +95,7 @@ class Ruler:
         self.box = self.scene.add_frame("/box", show_axes=False)
         reach = REACH * float(np.linalg.norm(self.subject - np.asarray(self.client.camera.position)))
         options = {"scale": reach, "disable_rotations": True}
-        self.corners = []
+        self.corners: list[viser.TransformControlsHandle] = []
         for i, side in enumerate((-1, 1)):
             corner = self.scene.add_transform_controls(f"/box/{i}", position=self.subject + side * reach, **options)
             corner.on_update(self._frame)
