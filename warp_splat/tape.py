@@ -261,9 +261,8 @@ def rasterize_worlds(
     found = []
     for world, camera in enumerate(cameras):
         room = {name: array[world] for name, array in (out or {}).items()}
-        found.append(
-            rasterize(**{name: of(world, name, value) for name, value in given.items()}, camera=camera, out=room)
-        )
+        own = {name: of(world, name, value) for name, value in given.items()}
+        found.append(rasterize(**own, camera=camera, out=room))
     return found
 
 

@@ -154,8 +154,7 @@ def _frames(video: Path, work: Path, config: SfmConfig, say) -> Path:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         with tqdm(total=100, desc="frames", unit="%", disable=config.quiet) as bar:
-            advance = lambda share: bar.update(share - bar.n)  # noqa: E731
-            count = sample_frames(video, part, config, say, advance)
+            count = sample_frames(video, part, config, say, lambda share: bar.update(share - bar.n))
             bar.update(100 - bar.n)
         if count < LEAST:
             raise InputError(f"{video}: expected a video of at least {LEAST} frames, {count} could be decoded.")
