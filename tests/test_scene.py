@@ -1,5 +1,8 @@
 """Scene loading against files written by hand, analytic patterns and formulas that share nothing with the loader."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import OpenImageIO as oiio
 import pycolmap
@@ -28,9 +31,9 @@ from scene_files import (
     write_model,
 )
 
-from warp_splat import InputError
+from warp_splat import Camera, InputError
 from warp_splat.scene.images import read_pixels, target_size
-from warp_splat.scene.types import visible
+from warp_splat.scene.types import Scene, visible
 
 FOX_TEST = ["0001.jpg", "0012.jpg", "0027.jpg", "0042.jpg", "0073.jpg", "0089.jpg", "0110.jpg"]
 
@@ -371,3 +374,18 @@ def test_fox():
 
 def test_import_stays_light():
     python("-c", "import sys, warp_splat.scene; sys.exit(not {'pycolmap', 'OpenImageIO'}.isdisjoint(sys.modules))")
+
+
+@pytest.mark.parametrize(
+    ("depth", "drawn", "expected"), [(2.0, False, 6.0 * 2.0), (20.0, False, 50.0), (2.0, True, 50.0)]
+)
+def test_the_extent_of_a_long_walk_is_that_of_what_it_passes(depth, drawn, expected):
+    """Cameras 10 apart along x, each before a wall; what walls hide is far away, and a few points are too near."""
+    camera = Camera(100, 100, 50.0, 50.0, 50.0, 50.0, np.eye(3), np.zeros(3))
+    places = np.linspace(0, 100, 11)
+    views = [SimpleNamespace(camera=replace(camera, translation=np.array([-x, 0.0, 0.0]))) for x in places]
+    wall = np.stack([*np.meshgrid(np.arange(-20, 120, 0.05), 0.0), np.full((1, 2800), depth)], -1).reshape(-1, 3)
+    near = np.array([[x, 0.0, 0.1] for x in places])
+    points = np.concatenate([wall, wall * (1, 1, 30), near]).astype(np.float32)
+    scene = Scene(views, [], points, points.astype(np.uint8), random_points=drawn)
+    assert scene.extent == pytest.approx(1.1 * expected, rel=1e-6)

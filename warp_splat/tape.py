@@ -115,8 +115,7 @@ def rasterize(
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
         with stage("tape"):
-            room = out or {}
-            pixels = {name: _array(name, tensor, recorded, room.get(name)) for name, tensor in shown.items()}
+            pixels = {name: _array(name, tensor, recorded, (out or {}).get(name)) for name, tensor in shown.items()}
             if recorded:
                 inputs = [(array, leaves[name]) for name, array in named.items() if array.requires_grad]
                 outputs = [(pixels[name], tensor) for name, tensor in shown.items() if tensor.requires_grad]
@@ -248,8 +247,7 @@ def rasterize_worlds(
     Raises:
         InputError: as :func:`rasterize` does.
     """
-    names = ("means", "quats", "scales", "opacities", "sh")
-    given = dict(zip(names, (means, *gaussians), strict=True)) | more
+    given = dict(zip(("means", "quats", "scales", "opacities", "sh"), (means, *gaussians), strict=True)) | more
 
     def of(world: int, name: str, value: Any) -> Any:
         """What of ``value`` is of one world."""

@@ -62,7 +62,6 @@ def cells_of(records: Iterable[Mapping], columns: Mapping[str, str | Callable[[M
 def _cell(record: Mapping, column: str | Callable[[Mapping], object]) -> object:
     if callable(column):
         return column(record)
-    names = [name for _, name, _, _ in string.Formatter().parse(column) if name]
-    values = [record.get(name) for name in names]
+    values = [record.get(name) for _, name, _, _ in string.Formatter().parse(column) if name]
     missing = any(value is None or (isinstance(value, float) and math.isnan(value)) for value in values)
     return "-" if missing else column.format(**record)

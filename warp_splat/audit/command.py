@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
 from warp_splat.audit.judged import LEVEL, SceneRow, exact_image, in_eight_bits, measure, smallest
@@ -107,8 +106,7 @@ def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
         print(f"{name}: the renderer {error}.")
         answer = None
     out.mkdir(parents=True, exist_ok=True)
-    *geometry, sh_dc, sh_rest = workload.gaussians
-    write_files(out, stored(*geometry, torch.cat([sh_dc, sh_rest], 1)), workload.camera)
+    write_files(out, stored(*workload.gaussians[:4], workload.gaussians.sh), workload.camera)
     expected = exact_image(workload)
     np.save(out / "expected.npy", expected)
     save_png(out / "expected.png", (in_eight_bits(expected) * 255).astype(np.uint8))

@@ -51,8 +51,7 @@ def run(config: CompareConfig) -> int:
         _compare_modes(all_workloads(scenes, device, say), config.modes, out, say)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
-    name = "stability" if config.stability else "compare"
-    write_text(out / f"{name}.txt", "\n".join([*log, ""]))
+    write_text(out / ("stability.txt" if config.stability else "compare.txt"), "\n".join([*log, ""]))
     print(f"Tables and plots: {out}")
     return code
 

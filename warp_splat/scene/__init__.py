@@ -14,7 +14,7 @@ from warp_splat.color import from_srgb
 from warp_splat.config import LENSES, NEAR
 from warp_splat.errors import InputError
 from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, ImageFinder, find_files, is_video, photo_root, sfm_hint
-from warp_splat.scene.types import Scene, View, visible
+from warp_splat.scene.types import Scene, View, nearest_shown, visible
 from warp_splat.text import Report
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
 MASKS = "masks"  # the folder beside the images' or, for cameras in JSON, in the scene
-SAMPLE, CLOSE = 100, 20  # images that are asked what is near, and points that are no accident
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
 
 
@@ -218,16 +217,12 @@ def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], lis
 
 def too_near(photos: list[Photo], points: np.ndarray) -> str:
     """What to tell the user if ``points`` [P, 3] come as near to the cameras as what is never drawn; else nothing."""
-    found = []
-    for camera in [photo.camera for photo in photos[:: -(-len(photos) // SAMPLE)]]:
-        depths = (points[visible(camera, points)] - camera.center) @ camera.rotation[2]
-        found += np.sort(depths)[CLOSE - 1 : CLOSE].tolist()
-    usual = np.median(found or [np.inf])
-    if usual >= 2 * NEAR:
+    near = nearest_shown([photo.camera for photo in photos], points)
+    if near >= 2 * NEAR:
         return ""
     return (
-        f"in half of the images {CLOSE} points or more are nearer than {usual:.2g}, and what is nearer than {NEAR} is "
-        f"never drawn: the scene is small; multiply the coordinates of its cameras and points by {1 / usual:.2g}."
+        f"in half of the images the nearest points are nearer than {near:.2g}, and what is nearer than {NEAR} is never "
+        f"drawn: the scene is small; multiply the coordinates of its cameras and points by {1 / near:.2g}."
     )
 
 

@@ -17,6 +17,8 @@ from warp_splat.formats.splats import SplatFile
 if TYPE_CHECKING:
     from warp_splat.scene.blocks import Block
 
+SAMPLE = 100  # cameras that are asked how near points come
+WALK = 6.0  # times that distance: the largest extent
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 
@@ -29,6 +31,18 @@ def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
     in_width = (x * camera.fx + z * camera.cx >= 0) & (x * camera.fx + z * camera.cx <= z * camera.width)
     in_height = (y * camera.fy + z * camera.cy >= 0) & (y * camera.fy + z * camera.cy <= z * camera.height)
     return (z > 0) & in_width & in_height
+
+
+def nearest_shown(cameras: list[Camera], points: np.ndarray) -> float:
+    """How near ``points`` [P, 3] come: of up to SAMPLE cameras, the median depth of the nearest 1 % of what each shows.
+
+    What a wall hides does not count, since it is farther away. Infinity if no camera shows anything.
+    """
+    found = []
+    for camera in cameras[:: -(-len(cameras) // SAMPLE)]:
+        depths = (camera.rotation[2] * (points[visible(camera, points)] - camera.center)).sum(1)
+        found += np.sort(depths)[len(depths) // 100 :][:1].tolist()
+    return float(np.median(found or [math.inf]))
 
 
 def spread_of(centers: np.ndarray) -> float:
@@ -165,12 +179,20 @@ class Scene:
         """The views to judge by, with their name: those held out; if none are, those for training, or EVALUATED."""
         return ("test", self.test) if self.test else ("train", self.train[:: -(-len(self.train) // EVALUATED)])
 
-    @property
+    @cached_property
     def extent(self) -> float:
         """1.1 x the largest distance of a training camera's center from their mean (the reference's getNerfppNorm).
 
         Where all cameras stand at one place that is 0, and nothing could learn: then 1.1 x the median distance of the
-        points from there.
+        points from there. A long walk is no large thing seen from far away: its extent is 1.1 x WALK x how near points
+        come to its cameras, at most. Tried by the means' rate, 2,500 steps, one seed:
+
+        - 1,000 photographs, whose spread is 23 times that: 23.9 dB with the spread, 25.15 with 6, 25.2 with 4, 25.1
+          with 2.9, 25.0 with 1.5
+        - 300, of 7 times: 28.5 dB with the spread, 28.4 with 2.7
         """
-        centers = np.stack([view.camera.center for view in self.train])
-        return float(1.1 * (spread_of(centers) or np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))))
+        cameras = [view.camera for view in self.train]
+        centers = np.stack([camera.center for camera in cameras])
+        spread = spread_of(centers) or np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))
+        near = math.inf if self.random_points else nearest_shown(cameras, self.points)
+        return float(1.1 * min(spread, WALK * near))

@@ -72,14 +72,14 @@ def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np
     """
     with opened(database) as connection:
         images = {number: model.image(number) for number in model.reg_image_ids()}
-        seen = {n: each.camera.cam_from_img(connection.read_keypoints(n)[:, :2]) for n, each in images.items()}
+        points = {n: each.camera.cam_from_img(connection.read_keypoints(n)[:, :2]) for n, each in images.items()}
         found = [(0, 0)]
         for number, geometry in zip(*connection.read_two_view_geometries(), strict=True):
             a, b = pycolmap.pair_id_to_image_pair(number)
             if a in images and b in images:
                 b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
-                ends, essential = geometry.inlier_matches.T, pycolmap.essential_matrix_from_pose(b_from_a)
-                errors = pycolmap.compute_squared_sampson_error(seen[a][ends[0]], seen[b][ends[1]], essential)
+                ends = [np.asarray(points[n])[rows] for n, rows in zip((a, b), geometry.inlier_matches.T, strict=True)]
+                errors = pycolmap.compute_squared_sampson_error(*ends, pycolmap.essential_matrix_from_pose(b_from_a))
                 most = FITS / images[a].camera.mean_focal_length()
                 wrong = np.count_nonzero(np.sqrt(errors) > most)  # from one place all fit, and the errors are NaN
                 found.append((len(errors) - wrong, len(errors)))
@@ -89,8 +89,8 @@ def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np
 def _is_enough(model: pycolmap.Reconstruction, database: Path, images: int) -> bool:
     """Whether incremental mapping could add little: photographs are there, and what surely fits does so here."""
     fit, every = matches_that_fit(model, database)
-    torn = np.count_nonzero((2 * fit < every) & (every >= SURE))
-    return model.num_reg_images() >= ENOUGH * images and torn <= TORN * np.count_nonzero(every >= SURE)
+    torn = (2 * fit < every)[every >= SURE]
+    return model.num_reg_images() >= ENOUGH * images and bool(torn.sum() <= TORN * len(torn))
 
 
 def _told(model: pycolmap.Reconstruction, database: Path) -> str:
@@ -121,6 +121,7 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
         known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
     # One thread: with two, each run ends in other bytes.
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=config.seed)
+    points = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=config.seed)
 
     def work() -> None:
         calibrated = Path(shutil.copyfile(database, part / database.name))  # it is written to
@@ -130,7 +131,8 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
         for number, model in pycolmap.global_mapping(calibrated, root, part, options).items():
             for each in set(model.reg_image_ids()) - held_together(model):
                 model.deregister_frame(model.image(each).frame_id)
-            model.write(part / str(number))
+            # anew from these cameras: points that only two photographs see were left out, and training lacks them
+            pycolmap.triangulate_points(model, calibrated, root, part / str(number), options=points)
 
     began = time.monotonic()
     passed = lambda: int(time.monotonic() - began)  # noqa: E731

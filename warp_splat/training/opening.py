@@ -149,8 +149,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
 def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: bool) -> None:
     """Write what this training was given: options, cameras, points."""
     config = config.changed(minutes=0.0)  # a clock cannot be repeated, what it decides can
-    others = {"train_test_exp": False, "linear_light": scene.linear}
-    model_folder.write_cfg_args(folder, {**config.flat(), **others})
+    model_folder.write_cfg_args(folder, {**config.flat(), "train_test_exp": False, "linear_light": scene.linear})
     write_config(folder, config)
     model_folder.write_cameras(folder, scene.test, scene.train, scene.coordinates)
     write_coordinates(folder, scene.coordinates)

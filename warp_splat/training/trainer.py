@@ -100,8 +100,7 @@ class Trainer:
         self.degree = min(COEFFICIENTS.index(scene.start.splats.sh.shape[1]), degree) if scene.start else 0
         self.blocks = Blocks(self, processes) if isinstance(processes, Shards) else None
         self.deck = Deck(scene.train, seed)
-        with_alpha = any(having(self.parts, "reads_alpha"))
-        self.photographs = Photographs(config, scene, self.device, with_alpha)
+        self.photographs = Photographs(config, scene, self.device, any(having(self.parts, "reads_alpha")))
         self.room = Room()  # for tile instances
         self._radii = self.model.parameters["means"].new_zeros(len(self.model), dtype=torch.int32)  # in the last step
 
@@ -273,8 +272,7 @@ class Trainer:
 
     def _set_iteration(self, iteration: int) -> None:
         self.optimizer.set_iteration(iteration)
-        risen = min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree)
-        self.degree = max(self.degree, risen)
+        self.degree = max(self.degree, min(iteration // self.config.learn.sh_interval, self.config.model.sh_degree))
 
     def _shown(self, camera: Camera | CameraParameters, options: RasterOptions) -> torch.Tensor | None:
         """The Gaussians that a view needs, where they live in a file; None: all."""
@@ -317,8 +315,7 @@ class Trainer:
 
     def save(self, path: Path) -> None:
         """Write the model. Raises InputError if that fails."""
-        save = self.blocks.save if self.blocks else self.model.save
-        save(path, self.config.model.antialiasing)
+        (self.blocks or self.model).save(path, self.config.model.antialiasing)
 
     @property
     def exposures(self) -> Exposures | None:
