@@ -95,6 +95,7 @@ def adam(named: dict[int, int], sparse: bool, kind: torch.dtype = torch.float32)
 #: What is run in fibers, given the addresses that kernels take as numbers.
 RUNS: dict[str, Callable[[dict], None]] = {
     **{name: lambda _, case=case: differentiate_all(*case) for name, case in CASES.items()},
+    "harmonics": lambda _: differentiate(replace(small(), sh=small().sh.repeat(1, 16, 1)), "manual", RasterOptions()),
     "ellipsoid": lambda _: differentiate_all("manual", RasterOptions(projection="ellipsoid")),
     "most weights": lambda _: differentiate_all("manual", RasterOptions(strongest=cubins.STRONGEST_MOST)),
     "opencv": lambda _: through(replace(small().camera, lens=OPENCV)),
