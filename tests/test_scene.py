@@ -377,10 +377,13 @@ def test_import_stays_light():
 
 
 @pytest.mark.parametrize(
-    ("depth", "drawn", "expected"), [(2.0, False, 6.0 * 2.0), (20.0, False, 50.0), (2.0, True, 50.0)]
+    ("depth", "drawn", "expected"), [(2.0, False, 5.0 * 4.25**0.5), (20.0, False, 50.0), (2.0, True, 50.0)]
 )
 def test_the_extent_of_a_long_walk_is_that_of_what_it_passes(depth, drawn, expected):
-    """Cameras 10 apart along x, each before a wall; what walls hide is far away, and a few points are too near."""
+    """Cameras 10 apart along x, each before a wall; what walls hide is far away, and a few points are too near.
+
+    Each shows 2,000 points, of which the 20th nearest of the wall is 0.5 aside.
+    """
     camera = Camera(100, 100, 50.0, 50.0, 50.0, 50.0, np.eye(3), np.zeros(3))
     places = np.linspace(0, 100, 11)
     views = [SimpleNamespace(camera=replace(camera, translation=np.array([-x, 0.0, 0.0]))) for x in places]
@@ -388,4 +391,4 @@ def test_the_extent_of_a_long_walk_is_that_of_what_it_passes(depth, drawn, expec
     near = np.array([[x, 0.0, 0.1] for x in places])
     points = np.concatenate([wall, wall * (1, 1, 30), near]).astype(np.float32)
     scene = Scene(views, [], points, points.astype(np.uint8), random_points=drawn)
-    assert scene.extent == pytest.approx(1.1 * expected, rel=1e-6)
+    assert scene.extent == pytest.approx(1.1 * expected, rel=1e-2)

@@ -26,7 +26,7 @@ from warp_splat.sfm.stages import opened, run_watched
 # longer the more there are, and could add little.
 ENOUGH, MANY = 0.98, 100
 FITS = 4.0  # px, what a match may miss by, as when pairs were verified
-TORN = 1e-3  # share of sure pairs that need not fit. Of four sound models: 2e-4 at most, of one that is not: 4e-3
+TORN = 1e-3  # share of sure pairs that need not fit. Of five sound models: 2e-4 at most, of one that is not: 4e-3
 LINK = 30  # points that two photographs of one model share at least, one by one
 SURE = 50  # features of a pair that are no chance: of 6,419 wrong pairs among 60 rooms alike, none had as many
 SHARED = 3  # photographs that two models need to have in common to become one
