@@ -90,7 +90,6 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
         squares = (found.adj_colors.double() ** 2).mean(1)
         for degree in range(degrees):
             with torch.no_grad():
-                fewer = replace(setting.options, sh_degree=degree)
-                colors = project(gaussians, view.camera, fewer).colors
+                colors = project(gaussians, view.camera, replace(setting.options, sh_degree=degree)).colors
             harmonics[:, degree] += squares * ((colors - found.splats.colors.detach()).double() ** 2).sum(1)
     return Costs(whole, harmonics)

@@ -72,17 +72,18 @@ def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np
     """
     with opened(database) as connection:
         images = {number: model.image(number) for number in model.reg_image_ids()}
-        points = {n: each.camera.cam_from_img(connection.read_keypoints(n)[:, :2]) for n, each in images.items()}
+        rays = {n: np.array(i.camera.cam_from_img(connection.read_keypoints(n)[:, :2])) for n, i in images.items()}
         found = [(0, 0)]
         for number, geometry in zip(*connection.read_two_view_geometries(), strict=True):
             a, b = pycolmap.pair_id_to_image_pair(number)
             if a in images and b in images:
                 b_from_a = images[b].cam_from_world() * images[a].cam_from_world().inverse()
-                ends = [np.asarray(points[n])[rows] for n, rows in zip((a, b), geometry.inlier_matches.T, strict=True)]
-                errors = pycolmap.compute_squared_sampson_error(*ends, pycolmap.essential_matrix_from_pose(b_from_a))
-                most = FITS / images[a].camera.mean_focal_length()
-                wrong = np.count_nonzero(np.sqrt(errors) > most)  # from one place all fit, and the errors are NaN
-                found.append((len(errors) - wrong, len(errors)))
+                essential = pycolmap.essential_matrix_from_pose(b_from_a)
+                if essential.any():  # not from one and the same place, where there are no such lines
+                    ends = zip((a, b), geometry.inlier_matches.T, strict=True)
+                    errors = pycolmap.compute_squared_sampson_error(*(rays[n][rows] for n, rows in ends), essential)
+                    close = np.sqrt(errors) < FITS / images[a].camera.mean_focal_length()
+                    found.append((np.count_nonzero(close), len(errors)))
     return tuple(np.array(found).T)
 
 

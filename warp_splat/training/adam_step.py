@@ -31,8 +31,7 @@ def move(
     """Change tables of ``count`` rows in place."""
     keys = [KEY * (len(tables) * iteration + table) % 2**31 for table in range(len(tables))]
     if driver_of(tables[0][0].device).lanes > 1:
-        _launch(tables, numbers, keys, count, radii)
-        return
+        return _launch(tables, numbers, keys, count, radii)
     together = list(zip(tables, numbers, keys, strict=True))
     for begin in range(0, len(together), numbered.AT_ONCE):
         _launch_numbers(*map(list, zip(*together[begin : begin + numbered.AT_ONCE], strict=True)), count, radii)

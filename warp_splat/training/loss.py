@@ -196,9 +196,14 @@ def _centers(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     One number for both unless they lie far apart, so that equal pixels stay equal.
     """
     if target.dtype == torch.uint8:
-        return image.new_full((2,), 0.5)
+        return _halves(image.device)
     own, other = _middle(image), _middle(target)
     return torch.stack([torch.where((own - other).abs() > FAR_APART, own, other), other])
+
+
+@functools.cache
+def _halves(device: torch.device) -> torch.Tensor:
+    return torch.full((2,), 0.5, device=device)
 
 
 def _middle(image: torch.Tensor) -> torch.Tensor:
