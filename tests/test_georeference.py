@@ -93,6 +93,9 @@ def test_distances_give_the_scale_and_cameras_the_up(tmp_path):
         ("name,x,y,z\na.jpg,1,2,b", "without numbers"),
         ("name,x,y,z\na.jpg,1,2,3", "of at least 3 photographs"),
         ("name,other,distance\na.jpg,b.jpg,3", "two photographs that were registered"),
+        ("name,other,distance\n0.jpg,1.jpg,2\n0.jpg,1.jpg,0", "distances above 0"),
+        ("name,other,distance\n0.jpg,1.jpg,-3", "distances above 0"),
+        ("name,other,distance\n0.jpg,0.jpg,3", "distances above 0 of two photographs"),
         (
             "name,x,y,z\n" + "\n".join(f"{k}.jpg,{k**3 % 7},{k**5 % 11},{k**2 % 5}" for k in range(COUNT)),
             "fit to the cam",

@@ -97,7 +97,7 @@ def load_scene(
         points, colors, file = points[rows], colors[rows], file and file._replace(splats=file.splats.take(rows))
         report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")
     require_visible(train, points, start or source)
-    if near := too_near(train, points):
+    if not drawn and (near := too_near(train, points)):
         report(f"Warning: {near}")
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
     halves = (train, views[: len(train)]), (test, views[len(train) :])

@@ -21,7 +21,6 @@ LOOSE = 0.05  # of the positions' extent: what RANSAC takes for right
 OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
-SOME = 100  # photographs that tell it
 LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
 
 
@@ -87,9 +86,8 @@ def scale_as_usual(model: pycolmap.Reconstruction) -> None:
     Mappers scale it so that all cameras lie within a few units, whether they stood in a room or in a city. But what is
     nearer than ``RasterOptions.near`` is never drawn.
     """
-    numbers = sorted(model.reg_image_ids())
-    depths = []
-    for image in map(model.image, numbers[:: -(-len(numbers) // SOME)]):
+    numbers, depths = sorted(model.reg_image_ids()), []
+    for image in map(model.image, numbers[:: -(-len(numbers) // 100)]):  # a hundred tell it
         seen = [model.point3D(point.point3D_id).xyz for point in image.get_observation_points2D()]
         depths.append((image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2])
     middle = float(np.median(np.concatenate(depths)))
@@ -130,8 +128,8 @@ def _extent(points: np.ndarray) -> float:
 def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str) -> dict:
     """The scale alone from distances [m] between cameras; up from the cameras, the origin in their middle."""
     known = [(*names, numbers[0]) for names, numbers in rows if set(names) <= set(centers)]
-    if not known:
-        raise InputError(f"{source}: expected names of two photographs that were registered, found none; check them.")
+    if not known or not all(a != b and distance > 0 for a, b, distance in known):
+        raise InputError(f"{source}: expected distances above 0 of two photographs that were registered; check them.")
     measured = np.array([np.linalg.norm(centers[a] - centers[b]) for a, b, _ in known])
     true = np.array([distance for _, _, distance in known])
     scale = float(np.median(true / measured))

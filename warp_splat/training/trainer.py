@@ -254,8 +254,9 @@ class Trainer:
         same = names == [view.name for view in self.scene.train]
         if not (same and math.isclose(extent, self.scene.extent, rel_tol=1e-6)):
             raise InputError(
-                f"{checkpoint.path}: expected training views of the same names and positions as in this checkpoint, "
-                "found other ones in the scene; name the scene that it was trained on (-s, -i, --eval)."
+                f"{checkpoint.path}: expected training views of the same names and extent ({extent:.4g}) as in this "
+                f"checkpoint, found {'other ones' if not same else f'{self.scene.extent:.4g}'} in the scene; name the "
+                "scene that it was trained on (-s, -i, --eval), or train anew if an older version began a long walk."
             )
         self.deck.restore(checkpoint)
         counts = {name: checkpoint.count(f"dropped.{name}") for name in (*NOT_FINITE, "prunings")}
