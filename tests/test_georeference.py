@@ -91,6 +91,7 @@ def test_distances_give_the_scale_and_cameras_the_up(tmp_path):
         ("x,y\n1,2", "expected a CSV file that begins with name,x,y,z"),
         ("name,x,y,z\na.jpg,1,2", "found the line a.jpg,1,2"),
         ("name,x,y,z\na.jpg,1,2,b", "without numbers"),
+        ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,nan,3", "found the line b.jpg,1,nan,3"),
         ("name,x,y,z\na.jpg,1,2,3", "of at least 3 photographs"),
         ("name,other,distance\na.jpg,b.jpg,3", "two photographs that were registered"),
         ("name,other,distance\n0.jpg,1.jpg,2\n0.jpg,1.jpg,0", "distances above 0"),

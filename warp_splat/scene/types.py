@@ -18,8 +18,7 @@ from warp_splat.formats.splats import SplatFile
 if TYPE_CHECKING:
     from warp_splat.scene.blocks import Block
 
-SAMPLE = 100  # cameras that are asked how near points come
-WALK = 5.0  # times that distance: the largest extent
+WALK = 5.0  # times as far away as what comes near: the largest extent
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 
@@ -34,16 +33,17 @@ def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
     return (z > 0) & in_width & in_height
 
 
-def nearest_shown(cameras: list[Camera], points: np.ndarray) -> float:
-    """How near ``points`` [P, 3] come: of up to SAMPLE cameras, the median distance of the nearest 1 % that each shows.
+def nearest_shown(cameras: list[Camera], points: np.ndarray, least: float = 0.0) -> float:
+    """How near ``points`` [P, 3] come: the median over cameras of the distance of the nearest 1 % that each shows.
 
-    What a wall hides does not count, since it is farther away. Infinity if no camera shows anything. Of a laser's
-    millions of points 20,000 are asked.
+    What a wall hides does not count, since it is farther away, nor what is within ``least``. Of many, a hundred cameras
+    and 20,000 points are asked. Infinity if no camera shows anything.
     """
-    found, points = [], points[:: -(-len(points) // 20_000) or 1]
-    for camera in cameras[:: -(-len(cameras) // SAMPLE)]:
+    found, points = [], points[np.random.default_rng(0).permutation(len(points))[:20_000]]
+    for camera in cameras[:: -(-len(cameras) // 100)]:
         distances = np.sqrt(((points[visible(camera, points)] - camera.center) ** 2).sum(1))
-        found += np.sort(distances)[len(distances) // 100 :][:1].tolist()
+        distances = np.sort(distances[distances > least])
+        found += distances[len(distances) // 100 :][:1].tolist()
     return float(np.median(found or [math.inf]))
 
 
@@ -195,5 +195,7 @@ class Scene:
         """
         centers = np.stack([view.camera.center for view in self.train])
         spread = spread_of(centers) or np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))
-        near = math.inf if self.random_points else nearest_shown([view.camera for view in self.train], self.points)
-        return float(1.1 * min(spread, WALK * max(near, NEAR)))  # what is nearer is not drawn
+        near = (
+            math.inf if self.random_points else nearest_shown([view.camera for view in self.train], self.points, NEAR)
+        )
+        return float(1.1 * min(spread, WALK * near))

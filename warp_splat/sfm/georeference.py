@@ -90,8 +90,7 @@ def scale_as_usual(model: pycolmap.Reconstruction) -> None:
     for image in map(model.image, numbers[:: -(-len(numbers) // 100)]):  # a hundred tell it
         seen = [model.point3D(point.point3D_id).xyz for point in image.get_observation_points2D()]
         depths.append((image.cam_from_world() * np.array(seen).reshape(-1, 3))[:, 2])
-    middle = float(np.median(np.concatenate(depths)))
-    model.transform(pycolmap.Sim3d(USUAL / middle, pycolmap.Rotation3d(), np.zeros(3)))
+    model.transform(pycolmap.Sim3d(USUAL / np.median(np.concatenate(depths)), pycolmap.Rotation3d(), np.zeros(3)))
 
 
 def fit(
@@ -128,10 +127,10 @@ def _extent(points: np.ndarray) -> float:
 def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str) -> dict:
     """The scale alone from distances [m] between cameras; up from the cameras, the origin in their middle."""
     known = [(*names, numbers[0]) for names, numbers in rows if set(names) <= set(centers)]
-    if not known or not all(a != b and distance > 0 for a, b, distance in known):
-        raise InputError(f"{source}: expected distances above 0 of two photographs that were registered; check them.")
     measured = np.array([np.linalg.norm(centers[a] - centers[b]) for a, b, _ in known])
-    true = np.array([distance for _, _, distance in known])
+    true, apart = np.array([distance for _, _, distance in known]), 1e-6 * _extent(np.array(list(centers.values())))
+    if not known or not ((true > 0) & (measured > apart)).all():
+        raise InputError(f"{source}: expected distances above 0 of two photographs that were registered; check them.")
     scale = float(np.median(true / measured))
     side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up])
@@ -175,7 +174,7 @@ def _read(path: Path) -> tuple[list[str], list[tuple[list[str], list[float]]]]:
             found = [(row[:text], [float(cell) for cell in row[text:]]) for row in rows]
         except ValueError as error:
             raise Unexpected(f"a line without numbers ({error})") from error
-        short = [row for row in rows if len(row) != len(first)]
-        if short or not all(np.isfinite(numbers).all() for _, numbers in found):
-            raise Unexpected(f"the line {','.join((short or rows)[0]):.80}")
+        for row, (_, numbers) in zip(rows, found, strict=True):
+            if len(row) != len(first) or not np.isfinite(numbers).all():
+                raise Unexpected(f"the line {','.join(row):.80}")
         return first, found
