@@ -21,7 +21,7 @@ import torch
 import warp as wp
 from common import interleaved, option, parse
 
-from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.runtime import launch, pool
 from warp_splat.runtime.launch import view
@@ -33,7 +33,7 @@ REPEATS = 7  # the best counts: a limit is what was reached once
 mat_chains = wp.types.matrix(shape=(CHAINS, LANES), dtype=float)
 
 
-@wp.kernel(module="unique", module_options=dict(IN_LANES))
+@wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
 def multiply_add(first: int, rounds: int, factor: float, values_out: wp.array2d[vec16]):
     i = first + wp.tid()
     x = mat_chains()

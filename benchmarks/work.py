@@ -22,7 +22,7 @@ import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.cpu.blend import BLOCKS, offset_x, offset_y, reach
 from warp_splat.kernels.falloff import make_exp
 from warp_splat.kernels.simd import LANES, total, vec16, where_less
@@ -40,7 +40,7 @@ LOSS, ADJOINT_OF_LOSS = 159, 73  # per channel of a pixel: five planes blurred a
 exp2_minus = make_exp(RasterOptions().exp_degree)
 
 
-@wp.kernel(module="unique", module_options=dict(IN_LANES))
+@wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
 def count_pairs(
     first: int,
     bins: BinsView,

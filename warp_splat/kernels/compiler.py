@@ -23,13 +23,13 @@ if _portable not in ("", "0", "1"):
 PORTABLE = _portable == "1"
 
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its
-#: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie.
+#: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie. Loops over
+#: blocks in lanes are short: vectorized across blocks they take three times as long. All kernels have the same flags,
+#: since for each set of them, in each process, Warp compiles its headers first, which takes as long as the projection.
 DIFFERENTIABLE = {
     "optimization_level": 3,
-    "cpu_compiler_flags": f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512",
+    "cpu_compiler_flags": f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512 "
+    "-fno-vectorize",
 }
 
 FORWARD_ONLY = {**DIFFERENTIABLE, "enable_backward": False}
-
-#: Of the loops over blocks in lanes: they are short, and vectorized across blocks they take three times as long.
-IN_LANES = {**FORWARD_ONLY, "cpu_compiler_flags": f"{FORWARD_ONLY['cpu_compiler_flags']} -fno-vectorize"}

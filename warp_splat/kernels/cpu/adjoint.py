@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, LANE_X, LANE_Y, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, VECTORS, fma, times, total, vec16, where_less
@@ -164,7 +164,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
             slots_out[k, grad] = sums[grad]
         return False
 
-    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
+    @kernel_of_parts(FORWARD_ONLY, walk=walk, begin=begin, step=step, finish=finish)
     def adj_blend(
         first: int,
         bins: BinsView,

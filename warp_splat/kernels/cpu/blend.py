@@ -37,7 +37,7 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, brightness, own_light, sure, unsure
-from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.cpu.settle import SETTLED, make_settle, rows_from
 from warp_splat.kernels.falloff import make_falloff
@@ -238,7 +238,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             stopped = total(alive) == 0.0
         return stopped
 
-    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
+    @kernel_of_parts(FORWARD_ONLY, walk=walk, begin=begin, step=step, finish=finish)
     def blend(
         first: int,  # tile of this slice
         bins: BinsView,  # its blocks are written

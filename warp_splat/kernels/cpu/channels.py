@@ -10,7 +10,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.cpu.adjoint import folded
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.falloff import make_falloff
@@ -102,7 +102,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     def finish(k, splat, ahead, out):
         return False
 
-    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
+    @kernel_of_parts(FORWARD_ONLY, walk=walk, begin=begin, step=step, finish=finish)
     def beside(
         first: int,
         bins: BinsView,
@@ -214,7 +214,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
         slots_out[k, OPACITY] = sums[OPACITY]
         return False
 
-    @kernel_of_parts(IN_LANES, walk=walk, begin=begin, step=step, finish=finish)
+    @kernel_of_parts(FORWARD_ONLY, walk=walk, begin=begin, step=step, finish=finish)
     def adj_channels(
         first: int,
         bins: BinsView,

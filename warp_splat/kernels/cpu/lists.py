@@ -23,7 +23,7 @@ import functools
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY, IN_LANES
+from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.simd import LANES, vec16, vec16i
@@ -42,7 +42,7 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
     """Splats as the blends read them, and how many rows of tiles each has; ``reach_of``: where their falloff ends."""
     shaped = make_shaped(reach_of, LANES)
 
-    @wp.kernel(module="unique", module_options=dict(IN_LANES))
+    @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def pack(
         first: int,  # group of splats of this slice
         gaussians: wp.array[int],  # [V] Gaussian of each splat
@@ -83,7 +83,7 @@ def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
     return pack
 
 
-@wp.kernel(module="unique", module_options=dict(IN_LANES))
+@wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
 def find_spans(
     first: int,  # group of splats of this slice
     splats: wp.array[Splat2D],  # [V]

@@ -22,7 +22,7 @@ import functools
 
 import warp as wp
 
-from warp_splat.kernels.compiler import IN_LANES
+from warp_splat.kernels.compiler import DIFFERENTIABLE
 from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, corner, reach
 from warp_splat.kernels.falloff import make_fall_value, make_falloff
 from warp_splat.kernels.simd import fma, times, total, vec16, where_less
@@ -121,7 +121,7 @@ def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     def adj_front_of(t: wp.array[vec16], block: int, alpha: vec16, kept: wp.array2d[vec16], k: int, adj_ret: vec16):
         wp.adjoint[t][block] += adj_ret
 
-    @wp.kernel(module="unique", module_options={**IN_LANES, "enable_backward": True})
+    @wp.kernel(module="unique", module_options=dict(DIFFERENTIABLE))
     def walk(
         first: int,
         bins: BinsView,  # splats: a copy per instance for ``generated``, [M]
