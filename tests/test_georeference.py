@@ -71,13 +71,17 @@ def test_positions_place_a_model_and_outliers_are_left_out(tmp_path, along):
     np.testing.assert_allclose(down, np.broadcast_to((0, 1, 0), down.shape), atol=0.01)
 
 
-def test_distances_give_the_scale_and_cameras_the_up(tmp_path):
+def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(tmp_path):
     random = np.random.default_rng(4)
     centers = random.uniform(-5, 5, (COUNT, 3))
     model = model_of(centers, random)
     between = np.linalg.norm(centers[0] - centers[1]), np.linalg.norm(centers[2] - centers[3])
-    (tmp_path / "d.csv").write_text(f"name,other,distance\n0.jpg,1.jpg,{between[0]}\n2.jpg, 3.jpg, {between[1]}\n")
-    found = georeference(model, tmp_path, str(tmp_path / "d.csv"), 0, print)
+    (tmp_path / "d.csv").write_text(
+        f"name,other,distance\n0.jpg,1.jpg,{between[0]}\n2.jpg, 3.jpg, {between[1]}\nother.jpg,1.jpg,7\n"
+    )
+    told: list[str] = []
+    found = georeference(model, tmp_path, str(tmp_path / "d.csv"), 0, told.append)
+    assert len(told) == 1 and "not registered: other.jpg;" in told[0]
     world = placed(model, found)
     np.testing.assert_allclose(world[:, 2] - world[0, 2], centers[:, 2] - centers[0, 2], atol=1e-4)
     np.testing.assert_allclose(
