@@ -26,10 +26,8 @@ PORTABLE = _portable == "1"
 #: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie. Loops over
 #: blocks in lanes are short: vectorized across blocks they take three times as long. All kernels have the same flags,
 #: since for each set of them, in each process, Warp compiles its headers first, which takes as long as the projection.
-DIFFERENTIABLE = {
-    "optimization_level": 3,
-    "cpu_compiler_flags": f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512 "
-    "-fno-vectorize",
-}
+_FLAGS = f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512 -fno-vectorize"
+
+DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS}
 
 FORWARD_ONLY = {**DIFFERENTIABLE, "enable_backward": False}

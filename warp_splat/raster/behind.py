@@ -43,8 +43,7 @@ def put_behind(
 def load_kernels(device: torch.device) -> None:
     """Compile and load them, for many pixels at once and for those left over."""
     for lanes in {driver_of(device).lanes, 1}:
-        load(make_put_behind(lanes), device)
-        load(make_adj_put_behind(lanes), device)
+        load(device, make_put_behind(lanes), make_adj_put_behind(lanes))
 
 
 @functools.lru_cache(maxsize=KEPT)

@@ -49,8 +49,7 @@ def color_matrix(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor
 def load_color_maps(device: torch.device) -> None:
     """Compile and load them, for many pixels at once and for those left over."""
     for lanes in {driver_of(device).lanes, 1}:
-        load(make_map_colors(lanes), device)
-        load(make_adj_map_colors(lanes), device)
+        load(device, make_map_colors(lanes), make_adj_map_colors(lanes))
 
 
 def _through_grid(image: torch.Tensor, numbers: torch.Tensor, pivot: float) -> torch.Tensor:

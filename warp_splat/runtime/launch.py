@@ -225,10 +225,11 @@ def arrays_of(types: Sequence[type], tensors: Sequence[torch.Tensor]) -> list:
     return [view(t if t.shape[1:] == inner else t.view(-1, *inner), dtype) for t, inner, dtype in given]
 
 
-def load(kernel: wp.Kernel, device: torch.device) -> None:
-    """Compile and load ``kernel``, and what else is in its module."""
+def load(device: torch.device, *kernels: wp.Kernel) -> None:
+    """Compile and load ``kernels``, and what else is in their modules."""
     wp.init()
-    wp.load_module(kernel.module, device=wp.device_from_torch(device))
+    for kernel in kernels:
+        wp.load_module(kernel.module, device=wp.device_from_torch(device))
 
 
 def launch_blocks(

@@ -21,8 +21,7 @@ MOST = 2**30  # numbers of a table in a launch on a GPU
 def load_adam(device: torch.device, sparse: bool, halves: bool) -> None:
     """Compile and load what :func:`move` launches on ``device``."""
     lanes = {LANES, 1} if driver_of(device).lanes > 1 else ()
-    for kernel in [make_adam(size, sparse, halves) for size in lanes] or [numbered.make_adam_by_number(sparse, halves)]:
-        load(kernel, device)
+    load(device, *[make_adam(n, sparse, halves) for n in lanes] or [numbered.make_adam_by_number(sparse, halves)])
 
 
 def move(

@@ -214,7 +214,7 @@ class Trainer:
         self.optimizer.load()
         for load_kernels in having((self.growth, *self.parts), "load"):
             load_kernels()
-        load(quarantine, self.device)  # launched only where a gradient is not finite
+        load(self.device, quarantine)  # launched only where a gradient is not finite
 
     def check_identical(self, iteration: int) -> None:
         """Raise GroupError if the model is not the same, byte for byte, in all processes."""

@@ -65,8 +65,7 @@ class Reference:
 
     def load(self) -> None:
         """Compile and load the kernel of :meth:`observe`."""
-        for lanes in {driver_of(self.model.device).lanes, 1}:
-            load(make_observe(lanes), self.model.device)
+        load(self.model.device, *map(make_observe, {driver_of(self.model.device).lanes, 1}))
 
     def update(self, iteration: int) -> Change | None:
         """Densify, prune and reset opacities if it is time; None if the set did not change."""
