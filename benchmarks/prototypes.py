@@ -168,7 +168,7 @@ def main() -> None:
         option("--only", default="", help="ingredients whose names begin so, between commas"),
     )
     launch.prepare("cpu", 1)
-    launch.load(search, torch.device("cpu"))
+    launch.load(torch.device("cpu"), search)
     arguments.runs.mkdir(parents=True, exist_ok=True)
     places = {"fox": arguments.fox, "church": arguments.church, "embedded": embedded_scene()}
     runs = Runs(arguments.runs, places, arguments.only_table)

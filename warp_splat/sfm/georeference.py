@@ -49,8 +49,9 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
         return None
     if source != "auto":
         kind, rows = _read(Path(source))
-        if unknown := sorted({name for names, _ in rows for name in names} - set(centers)):
-            say(f"{source}: left out, since they were not registered: {few(unknown)}; check these names.")
+        named = {name for names, _ in rows for name in names}
+        if set() < centers.keys() & named < named:
+            say(f"{source}: no registered photograph has the name {few(sorted(named - set(centers))):.200}")
         if kind == DISTANCES:
             return _by_distances(model, centers, up, rows, source)
         known, reference = {name: np.array(numbers) for (name, *_), numbers in rows}, Path(source).name
