@@ -25,7 +25,7 @@ PORTABLE = _portable == "1"
 #: The stack is aligned for lanes that do not fit into registers: what crosses two lines of the cache holds up its
 #: readers. Without, the same kernel takes up to a fifth longer, as the frames of its callers happen to lie. Loops over
 #: blocks in lanes are short: vectorized across blocks they take three times as long. All kernels have the same flags,
-#: since for each set of them, in each process, Warp compiles its headers first, which takes 2 to 3 s.
+#: since for each set of them, in each process, Warp compiles its headers first, which takes about 2 s.
 _FLAGS = f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512 -fno-vectorize"
 
 DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS}

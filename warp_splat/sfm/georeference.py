@@ -133,7 +133,8 @@ def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str)
     measured = np.array([np.linalg.norm(centers[a] - centers[b]) for a, b, _ in known])
     true, apart = np.array([distance for _, _, distance in known]), 1e-6 * _extent(np.array(list(centers.values())))
     if not known or not ((true > 0) & (measured > apart)).all():
-        raise InputError(f"{source}: expected distances above 0 of two photographs that were registered; check them.")
+        some = f"two photographs that were registered, such as {min(centers)}"
+        raise InputError(f"{source}: expected distances above 0 of {some}; check names and distances.")
     scale = float(np.median(true / measured))
     side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up])
