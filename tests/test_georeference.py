@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from splat_files import some_file
 
+from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import MODEL_FROM_WORLD, read_coordinates, write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
@@ -81,7 +82,7 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
     )
     told: list[str] = []
     found = georeference(model, tmp_path, str(tmp_path / "d.csv"), 0, told.append)
-    assert len(told) == 1 and told[0].endswith("has the name other.jpg")
+    assert len(told) == 2 and told[0].endswith("has the name other.jpg") and "2 distances fit within" in told[1]
     world = placed(model, found)
     np.testing.assert_allclose(world[:, 2] - world[0, 2], centers[:, 2] - centers[0, 2], atol=1e-4)
     np.testing.assert_allclose(
@@ -97,10 +98,11 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
         ("name,x,y,z\na.jpg,1,2,b", "without numbers"),
         ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,nan,3", "found the line b.jpg,1,nan,3"),
         ("name,x,y,z\na.jpg,1,2,3", "of at least 3 photographs"),
-        ("name,other,distance\na.jpg,b.jpg,3", "two photographs that were registered"),
+        ("name,other,distance\na.jpg,b.jpg,3", "above 0 of registered photographs such as 0.jpg"),
         ("name,other,distance\n0.jpg,1.jpg,2\n0.jpg,1.jpg,0", "distances above 0"),
         ("name,other,distance\n0.jpg,1.jpg,-3", "distances above 0"),
-        ("name,other,distance\n0.jpg,0.jpg,3", "distances above 0 of two photographs"),
+        ("name,other,distance\n0.jpg,1.jpg,1\n1.jpg,2.jpg,1e3\n2.jpg,3.jpg,1e6", "off (median)"),
+        ("name,other,distance\n0.jpg,0.jpg,3", "distances above 0"),
         (
             "name,x,y,z\n" + "\n".join(f"{k}.jpg,{k**3 % 7},{k**5 % 11},{k**2 % 5}" for k in range(COUNT)),
             "fit to the cam",
@@ -112,6 +114,13 @@ def test_files_that_do_not_fit_get_one_sentence(tmp_path, text, words):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         georeference(model_of(random.uniform(-5, 5, (COUNT, 3)), random), tmp_path, str(tmp_path / "a.csv"), 0, print)
+
+
+def test_a_file_that_cannot_be_read_is_refused_before_cameras_are_computed(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "a.csv").write_text("x,y\n1,2")
+    assert main(["sfm", f"{tmp_path}/photos", f"{tmp_path}/scene", "--coordinates", f"{tmp_path}/a.csv"]) == 1
+    assert "begins with name,x,y,z" in capsys.readouterr().err and not (tmp_path / "scene").exists()
 
 
 def test_gps_of_photographs_is_read_as_utm(tmp_path):

@@ -83,9 +83,8 @@ def check_coordinates(subject: Subject) -> Iterator[Finding]:
     fitting = sorted((size, name) for name, size in residuals.items() if name not in left_out)
     text = f"{found.get('reference')}, origin at {', '.join(f'{x:.12g}' for x in found['origin'])}"
     if fitting:
-        worst, name = fitting[-1]
-        text += f"; {len(fitting)} positions fit within {fitting[len(fitting) // 2][0]:.2g} m (median), "
-        text += f"the worst, {name}, within {worst:.2g} m"
+        (half, _), (worst, name) = fitting[len(fitting) // 2], fitting[-1]
+        text += f"; {len(fitting)} fit within {half:.2g} m (median), the worst, {name}, within {worst:.2g} m"
     rest = f"; {len(left_out)} were left out: {few(left_out)}" if left_out else ""
     yield Finding("coordinates", "warning" if left_out else "ok", f"{text}{rest}.")
 

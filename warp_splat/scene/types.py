@@ -193,9 +193,8 @@ class Scene:
           with 2.5, 24.8 with 0.5
         - 300, of 6 times: 28.5 dB with the spread, 28.4 with 2.3 or 1.1
         """
-        centers = np.stack([view.camera.center for view in self.train])
+        cameras = [view.camera for view in self.train]
+        centers = np.stack([camera.center for camera in cameras])
         spread = spread_of(centers) or np.median(np.linalg.norm(self.points - centers.mean(0), axis=1))
-        near = (
-            math.inf if self.random_points else nearest_shown([view.camera for view in self.train], self.points, NEAR)
-        )
+        near = math.inf if self.random_points else nearest_shown(cameras, self.points, NEAR)
         return float(1.1 * min(spread, WALK * near))

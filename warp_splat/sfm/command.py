@@ -26,7 +26,7 @@ from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, VIDEOS, find_files, is_video, photo_root, scene_of, sfm_hint
 from warp_splat.sfm import mapping, stages
-from warp_splat.sfm.georeference import georeference, scale_as_usual
+from warp_splat.sfm.georeference import georeference, read_places, scale_as_usual
 from warp_splat.sfm.matching import match
 from warp_splat.text import few
 
@@ -55,6 +55,8 @@ def sfm(config: SfmConfig) -> int:
         raise InputError(
             f"{source}: expected a folder of photographs or a video ({endings}), found {found}; check the path."
         )
+    if config.coordinates not in ("auto", "none"):
+        read_places(Path(config.coordinates))  # hours before it is needed
     work = _claim(source, scene, config)
     config = replace(config, threads=min(config.threads or CORES, CORES))
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its progress is ours to tell

@@ -48,12 +48,12 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     if source == "none":
         return None
     if source != "auto":
-        kind, rows = _read(Path(source))
+        kind, rows = read_places(Path(source))
         named = {name for names, _ in rows for name in names}
         if set() < centers.keys() & named < named:
             say(f"{source}: no registered photograph has the name {few(sorted(named - set(centers))):.200}")
         if kind == DISTANCES:
-            return _by_distances(model, centers, up, rows, source)
+            return _by_distances(model, centers, up, rows, source, say)
         known, reference = {name: np.array(numbers) for (name, *_), numbers in rows}, Path(source).name
     else:
         known, reference = _gps(database)
@@ -71,10 +71,10 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     extent = _extent(world[right])
     error = float(np.median(residuals[right])) if right.any() else np.inf
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
-        text = f"{right.sum()} of {len(names)} positions of {reference} do, within {error:.2g} m of {extent:.3g} m"
+        text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {extent:.3g} m"
         if source != "auto":
-            raise InputError(f"{source}: expected positions that fit to the cameras, but {text}; check their order.")
-        say(f"no coordinates: of positions that fit to the cameras, {text}")
+            raise InputError(f"{source}: expected positions that fit to the cameras, but {text}; check names and axes.")
+        say(f"no coordinates, since positions do not fit to the cameras: {text}")
         return None
     _move(model, fitted)
     left_out = [name for name, good in zip(names, right, strict=True) if not good]
@@ -127,20 +127,22 @@ def _extent(points: np.ndarray) -> float:
     return float(np.linalg.norm(points - points.mean(0), axis=1).max()) if len(points) else 0.0
 
 
-def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str) -> dict:
+def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str, say: Report) -> dict:
     """The scale alone from distances [m] between cameras; up from the cameras, the origin in their middle."""
     known = [(*names, numbers[0]) for names, numbers in rows if set(names) <= set(centers)]
     measured = np.array([np.linalg.norm(centers[a] - centers[b]) for a, b, _ in known])
-    true, apart = np.array([distance for _, _, distance in known]), 1e-6 * _extent(np.array(list(centers.values())))
-    if not known or not ((true > 0) & (measured > apart)).all():
-        some = f"two photographs that were registered, such as {min(centers)}"
-        raise InputError(f"{source}: expected distances above 0 of {some}; check names and distances.")
+    true, places = np.array([distance for *_, distance in known]), np.array([*centers.values()])
+    if not known or not ((true > 0) & (measured > 1e-6 * _extent(places))).all():
+        raise InputError(f"{source}: expected distances above 0 of registered photographs such as {min(centers)}.")
     scale = float(np.median(true / measured))
+    off = np.abs(scale * measured - true)
+    if (misfit := float(np.median(off / true))) > COARSE:
+        raise InputError(f"{source}: expected distances that fit to the cameras, found {misfit:.0%} off (median); check it.")
+    say(f"coordinates: {Path(source).name}, {len(off)} distances fit within {np.median(off):.2g} m (median)")
     side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up])
-    middle = np.mean(list(centers.values()), axis=0)
-    _move(model, pycolmap.Sim3d(scale, pycolmap.Rotation3d(level), -scale * level @ middle))
-    residuals = {f"{a} to {b}": float(r) for (a, b, _), r in zip(known, np.abs(scale * measured - true), strict=True)}
+    _move(model, pycolmap.Sim3d(scale, pycolmap.Rotation3d(level), -scale * level @ places.mean(0)))
+    residuals = {f"{a} to {b}": float(r) for (a, b, _), r in zip(known, off, strict=True)}
     return _described(np.zeros(3), Path(source).name, scale, residuals, [])
 
 
@@ -166,7 +168,7 @@ def _gps(database: Path) -> tuple[dict[str, np.ndarray], str]:
     return dict(zip(found, places, strict=True)), f"UTM zone {zone} {'south' if south else 'north'}, WGS 84, from GPS"
 
 
-def _read(path: Path) -> tuple[list[str], list[tuple[list[str], list[float]]]]:
+def read_places(path: Path) -> tuple[list[str], list[tuple[list[str], list[float]]]]:
     """The first line of a CSV file, and of the others the names and the numbers."""
     with reading(path, f"a CSV file that begins with {','.join(POSITIONS)} or {','.join(DISTANCES)}"):
         with path.open(newline="", encoding="utf-8-sig") as file:
