@@ -101,11 +101,11 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
         ("name,other,distance\na.jpg,b.jpg,3", "above 0 of registered photographs such as 0.jpg"),
         ("name,other,distance\n0.jpg,1.jpg,2\n0.jpg,1.jpg,0", "distances above 0"),
         ("name,other,distance\n0.jpg,1.jpg,-3", "distances above 0"),
-        ("name,other,distance\n0.jpg,1.jpg,1\n1.jpg,2.jpg,1e3\n2.jpg,3.jpg,1e6", "off (median)"),
+        ("name,other,distance\n0.jpg,1.jpg,1\n1.jpg,2.jpg,1e3\n2.jpg,3.jpg,1e6", "found 100% off"),
         ("name,other,distance\n0.jpg,0.jpg,3", "distances above 0"),
         (
             "name,x,y,z\n" + "\n".join(f"{k}.jpg,{k**3 % 7},{k**5 % 11},{k**2 % 5}" for k in range(COUNT)),
-            "fit to the cam",
+            "fit the cam",
         ),
     ],
 )

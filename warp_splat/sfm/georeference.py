@@ -39,7 +39,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
         What ``coordinates.json`` is to say, or None if the model stays as it is.
 
     Raises:
-        InputError: if the file cannot be read, or does not fit to the cameras.
+        InputError: if the file cannot be read, or does not fit the cameras.
     """
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     centers = {name: image.projection_center() for name, image in images.items()}
@@ -73,8 +73,8 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
         text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {extent:.3g} m"
         if source != "auto":
-            raise InputError(f"{source}: expected positions that fit to the cameras, but {text}; check names and axes.")
-        say(f"no coordinates, since positions do not fit to the cameras: {text}")
+            raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
+        say(f"no coordinates, since positions do not fit the cameras: {text}")
         return None
     _move(model, fitted)
     left_out = [name for name, good in zip(names, right, strict=True) if not good]
@@ -136,8 +136,8 @@ def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str,
         raise InputError(f"{source}: expected distances above 0 of registered photographs such as {min(centers)}.")
     scale = float(np.median(true / measured))
     off = np.abs(scale * measured - true)
-    if (misfit := float(np.median(off / true))) > COARSE:
-        raise InputError(f"{source}: expected distances that fit to the cameras, found {misfit:.0%} off (median); check it.")
+    if (miss := float(np.median(off / true))) > COARSE:
+        raise InputError(f"{source}: expected distances that fit the cameras, found {miss:.0%} off (median); check it.")
     say(f"coordinates: {Path(source).name}, {len(off)} distances fit within {np.median(off):.2g} m (median)")
     side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up])
