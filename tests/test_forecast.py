@@ -51,7 +51,7 @@ def test_forecast_is_what_a_step_takes(point, kinds):
     ],
 )
 def test_grounds(scene, options, count, reason):
-    told = memory.describe(Trainer(scene, TrainConfig(device="cpu", **options)))
+    told, _ = memory.describe(Trainer(scene, TrainConfig(device="cpu", **options)))
     assert told.startswith("About ") and f" at {count} Gaussians (" in told and reason in told
 
 
@@ -64,7 +64,8 @@ def test_what_does_not_fit_is_told(scene, monkeypatch):
     trainer.processes.local_count = 2
     for available, fits in ((pair, True), (pair - 2, False)):
         monkeypatch.setattr(memory, "available_memory", lambda device, available=available: available)
-        told = memory.describe(trainer)
+        told, whether = memory.describe(trainer)
+        assert whether == fits
         assert "in each of 2 processes" in told and f"{(own + pair / 2) / memory.GIB:.1f} GiB" in told
         assert ("(-r)" not in told and "Only" not in told) if fits else ("(-r)" in told and "Only" in told)
 

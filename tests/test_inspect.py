@@ -3,7 +3,6 @@
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -13,11 +12,12 @@ from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, wri
 from test_scene_input import BAD
 
 from warp_splat.cli import main
-from warp_splat.inspect import geometry, verdicts
+from warp_splat.inspect import geometry
 from warp_splat.inspect.subject import read_subject
-from warp_splat.inspect.verdicts import forecast
 from warp_splat.scene import load_scene
 from warp_splat.sfm import stages
+from warp_splat.training import deadline, memory
+from warp_splat.training.plan import StepTime
 
 
 @pytest.fixture
@@ -252,17 +252,22 @@ def test_other_endings_and_two_kinds_of_light(tmp_path, capsys):
     assert any(found == "error" and "b.png in linear light" in text for found, _, text in findings)
 
 
-def test_the_forecast_knows_what_a_photograph_takes(monkeypatch):
-    """float32 in linear light instead of bytes, a byte for each pixel of masks and of alpha; within a bound."""
-    free = [2**40]
-    monkeypatch.setattr(verdicts.psutil, "virtual_memory", lambda: SimpleNamespace(available=free[-1]))
-    sizes, told = [(1600, 1000)] * 5000, []
-    for kinds in ((False, False, False), (False, True, False), (False, True, True), (True, True, True)):
-        told.append(float(re.search(r"about ([\d.]+) GiB", forecast(sizes, 10, *kinds)[0])[1]))
-    assert np.diff(told) / (5000 * 1600 * 1000 / 2**30) == pytest.approx([1, 1, 9], abs=0.1)
-    free.append(2**35)
-    bounded, _ = forecast(sizes, 10)
-    assert told[0] - float(bounded.split()[1]) == pytest.approx(5000 * 1600 * 1000 * 3 / 2**30 - 8, abs=0.15)
+def test_a_few_steps_tell_how_long_a_training_takes(tmp_path, capsys, monkeypatch):
+    """By the steps of a trial; without them where memory is short; nothing of a scene that training refuses."""
+    half = lambda trial, _: StepTime(len(trial.model), trial.scene.train[0].camera.width, 0.5)  # noqa: E731
+    monkeypatch.setattr(deadline, "_of_step", half)
+
+    def told():
+        return [(level, text) for level, check, text in examine(SCENE, tmp_path, capsys, 0)[0] if check == "forecast"]
+
+    (fast, first), (plain, second) = told()
+    assert fast == plain == "note" and first.startswith("--preset fast: about 30.0 min for 3600 steps. About ")
+    assert " at 100000 Gaussians (--max_gaussians)." in first and "the default: about 4.2 h for 30000 steps." in second
+    monkeypatch.setattr(memory, "available_memory", lambda device: 0)
+    assert all(level == "warning" and " min " not in text and "Only " in text for level, text in told())
+    broken = shutil.copytree(SCENE, tmp_path / "broken")
+    next((broken / "images").iterdir()).unlink()
+    assert not [check for _, check, _ in examine(broken, tmp_path, capsys, 1)[0] if check == "forecast"]
 
 
 def test_a_model_without_its_points(life, tmp_path, capsys):

@@ -187,7 +187,7 @@ def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mod
 @pytest.mark.parametrize(
     ("name", "change", "found"),
     [
-        ("means", wp.to_torch, "expected a Warp array, got Tensor; warp_splat.rasterize takes"),
+        ("means", wp.to_torch, "expected a Warp array, got Tensor; rasterize takes"),
         ("means", lambda a: wp.array(a.numpy(), dtype=wp.vec3d), "expected an array of float32, got one of vec3d"),
         ("quats", lambda a: a[:3], r"quats: expected shape \[120, 4\], got \[3, 4\]"),
         ("quats", lambda a: wp.array(a.numpy()[:, :3], dtype=wp.vec3), r"quats: .* got \[120, 3\]"),

@@ -210,7 +210,7 @@ def test_films_that_cannot_be(tmp_path, fails):
     for name, count in (("empty.ply", 0), ("full.ply", 5)):
         save_gaussians(tmp_path / name, some_file(count))
     film = ("-s", str(SCENE), "--video", "path", "--frames", "2")
-    assert "at least one Gaussian to film" in fails("render", "-m", str(tmp_path / "empty.ply"), *film)
+    assert "expected a Gaussian to film" in fails("render", "-m", str(tmp_path / "empty.ply"), *film)
     output = ("--video_output", str(tmp_path / "full.ply" / "a.mp4"))
     sentence = fails("render", "-m", str(tmp_path / "full.ply"), *film, *output)
     assert "full.ply: expected a folder that can be written" in sentence

@@ -182,9 +182,7 @@ def _check_parts(parts: str, given: dict) -> None:
     for name in PARTS:
         if given.get(name) is False and (name in named or AUTO in named):
             hint = "name the parts to use" if AUTO in named else "leave one of them out"
-            raise InputError(
-                f"--no-{name}: expected no other word on this part beside it, got --parts {parts}; {hint}."
-            )
+            raise InputError(f"--no-{name}: expected no other word on this part, got --parts {parts}; {hint}.")
         if named.count(name) > 1:
             raise InputError(f"--parts {parts}: expected each part once, got {name} twice; leave one out.")
 

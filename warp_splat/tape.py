@@ -174,9 +174,7 @@ def _checked(name: str, array: Any) -> wp.array:
     """``array``. Raises InputError if it is none of Warp's of real numbers; shapes are checked later."""
     kinds = (wp.float32, wp.float64) if name in ("twist", "intrinsics") else (wp.float32,)
     if not isinstance(array, wp.array):
-        raise InputError(
-            f"{name}: expected a Warp array, got {type(array).__name__}; warp_splat.rasterize takes torch tensors."
-        )
+        raise InputError(f"{name}: expected a Warp array, got {type(array).__name__}; rasterize takes torch tensors.")
     scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
     if scalar not in kinds:
         wanted = " or ".join(kind.__name__ for kind in kinds)

@@ -9,6 +9,7 @@ from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import check_output
 from warp_splat.inspect import geometry, verdicts
+from warp_splat.inspect.forecast import check_cost
 from warp_splat.inspect.page import draw_pictures, write_page
 from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos
@@ -36,6 +37,8 @@ def inspect(config: InspectConfig) -> int:
     subject, findings = read_subject(source, config.images)
     for check in (verdicts.check_cameras, *geometry.CHECKS, *verdicts.CHECKS):
         findings += check(subject)
+    print("Trying a few steps (kernels are compiled once on a machine, about 20 s) ...")
+    findings += check_cost(subject)
     findings.sort(key=lambda finding: list(COLORS).index(finding.level))
     verdict = _verdict(findings)
     write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))

@@ -6,30 +6,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import psutil
 
-from warp_splat.config import CORES
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.inspect.subject import Finding, Subject
-from warp_splat.presets import PRESETS
 from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible, too_near
-from warp_splat.scene.decoding import SHARE
-from warp_splat.scene.images import target_size
 from warp_splat.scene.photos import READABLE, find_files
 from warp_splat.text import few
-from warp_splat.training.memory import FLOAT, GIB, INSTANCES, expected_gaussians, pixel_floats, step_memory
-from warp_splat.training.options import TrainConfig
 
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
 OFF_CENTER = 0.1  # of the image's width or height
 ROUNDED = 1e-4  # of the distance between cameras, which may be lost by rounding
 AT_LEAST = 20  # images; fewer train, but show little from new sides
-BASE = 0.7 * GIB  # Python, torch, Warp and their kernels
-SECONDS_PER_PIXEL = 6.7e-7  # of a thread, for each step: 1216 s for 7,000 steps of 518,400 px on two
-DEFAULTS = TrainConfig()
-RUNS = {"--preset fast": PRESETS["fast"]["iterations"], "the default": DEFAULTS.learn.iterations}
 
 
 def check_cameras(subject: Subject) -> Iterator[Finding]:
@@ -152,52 +141,5 @@ def check_loading(subject: Subject) -> Iterator[Finding]:
     yield from (Finding("loading", "note", note) for note in notes)
 
 
-def check_cost(subject: Subject) -> Iterator[Finding]:
-    """Memory and time of a training, against what this machine has."""
-    if not subject.photos:
-        return
-    sizes = [(photo.camera.width, photo.camera.height) for photo in subject.photos]
-    kinds = bool(subject.linear), any(photo.mask for photo in subject.photos), bool(subject.alpha)
-    text, fits = forecast(sizes, len(subject.points), *kinds)
-    yield Finding("forecast", "note" if fits else "warning", text)
-
-
-def forecast(
-    sizes: list[tuple[int, int]], points: int, linear: bool = False, masked: bool = False, alpha: bool = False
-) -> tuple[str, bool]:
-    """Memory and time of a training with default options.
-
-    Args:
-        sizes: width and height [px] of each image.
-        points: that training starts from.
-        linear: the images are in linear light.
-        masked: they have masks.
-        alpha: they have alpha.
-
-    Returns:
-        A sentence, and whether this machine has the memory.
-    """
-    targets = [target_size(*size, -1) for size in sizes]
-    areas = [width * height for width, height in targets]
-    gaussians, _ = expected_gaussians(points, max(areas))
-    per_pixel = pixel_floats(masked, False, linear)
-    step = step_memory(gaussians, INSTANCES * gaussians, max(areas), DEFAULTS, per_pixel)
-    photographs = sum(areas) * ((3 * FLOAT if linear else 3) + masked + alpha)
-    available = psutil.virtual_memory().available
-    needed = BASE + min(photographs, SHARE * available) + step
-    seconds = sum(areas) / len(areas) * SECONDS_PER_PIXEL / CORES
-    times = ", ".join(f"{_span(steps * seconds)} for {name} ({steps} iterations)" for name, steps in RUNS.items())
-    less = "; take smaller images (-r 2) or fewer Gaussians (--max_gaussians)" * (needed > available)
-    text = (
-        f"about {needed / GIB:.1f} GiB of memory for {gaussians} Gaussians, {available / GIB:.1f} GiB are free; "
-        f"roughly {times} on {CORES} CPU threads{less}."
-    )
-    return text, needed <= available
-
-
-def _span(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
 #: What is checked once the points are: see geometry.py.
-CHECKS = (check_coordinates, check_names, check_masks, check_loading, check_cost)
+CHECKS = (check_coordinates, check_names, check_masks, check_loading)

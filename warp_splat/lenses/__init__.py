@@ -39,9 +39,7 @@ class Lens:
         except (TypeError, ValueError, OverflowError):
             coefficients = ()
         if len(coefficients) != count or not all(math.isfinite(number) for number in coefficients):
-            raise InputError(
-                f"Lens {self.model}: expected {count} finite coefficients, got {self.coefficients!r:.200}."
-            )
+            raise InputError(f"Lens {self.model}: expected {count} finite coefficients, got {self.coefficients!r:.99}.")
         object.__setattr__(self, "coefficients", coefficients)
 
     @property

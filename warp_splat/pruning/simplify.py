@@ -70,9 +70,7 @@ def simplify(config: SimplifyConfig) -> int:
         found = f"{measured:.2g} measured, {upward(bound)} its bound"
         print(f"  largest change of a pixel, {len(views)} training views: {found}")
         if bound > config.tolerance:
-            print(
-                "  Without any change, the bound of rounding is more: nothing is left out; take a larger --tolerance."
-            )
+            print("  Without any change, the bound of rounding is more: nothing is left out; raise --tolerance.")
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
     print_quality(opened.quality(file.splats), opened.quality(splats))
@@ -103,9 +101,7 @@ def _check(config: SimplifyConfig) -> None:
     given = [name for name in ("keep", "max_loss", "size", "tolerance") if getattr(config, name)]
     if len(given) != 1:
         found = " and ".join(f"--{name}" for name in given) or "none"
-        raise InputError(
-            f"warp-splat simplify: expected one of --keep, --max_loss, --size and --tolerance above 0, got {found}."
-        )
+        raise InputError(f"simplify: expected one of --keep, --max_loss, --size and --tolerance above 0, got {found}.")
     if config.size:
         bytes_of(config.size)
     if config.tolerance and config.steps:
@@ -187,9 +183,7 @@ def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
 def _unseen(config: SimplifyConfig, output: Path) -> int:
     """Without a scene: the largest by opacity and extent."""
     if config.max_loss or config.steps or config.tolerance:
-        raise InputError(
-            "--max_loss, --tolerance, --steps: expected photographs to compare with; name the scene with -s."
-        )
+        raise InputError("--max_loss, --tolerance, --steps: expected photographs to compare; name a scene with -s.")
     print(UNSEEN)
     finished = Finished(config.model, config.iteration, config.crop)
     require_some(finished)

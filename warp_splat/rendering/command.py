@@ -97,9 +97,7 @@ def render_model(config: RenderConfig) -> int:
     folder, finished = _open(config)
     model, iteration = GaussianModel.from_splats(finished.file.splats).arranged(), finished.iteration
     if (config.orbit or config.video) and not len(model):
-        raise InputError(
-            f"{config.model_path}: expected at least one Gaussian to film, found none; name another model."
-        )
+        raise InputError(f"{config.model_path}: expected a Gaussian to film, found none; name another model.")
     output = config.video_output or (str(folder / f"{config.video}.mp4") if config.video else "")
     if output:  # before frames are drawn for it
         model_folder.check_place(Path(output).parent if Path(output).suffix.lower() == ".mp4" else Path(output))

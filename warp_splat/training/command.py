@@ -118,7 +118,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     leads, config = trainer.processes.rank == 0, trainer.config
     if leads:
         opening.refuse_other_training(run.folder, begun)  # again: one may have ended meanwhile
-    say("Preparing kernels (compiled once on a machine, about 40 s) ...")
+    say("Preparing kernels (compiled once on a machine, about 20 s) ...")
     start = time.perf_counter()
     trainer.warm_up()
     say(f"Kernels ready after {time.perf_counter() - start:.1f} s")
@@ -135,7 +135,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     if leads and config.report.tensorboard:
         run.events = EventLog(run.folder, run.iteration)
     if config.machine.device == "cpu":
-        say(memory.describe(trainer))
+        say(memory.describe(trainer)[0])
 
 
 def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:

@@ -74,15 +74,12 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
         InputError: if there is too little time for one change of the set of Gaussians.
     """
     minutes = config.learn.minutes
-    say("Measuring this machine (kernels are compiled first, once on a machine, about 40 s) ...")
+    say("Measuring this machine (kernels are compiled first, once on a machine, about 20 s) ...")
     measured_as = suggested(config, scene).changed(settle_from_iter=1, minutes=0.0)  # its set stays as it is
     trial = Trainer(scene, measured_as, processes)
     trial.warm_up()
     task = task_of(config, scene, trial.photographs.shares)
-    measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
-    for row in measured:
-        say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")
-    cost = Cost.of([row._replace(seconds=row.seconds / processes.images) for row in measured])  # of one image
+    cost = cost_of(trial, task, say)
     plan = plan_for(config, cost, 60.0 * minutes, task)
     say(f"Plan for {minutes:g} minutes ({seconds_of(plan, cost, task):.0f} s by these figures): {as_flags(plan)}")
     if trial.growth.grows(config.learn.iterations):
@@ -95,6 +92,15 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     table = [Reached(**entry) for entry in json.loads(REACHED.read_text())] if REACHED.is_file() else []
     say(comparable(table, plan, task))
     return plan
+
+
+def cost_of(trial: Trainer, task: Task, say: Callable[[str], None]) -> Cost:
+    """What steps cost on this machine, for each image, as ``trial`` takes a few; it is of no use afterwards."""
+    processes = trial.processes
+    measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
+    for row in measured:
+        say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")
+    return Cost.of([row._replace(seconds=row.seconds / processes.images) for row in measured])
 
 
 def _measured(trial: Trainer, task: Task) -> list[StepTime]:

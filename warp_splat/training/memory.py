@@ -54,15 +54,18 @@ def step_memory(gaussians: int, instances: int, pixels: int, config: TrainConfig
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
 
-def describe(trainer: "Trainer") -> str:
-    """What to tell the user once kernels are loaded: memory and the Gaussians assumed, and whether that can be had."""
+def describe(trainer: "Trainer") -> tuple[str, bool]:
+    """What to tell the user once kernels are loaded, memory and the Gaussians assumed, and whether that can be had."""
     scene, config, processes = trainer.scene, trainer.config, trainer.processes.local_count
     pixels = max(view.camera.width * view.camera.height for view in scene.train)
     grows, limit = trainer.growth.grows(config.learn.iterations), config.grow.max_gaussians
     count, reason = expected_gaussians(len(trainer.model), pixels, limit, grows)
     if trainer.optimizer.folder:
         size = 3 * FLOAT * sum(leaf[0].numel() for leaf in trainer.model.parameters.values()) * count
-        return f"{count} Gaussians ({reason}) take {size / GIB:.1f} GiB on the disk, memory where views show them."
+        return (
+            f"{count} Gaussians ({reason}) take {size / GIB:.1f} GiB on the disk, memory where views show them.",
+            True,
+        )
     masked = any(view.mask is not None for view in scene.train)
     composited = any(having(trainer.parts, "reads_alpha")) and any(view.alpha is not None for view in scene.train)
     per_pixel = pixel_floats(masked, composited, scene.linear)
@@ -76,12 +79,13 @@ def describe(trainer: "Trainer") -> str:
     if not limit:
         text += f", {(step(10**6) - step(0)) / GIB:.1f} GiB more for each further million"
     available = available_memory(torch.device("cpu"))
-    if processes * needed > available:
+    fits = processes * needed <= available
+    if not fits:
         text += (
             f". Only {(base + available // processes) / GIB:.1f} GiB can be had: take smaller images (-r) or fewer "
             "Gaussians (--max_gaussians)"
         )
-    return f"{text}."
+    return f"{text}.", fits
 
 
 def expected_gaussians(beginning: int, pixels: int, limit: int = 0, grows: bool = True) -> tuple[int, str]:

@@ -20,9 +20,7 @@ class DataOptions:
     eval: bool = flag(False, "hold out every 8th image (by name) for testing")
     resolution: int = flag(-1, "1, 2, 4, 8: divide the size; other: width in px; -1: at most 1600 px", "-r", least=-1)
     preset: str = flag("", "fast: other defaults that train in minutes on a CPU; see docs", choices=("", "fast"))
-    start_checkpoint: str = flag(
-        "", "a training to continue: folder, or checkpoint; flags change its options", "--resume"
-    )
+    start_checkpoint: str = flag("", "a training to continue: folder or checkpoint; flags change options", "--resume")
 
     images: str = data("images", "folder of the photographs inside a COLMAP scene", "-i")
     white_background: bool = data(False, "composite on white instead of black", "-w")
@@ -242,7 +240,7 @@ def check_train(config: TrainConfig) -> None:
     learn, parts = config.learn, config.model.parts
     if (verify := config.report.verify) and (not 8 <= len(verify) <= 64 or set(verify) - set("0123456789abcdef")):
         raise InputError(
-            f"--verify: expected a sha256 as in results.json, or 8 or more of its first digits, got {verify!r:.80}."
+            f"--verify: expected 8 or more first digits of a sha256 as in results.json, got {verify!r:.80}."
         )
     if (config.data.block or config.data.blocks) and parts == AUTO:
         raise InputError(f"--block: expected parts by name, got --parts {AUTO}: each block would take others.")

@@ -30,7 +30,7 @@ def view_model(config: ViewConfig) -> int:
     print(f"{len(model)} Gaussians from {config.model}, iteration {finished.iteration}")
     scene = _find_scene(finished, config.source_path)
     options = replace(finished.options, of="trained", tolerance=config.tolerance or None)
-    print("Preparing kernels (compiled once on a machine, about 40 s) ...")
+    print("Preparing kernels (compiled once on a machine, about 20 s) ...")
     advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
     with memory_explained(device, model, [LARGEST], advice):
         draw, linear = finished.renderer(model, options), finished.is_linear(scene)

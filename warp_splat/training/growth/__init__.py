@@ -16,9 +16,7 @@ class ReferenceOptions:
     densification_interval: int = growing(100, "steps between two densifications", least=1)
     densify_grad_threshold: float = growing(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
     percent_dense: float = growing(0.01, "share of the scene's extent above which a Gaussian splits, and is not cloned")
-    opacity_reset_interval: int = growing(
-        3000, "steps between two resets of all opacities to 0.01", least=1, schedule=True
-    )
+    opacity_reset_interval: int = growing(3000, "steps between resets of all opacities to 0.01", least=1, schedule=True)
     prune_screen_size: int = growing(0, "prune Gaussians wider than this radius in px; 0: never, as in the reference")
 
 

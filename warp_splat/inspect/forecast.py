@@ -1,0 +1,40 @@
+"""What a training of the scene will take on this machine: a few of its steps are tried."""
+
+from collections.abc import Iterator
+
+from warp_splat.errors import InputError
+from warp_splat.inspect.subject import Finding, Subject
+from warp_splat.presets import PRESETS
+from warp_splat.runtime import launch
+from warp_splat.scene import load_scene
+from warp_splat.scene.decoding import photo_memory
+from warp_splat.training.deadline import cost_of
+from warp_splat.training.memory import describe
+from warp_splat.training.options import TrainConfig
+from warp_splat.training.plan import seconds_of, task_of
+from warp_splat.training.trainer import Trainer
+
+RUNS = {"--preset fast": PRESETS["fast"], "the default": PRESETS[""]}
+
+
+def check_cost(subject: Subject) -> Iterator[Finding]:
+    """Memory and time of a training by each of RUNS. None of a scene that cannot be loaded, which others tell."""
+    silent = lambda line: None  # noqa: E731
+    try:
+        scene = load_scene(subject.source, images=subject.folder, memory=photo_memory(), report=silent)
+    except InputError:
+        return
+    device = launch.prepare("auto", 0)
+    runs = {name: TrainConfig(**options) for name, options in RUNS.items()}
+    trials = {name: Trainer(scene, config.changed(settle_from_iter=1)) for name, config in runs.items()}  # none grows
+    for trial in trials.values():
+        trial.warm_up()
+    told = {name: describe(trial) if device.type == "cpu" else ("", True) for name, trial in trials.items()}
+    for name, config in runs.items():
+        (text, fits), trial = told[name], trials.pop(name)
+        if fits:
+            task = task_of(config, scene, trial.photographs.shares)
+            seconds, steps = seconds_of(config, cost_of(trial, task, silent), task), config.learn.iterations
+            time = f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+            text = f"about {time} for {steps} steps. {text}".rstrip()
+        yield Finding("forecast", "note" if fits else "warning", f"{name}: {text}")
