@@ -38,7 +38,8 @@ def count_steps(scene, budget, **options):
 def test_it_ends_with_exactly_as_many_as_asked_for(budget, until, scene):
     _, found = count_steps(scene, budget, densify_until_iter=until, opacity_lr=0.3)  # some fade away meanwhile
     assert found[-1] == budget and found == sorted(found, reverse=budget < POINTS) and found[19] == POINTS
-    due = [round(POINTS + (budget - POINTS) * (step / (min(until, 50) - 10)) ** 0.5) for step in (10, 20)]
+    shares = [(step / (min(until, 50) - 10)) ** 0.5 if budget > POINTS else 1 for step in (10, 20)]
+    due = [round(POINTS + (budget - POINTS) * share) for share in shares]
     assert [found[20], found[30]] == due
 
 
@@ -71,7 +72,7 @@ def test_a_budget_has_to_be_named(flags, growth, least, fails, tmp_path):
     [
         (POINTS, 45, ""),
         (2 * POINTS, 21, ""),
-        (4000, 45, f"The faintest of {POINTS} Gaussians go, until there are --max_gaussians 4000."),
+        (4000, 45, f"Of {POINTS} Gaussians, --max_gaussians 4000 are left at the first densification."),
         (
             9001,
             21,

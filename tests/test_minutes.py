@@ -32,7 +32,7 @@ from warp_splat.training.plan import (
 from warp_splat.training.record import keep, restore
 
 FAST = parse(["train", "-s", "x", "--preset", "fast"])
-TASK, COST = Task(500_000, 10_000, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.004, 3e-7, 5e-8)
+TASK, COST = Task(500_000, 10_000, 1, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.004, 3e-7, 5e-8)
 
 
 def test_costs_are_found_again():
@@ -44,23 +44,30 @@ def test_costs_are_found_again():
     assert min(noisy) >= 0
 
 
-@pytest.mark.parametrize("factor", [0.1, 1.0, 3.7])
-def test_seconds_are_those_of_the_steps_added_up(factor):
-    config = of_length(FAST, factor, TASK)
+@pytest.mark.parametrize(
+    ("factor", "start", "least"),
+    [(0.1, 10_000, 1), (1.0, 10_000, 1), (3.7, 10_000, 1), (0.1, 80_000, 1), (0.1, 80_000, 80_000)],
+)
+def test_seconds_are_those_of_the_steps_added_up(factor, start, least):
+    """Of more points than a plan has Gaussians, as many start; a file of Gaussians stays whole."""
+    task = TASK._replace(start=start, least=least)
+    config = of_length(FAST, factor, task)
     learn, expected = config.learn, 0.0
+    assert config.grow.max_gaussians == max(round(TASK.most * min(factor, 1) ** 0.5), least)
     for step in range(1, learn.iterations + 1):
         side = [4, 2, 1][sum(step >= learn.coarse_until_iter * share for share in TASK.shares)]
         share = min(step / (learn.iterations - learn.cooldown), 1.0)
-        gaussians = TASK.start + share * (config.grow.max_gaussians - TASK.start)
+        begin = min(start, config.grow.max_gaussians)
+        gaussians = begin + share * (config.grow.max_gaussians - begin)
         expected += COST.step + COST.gaussian * gaussians + COST.pixel * TASK.pixels / side**2
-    assert seconds_of(config, COST, TASK) == pytest.approx(expected, rel=0.01)
+    assert seconds_of(config, COST, task) == pytest.approx(expected, rel=0.01)
 
 
 @pytest.mark.parametrize("minutes", [0.2, 1, 5, 60])
 def test_plans_take_their_time_and_keep_the_shape(minutes):
     plan = plan_for(FAST, COST, 60.0 * minutes, TASK)
     assert 0.99 * 60 * minutes < seconds_of(plan, COST, TASK) <= 60 * minutes
-    assert TASK.start <= plan.grow.max_gaussians <= TASK.most
+    assert TASK.least <= plan.grow.max_gaussians <= TASK.most
     factor = plan.learn.iterations / FAST.learn.iterations
     before, after = schedule_of(FAST), schedule_of(plan)
     for name, value in before.items():

@@ -9,7 +9,7 @@ from warp_splat.config import InspectConfig
 from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import check_output
 from warp_splat.inspect import geometry, verdicts
-from warp_splat.inspect.forecast import check_cost
+from warp_splat.inspect.cost import check_cost
 from warp_splat.inspect.page import draw_pictures, write_page
 from warp_splat.inspect.subject import Finding, read_subject
 from warp_splat.scene import has_cameras, read_photos

@@ -15,6 +15,7 @@ import numpy as np
 
 from warp_splat.flags import flags_of
 from warp_splat.scene.types import Scene
+from warp_splat.training.growth import GROWTHS
 from warp_splat.training.memory import expected_gaussians
 from warp_splat.training.options import TrainConfig, schedule_of
 from warp_splat.training.photographs import shrink_at
@@ -58,7 +59,8 @@ class Task(NamedTuple):
     """What of a scene a plan depends on."""
 
     pixels: int  # of a photograph at its full size
-    start: int  # Gaussians at the start
+    start: int  # Gaussians at the start, where a plan has as many
+    least: int  # that a plan has: all, of --start_ply and of growths that do not shrink
     most: int  # Gaussians that the shape is made for
     shares: tuple[float, ...]  # of --coarse_until_iter, where sizes end
 
@@ -67,8 +69,10 @@ def task_of(config: TrainConfig, scene: Scene, shares: tuple[float, ...]) -> Tas
     """Of a scene; ``shares`` as :func:`shares_of_size` gives them."""
     camera = scene.train[0].camera
     pixels = camera.width * camera.height
-    start = len(scene.start.splats.means) if scene.start else len(scene.points)
-    return Task(pixels, start, config.grow.max_gaussians or expected_gaussians(start, pixels)[0], shares)
+    start = len(scene.points)  # those of --start_ply are its Gaussians' centers
+    shrinks = getattr(GROWTHS[config.grow.growth].load(), "shrinks", False) and not scene.start
+    least = 1 if shrinks else start
+    return Task(pixels, start, least, config.grow.max_gaussians or expected_gaussians(start, pixels)[0], shares)
 
 
 def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:
@@ -77,8 +81,9 @@ def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:
     steps = (np.arange(SAMPLES) + 0.5) * learn.iterations / SAMPLES
     sides = 1.0 / np.array([shrink_at(learn, task.shares, step) for step in steps])
     grown = np.minimum(steps / max(learn.iterations - learn.cooldown, 1), 1.0)
-    most = max(config.grow.max_gaussians or task.most, task.start)
-    gaussians = task.start + grown * (most - task.start)
+    most = max(config.grow.max_gaussians or task.most, task.least)
+    start = min(task.start, most)
+    gaussians = start + grown * (most - start)
     each = cost.step + cost.gaussian * gaussians + cost.pixel * task.pixels * sides**2
     return float(each.mean()) * learn.iterations
 
@@ -90,11 +95,11 @@ def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
     steps["cooldown"] = steps["cooldown"] or round(COOLDOWN * steps["iterations"])
     steps = {name: max(round(factor * value), least[name]) if value > 0 else value for name, value in steps.items()}
     shorter = min(factor, 1.0) ** 0.5
-    most = max(round(task.most * shorter), task.start)
+    most = max(round(task.most * shorter), task.least)
     quicker = min(1.0 / shorter, QUICKEST)
     rates = {name: float(f"{quicker * getattr(config.learn, name):.3g}") for name in RATES if factor < 1}
     steps["settle_from_iter"] = 0  # the clock says when to settle
-    interval, doublings = config.flat()["densification_interval"], math.ceil(math.log2(most / max(task.start, 1)))
+    interval, doublings = config.flat()["densification_interval"], math.ceil(math.log2(most / min(task.start, most)))
     window = steps["densify_until_iter"] - 1 - max(steps["densify_from_iter"], 0)
     interval = min(interval, max(window // max(doublings, 1), 1))
     return config.changed(**steps, **rates, max_gaussians=most, densification_interval=interval)

@@ -20,7 +20,9 @@ CLEAREST = 1e-12  # floor of opacities and transmittances, whose logarithms are 
 
 
 class Budget(Reference):
-    """Exactly ``--max_gaussians`` by the end of densification, along a square root of the steps."""
+    """Exactly ``--max_gaussians`` by the end of densification, along a square root of the steps; of more, at once."""
+
+    shrinks = True  # to that number, where there are more at the start
 
     def __init__(self, options: ReferenceOptions, setting: Setting, optimizer: Optimizer):
         super().__init__(options, setting, optimizer)
@@ -35,7 +37,7 @@ class Budget(Reference):
         if not doublings and budget != self.start:
             return [f"Warning: no densification before step {self.end}: there will be {self.start} Gaussians as now."]
         if budget < self.start:
-            return [f"The faintest of {self.start} Gaussians go, until there are --max_gaussians {budget}."]
+            return [f"Of {self.start} Gaussians, --max_gaussians {budget} are left at the first densification."]
         if budget > self.start * 2 ** min(doublings, 99):
             most = f"{doublings} densifications double {self.start} to {self.start * 2**doublings}"
             return [f"Warning: --max_gaussians {budget} will not be reached, since {most} at most."]
@@ -50,12 +52,13 @@ class Budget(Reference):
 
     def _due(self, iteration: int) -> int:
         """Gaussians that there are to be after the densification of this step."""
-        options, step = self.options, self.processes.images
+        options, step, most = self.options, self.processes.images, self.setting.max_gaussians
         following = (iteration // options.densification_interval + 1) * options.densification_interval
-        if -(-following // step) * step >= self.end:  # this is the last one
-            return self.setting.max_gaussians
+        # at once, where there are too many: those that stay have the time to move to where they are lacking
+        if most < self.start or -(-following // step) * step >= self.end:
+            return most
         share = math.sqrt((iteration - options.densify_from_iter) / (self.end - options.densify_from_iter))
-        return self.start + round((self.setting.max_gaussians - self.start) * share)
+        return self.start + round((most - self.start) * share)
 
     def _grow(self, due: int) -> Change | None:
         self.processes.merge(self.gradient)
