@@ -1,5 +1,6 @@
 """A training for a given time: plans against their own steps added up, ends by false clocks, the same bytes again."""
 
+import dataclasses
 import json
 import tomllib
 
@@ -28,6 +29,7 @@ from warp_splat.training.plan import (
     of_length,
     plan_for,
     seconds_of,
+    task_of,
 )
 from warp_splat.training.record import keep, restore
 
@@ -52,15 +54,28 @@ def test_seconds_are_those_of_the_steps_added_up(factor, start, least):
     """Of more points than a plan has Gaussians, as many start; a file of Gaussians stays whole."""
     task = TASK._replace(start=start, least=least)
     config = of_length(FAST, factor, task)
-    learn, expected = config.learn, 0.0
+    learn, options, expected = config.learn, config.plugins["budget"], 0.0
     assert config.grow.max_gaussians == max(round(TASK.most * min(factor, 1) ** 0.5), least)
     for step in range(1, learn.iterations + 1):
         side = [4, 2, 1][sum(step >= learn.coarse_until_iter * share for share in TASK.shares)]
-        share = min(step / (learn.iterations - learn.cooldown), 1.0)
+        done = min(
+            max((step - options.densify_from_iter) / (options.densify_until_iter - options.densify_from_iter), 0), 1
+        )
+        share = min(max(done, 0), 1) ** 0.5
         begin = min(start, config.grow.max_gaussians)
         gaussians = begin + share * (config.grow.max_gaussians - begin)
         expected += COST.step + COST.gaussian * gaussians + COST.pixel * TASK.pixels / side**2
     assert seconds_of(config, COST, task) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("growth", "least"), [("budget", 1), ("reference", 4500), ("mcmc", 4500)])
+def test_points_beyond_a_limit_go_where_a_growth_shrinks(growth, least, scene):
+    """A plan has then no more Gaussians than it is allowed, and a file of Gaussians stays whole."""
+    config = TrainConfig(growth=growth, max_gaussians=1000)
+    task = task_of(config, scene, ())
+    assert (task.start, task.least, task.most) == (4500, least, 1000)
+    assert of_length(config, 0.25, task).grow.max_gaussians == max(500, least)
+    assert task_of(config, dataclasses.replace(scene, start=object()), ()).least == 4500
 
 
 @pytest.mark.parametrize("minutes", [0.2, 1, 5, 60])

@@ -22,6 +22,7 @@ REACHED = Path(__file__).with_name("reached.json")  # what benchmarks/minutes.py
 REPEATS = 5  # steps of which one is timed: their median
 WINDOW = 20  # parts of a training: as far back as the pace is looked at, which is from one evaluation to the next
 FEWEST = 10  # steps by which a pace is known
+WIDER = 1.35  # edge of a Gaussian that was trained, times that of a copy that covers as much as one of the start's
 KEPT = 4  # a cooldown is never shorter than one part in so many of the planned one
 
 
@@ -126,10 +127,10 @@ def _of_step(trial: Trainer, iteration: int) -> StepTime:
 
 
 def _multiply(trial: Trainer, count: int) -> None:
-    """Copies of the Gaussians, smaller, so that together they cover as much as before: what growth makes of them."""
+    """Copies of the Gaussians, smaller, but together they cover more than before, as what growth makes of them does."""
     present = len(trial.model)
     raw = {name: tensor.detach() for name, tensor in trial.model.parameters.items()}
-    raw["scales"].sub_(0.5 * torch.log(torch.tensor(count / present)).item())
+    raw["scales"].add_(math.log(WIDER / math.sqrt(count / present)))
     rows = torch.arange(count - present, device=trial.device) % present
     everything = torch.arange(present, device=trial.device)
     trial.optimizer.replace(everything, {name: tensor[rows] for name, tensor in raw.items()})

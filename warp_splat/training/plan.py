@@ -76,11 +76,12 @@ def task_of(config: TrainConfig, scene: Scene, shares: tuple[float, ...]) -> Tas
 
 
 def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:
-    """What a training takes by the costs of its steps; Gaussians are added evenly until the cooldown."""
-    learn = config.learn
+    """What a training takes by the costs of its steps; Gaussians are added as the square root of the steps that do."""
+    learn, options = config.learn, config.flat()
     steps = (np.arange(SAMPLES) + 0.5) * learn.iterations / SAMPLES
     sides = 1.0 / np.array([shrink_at(learn, task.shares, step) for step in steps])
-    grown = np.minimum(steps / max(learn.iterations - learn.cooldown, 1), 1.0)
+    begin, end = options["densify_from_iter"], min(options["densify_until_iter"], learn.iterations)
+    grown = np.sqrt(((steps - begin) / max(end - begin, 1)).clip(0.0, 1.0))
     most = max(config.grow.max_gaussians or task.most, task.least)
     start = min(task.start, most)
     gaussians = start + grown * (most - start)
