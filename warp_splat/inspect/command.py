@@ -37,8 +37,7 @@ def inspect(config: InspectConfig) -> int:
     subject, findings = read_subject(source, config.images)
     for check in (verdicts.check_cameras, *geometry.CHECKS, *verdicts.CHECKS):
         findings += check(subject)
-    print("Trying a few steps (kernels are compiled once on a machine, about 20 s) ...")
-    findings += check_cost(subject)
+    findings += check_cost(subject, print)
     findings.sort(key=lambda finding: list(COLORS).index(finding.level))
     verdict = _verdict(findings)
     write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))

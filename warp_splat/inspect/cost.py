@@ -5,9 +5,11 @@ from collections.abc import Iterator
 from warp_splat.errors import InputError
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.presets import PRESETS
+from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch
 from warp_splat.scene import load_scene
 from warp_splat.scene.decoding import photo_memory
+from warp_splat.text import Report
 from warp_splat.training.deadline import cost_of
 from warp_splat.training.memory import describe
 from warp_splat.training.options import TrainConfig
@@ -17,15 +19,16 @@ from warp_splat.training.trainer import Trainer
 RUNS = {"--preset fast": PRESETS["fast"], "the default": PRESETS[""]}
 
 
-def check_cost(subject: Subject) -> Iterator[Finding]:
+def check_cost(subject: Subject, say: Report) -> Iterator[Finding]:
     """Memory and time of a training by each of RUNS. None of a scene that cannot be loaded, which others tell."""
     silent = lambda line: None  # noqa: E731
     try:
         scene = load_scene(subject.source, images=subject.folder, memory=photo_memory(), report=silent)
     except InputError:
         return
-    device = launch.prepare("auto", 0)
-    runs = {name: TrainConfig(**options) for name, options in RUNS.items()}
+    say("Trying a few steps (kernels are compiled once on a machine, about 20 s) ...")
+    device = settle_device(launch.prepare("auto", 0), "auto", say=say)
+    runs = {name: TrainConfig(**options, device=device.type) for name, options in RUNS.items()}
     trials = {name: Trainer(scene, config.changed(settle_from_iter=1)) for name, config in runs.items()}  # none grows
     for trial in trials.values():
         trial.warm_up()

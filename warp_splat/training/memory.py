@@ -62,10 +62,7 @@ def describe(trainer: "Trainer") -> tuple[str, bool]:
     count, reason = expected_gaussians(len(trainer.model), pixels, limit, grows)
     if trainer.optimizer.folder:
         size = 3 * FLOAT * sum(leaf[0].numel() for leaf in trainer.model.parameters.values()) * count
-        return (
-            f"{count} Gaussians ({reason}) take {size / GIB:.1f} GiB on the disk, memory where views show them.",
-            True,
-        )
+        return f"{count} Gaussians ({reason}) take {size / GIB:.1f} GiB of disk, memory where views show them.", True
     masked = any(view.mask is not None for view in scene.train)
     composited = any(having(trainer.parts, "reads_alpha")) and any(view.alpha is not None for view in scene.train)
     per_pixel = pixel_floats(masked, composited, scene.linear)
