@@ -1,5 +1,6 @@
 """The memory that is forecast is the memory that is taken, and the user is told on what grounds."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ import scaling
 from trainings import Pretended
 
 from warp_splat.camera import Camera
-from warp_splat.scene.types import Decoded, Scene, View
+from warp_splat.scene.types import Decoded, PhotoMemory, Scene, View
 from warp_splat.training import memory
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -44,7 +45,7 @@ def test_forecast_is_what_a_step_takes(point, kinds):
     ("options", "count", "reason"),
     [
         ({"max_gaussians": 70_000}, 70_000, "(--max_gaussians)."),
-        ({"max_gaussians": 70}, 5000, "(--max_gaussians)."),
+        ({"max_gaussians": 70}, 5000, "(as at the beginning)."),
         ({"iterations": 400}, 5000, "(as at the beginning)"),
         ({"densify_until_iter": 0, "max_gaussians": 70_000}, 5000, "(as at the beginning)."),
         ({}, 120_000, "for 2 px of a photograph; --max_gaussians limits them), 1.7 GiB more for each further million."),
@@ -53,6 +54,15 @@ def test_forecast_is_what_a_step_takes(point, kinds):
 def test_grounds(scene, options, count, reason):
     told, _ = memory.describe(Trainer(scene, TrainConfig(device="cpu", **options)))
     assert told.startswith("About ") and f" at {count} Gaussians (" in told and reason in told
+
+
+def test_photographs_that_are_decoded_later_count(scene):
+    told = []
+    for later in (0.0, 3.0 * memory.GIB):
+        some = dataclasses.replace(scene, memory=PhotoMemory(later=later))
+        told.append(memory.describe(Trainer(some, TrainConfig(device="cpu", iterations=400)))[0])
+    few, many = (float(text.split()[1]) for text in told)
+    assert many - few == pytest.approx(3.0, abs=0.11)
 
 
 def test_what_does_not_fit_is_told(scene, monkeypatch):

@@ -12,7 +12,7 @@ from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, wri
 from test_scene_input import BAD
 
 from warp_splat.cli import main
-from warp_splat.inspect import geometry
+from warp_splat.inspect import cost, geometry
 from warp_splat.inspect.subject import read_subject
 from warp_splat.scene import load_scene
 from warp_splat.sfm import stages
@@ -261,8 +261,11 @@ def test_a_few_steps_tell_how_long_a_training_takes(tmp_path, capsys, monkeypatc
         return [(level, text) for level, check, text in examine(SCENE, tmp_path, capsys, 0)[0] if check == "forecast"]
 
     (fast, first), (plain, second) = told()
-    assert fast == plain == "note" and first.startswith("--preset fast: about 30.0 min for 3600 steps. About ")
+    assert fast == plain == "note" and first.startswith("--preset fast: about 30 min for 3600 steps. About ")
     assert " at 100000 Gaussians (--max_gaussians)." in first and "the default: about 4.2 h for 30000 steps." in second
+    with monkeypatch.context() as context:
+        context.setattr(cost, "cost_of", lambda *_: bytearray(2**62))
+        assert told()[-1][0] == "warning" and told()[-1][1].startswith("Out of memory on cpu between two stages, with ")
     monkeypatch.setattr(memory, "available_memory", lambda device: 0)
     assert all(level == "warning" and " min " not in text and "Only " in text for level, text in told())
     broken = shutil.copytree(SCENE, tmp_path / "broken")

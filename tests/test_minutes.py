@@ -58,9 +58,7 @@ def test_seconds_are_those_of_the_steps_added_up(factor, start, least):
     assert config.grow.max_gaussians == max(round(TASK.most * min(factor, 1) ** 0.5), least)
     for step in range(1, learn.iterations + 1):
         side = [4, 2, 1][sum(step >= learn.coarse_until_iter * share for share in TASK.shares)]
-        done = min(
-            max((step - options.densify_from_iter) / (options.densify_until_iter - options.densify_from_iter), 0), 1
-        )
+        done = (step - options.densify_from_iter) / (options.densify_until_iter - options.densify_from_iter)
         share = min(max(done, 0), 1) ** 0.5
         begin = min(start, config.grow.max_gaussians)
         gaussians = begin + share * (config.grow.max_gaussians - begin)
@@ -68,13 +66,16 @@ def test_seconds_are_those_of_the_steps_added_up(factor, start, least):
     assert seconds_of(config, COST, task) == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize(("growth", "least"), [("budget", 1), ("reference", 4500), ("mcmc", 4500)])
+@pytest.mark.parametrize(("growth", "least"), [("budget", 1000), ("reference", 4500), ("mcmc", 4500)])
 def test_points_beyond_a_limit_go_where_a_growth_shrinks(growth, least, scene):
-    """A plan has then no more Gaussians than it is allowed, and a file of Gaussians stays whole."""
+    """Early, and a plan has no more Gaussians than it is allowed; a file of Gaussians stays whole."""
     config = TrainConfig(growth=growth, max_gaussians=1000)
     task = task_of(config, scene, ())
     assert (task.start, task.least, task.most) == (4500, least, 1000)
-    assert of_length(config, 0.25, task).grow.max_gaussians == max(500, least)
+    plan = of_length(config, 0.02, task)
+    options = plan.plugins["budget"]
+    assert plan.grow.max_gaussians == least
+    assert options.densify_from_iter + options.densification_interval < options.densify_until_iter / 2
     assert task_of(config, dataclasses.replace(scene, start=object()), ()).least == 4500
 
 

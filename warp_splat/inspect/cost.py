@@ -2,12 +2,15 @@
 
 from collections.abc import Iterator
 
+import torch
+
 from warp_splat.errors import InputError
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.presets import PRESETS
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import launch
-from warp_splat.scene import load_scene
+from warp_splat.runtime.devices import memory_explained
+from warp_splat.scene import Scene, load_scene
 from warp_splat.scene.decoding import photo_memory
 from warp_splat.text import Report
 from warp_splat.training.deadline import cost_of
@@ -21,13 +24,21 @@ RUNS = {"--preset fast": PRESETS["fast"], "the default": PRESETS[""]}
 
 def check_cost(subject: Subject, say: Report) -> Iterator[Finding]:
     """Memory and time of a training by each of RUNS. None of a scene that cannot be loaded, which others tell."""
-    silent = lambda line: None  # noqa: E731
     try:
-        scene = load_scene(subject.source, images=subject.folder, memory=photo_memory(), report=silent)
+        scene = load_scene(subject.source, images=subject.folder, memory=photo_memory(), report=str)
     except InputError:
         return
     say("Trying a few steps (kernels are compiled once on a machine, about 20 s) ...")
     device = settle_device(launch.prepare("auto", 0), "auto", say=say)
+    sizes = [(view.camera.width, view.camera.height) for view in scene.train]
+    try:
+        with memory_explained(device, scene.points, sizes, "take smaller images (-r), or fewer Gaussians"):
+            yield from _tried(scene, device)
+    except InputError as error:
+        yield Finding("forecast", "warning", str(error))
+
+
+def _tried(scene: Scene, device: torch.device) -> Iterator[Finding]:
     runs = {name: TrainConfig(**options, device=device.type) for name, options in RUNS.items()}
     trials = {name: Trainer(scene, config.changed(settle_from_iter=1)) for name, config in runs.items()}  # none grows
     for trial in trials.values():
@@ -37,7 +48,7 @@ def check_cost(subject: Subject, say: Report) -> Iterator[Finding]:
         (text, fits), trial = told[name], trials.pop(name)
         if fits:
             task = task_of(config, scene, trial.photographs.shares)
-            seconds, steps = seconds_of(config, cost_of(trial, task, silent), task), config.learn.iterations
-            time = f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+            seconds, steps = seconds_of(config, cost_of(trial, task, str), task), config.learn.iterations
+            time = f"{seconds / 60:.{int(seconds < 600)}f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
             text = f"about {time} for {steps} steps. {text}".rstrip()
         yield Finding("forecast", "note" if fits else "warning", f"{name}: {text}")

@@ -105,11 +105,11 @@ def cost_of(trial: Trainer, task: Task, say: Callable[[str], None]) -> Cost:
 
 
 def _measured(trial: Trainer, task: Task) -> list[StepTime]:
-    """Steps of the smallest size and the full one, and of as many Gaussians as there may be."""
+    """Steps of the smallest size and the full one, and of as many Gaussians as there will be."""
     end = trial.config.learn.iterations
     found = [_of_step(trial, 1), _of_step(trial, end)]
-    if task.most > task.start:
-        _multiply(trial, task.most)
+    if (most := max(task.most, task.least)) != task.start:
+        _resize(trial, most)
         found.append(_of_step(trial, end))
     return found
 
@@ -126,11 +126,10 @@ def _of_step(trial: Trainer, iteration: int) -> StepTime:
     return StepTime(len(trial.model), camera.width * camera.height, statistics.median(seconds[1:]))
 
 
-def _multiply(trial: Trainer, count: int) -> None:
-    """Copies of the Gaussians, smaller, but together they cover more than before, as what growth makes of them does."""
+def _resize(trial: Trainer, count: int) -> None:
+    """Copies of the Gaussians, or some of them, of a size that together covers as much as those that are trained do."""
     present = len(trial.model)
     raw = {name: tensor.detach() for name, tensor in trial.model.parameters.items()}
     raw["scales"].add_(math.log(WIDER / math.sqrt(count / present)))
-    rows = torch.arange(count - present, device=trial.device) % present
-    everything = torch.arange(present, device=trial.device)
-    trial.optimizer.replace(everything, {name: tensor[rows] for name, tensor in raw.items()})
+    rows = torch.arange(count, device=trial.device) * present // count
+    trial.optimizer.replace(rows[:0], {name: tensor[rows] for name, tensor in raw.items()})

@@ -90,6 +90,6 @@ def expected_gaussians(beginning: int, pixels: int, limit: int = 0, grows: bool 
     if not grows:
         return beginning, "as at the beginning"
     if limit:
-        return max(beginning, limit), "--max_gaussians"
+        return (limit, "--max_gaussians") if limit >= beginning else (beginning, "as at the beginning")
     guess = max(beginning, pixels // PIXELS)
     return guess, f"guessed: one for {PIXELS} px of a photograph; --max_gaussians limits them"

@@ -112,9 +112,7 @@ class LearnOptions:
 class GrowOptions:
     """How the set grows; each growth has options of its own."""
 
-    max_gaussians: int = flag(
-        0, "never grow beyond this many (largest gradients first), but keep all starting points; 0: no limit"
-    )
+    max_gaussians: int = flag(0, "never grow beyond this many (--growth budget: shrink to it, too); 0: no limit")
 
     growth: str = growing("reference", f"the rules: {', '.join(GROWTHS)}")
 

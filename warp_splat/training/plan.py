@@ -25,6 +25,7 @@ SHORTEST, LONGEST = 1e-4, 1e4  # times the shape
 SAMPLES = 1000  # steps whose costs are added up
 RATES = ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr")
 QUICKEST = 2.0  # times the rates of the shape; four times lost 1 to 8 dB (benchmarks/short_plans.py)
+EARLY = 4  # densifications of a plan with too many points, at least: the first one takes the rest away
 LIKE = 1.5  # factor between the steps and between the pixels of two trainings, up to which they are comparable
 
 
@@ -60,7 +61,7 @@ class Task(NamedTuple):
 
     pixels: int  # of a photograph at its full size
     start: int  # Gaussians at the start, where a plan has as many
-    least: int  # that a plan has: all, of --start_ply and of growths that do not shrink
+    least: int  # that a plan has: as many, where a growth shrinks not beyond what is allowed
     most: int  # Gaussians that the shape is made for
     shares: tuple[float, ...]  # of --coarse_until_iter, where sizes end
 
@@ -70,9 +71,9 @@ def task_of(config: TrainConfig, scene: Scene, shares: tuple[float, ...]) -> Tas
     camera = scene.train[0].camera
     pixels = camera.width * camera.height
     start = len(scene.points)  # those of --start_ply are its Gaussians' centers
+    most = config.grow.max_gaussians or expected_gaussians(start, pixels)[0]
     shrinks = getattr(GROWTHS[config.grow.growth].load(), "shrinks", False) and not scene.start
-    least = 1 if shrinks else start
-    return Task(pixels, start, least, config.grow.max_gaussians or expected_gaussians(start, pixels)[0], shares)
+    return Task(pixels, start, min(start, most) if shrinks else start, most, shares)
 
 
 def seconds_of(config: TrainConfig, cost: Cost, task: Task) -> float:
@@ -100,7 +101,8 @@ def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
     quicker = min(1.0 / shorter, QUICKEST)
     rates = {name: float(f"{quicker * getattr(config.learn, name):.3g}") for name in RATES if factor < 1}
     steps["settle_from_iter"] = 0  # the clock says when to settle
-    interval, doublings = config.flat()["densification_interval"], math.ceil(math.log2(most / min(task.start, most)))
+    interval = config.flat()["densification_interval"]
+    doublings = math.ceil(math.log2(most / task.start)) if most >= task.start else EARLY
     window = steps["densify_until_iter"] - 1 - max(steps["densify_from_iter"], 0)
     interval = min(interval, max(window // max(doublings, 1), 1))
     return config.changed(**steps, **rates, max_gaussians=most, densification_interval=interval)
