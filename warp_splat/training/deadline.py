@@ -22,7 +22,7 @@ REACHED = Path(__file__).with_name("reached.json")  # what benchmarks/minutes.py
 REPEATS = 5  # steps of which one is timed: their median
 WINDOW = 20  # parts of a training: as far back as the pace is looked at, which is from one evaluation to the next
 FEWEST = 10  # steps by which a pace is known
-WIDER = 1.35  # edge of a Gaussian that was trained, times that of a copy that covers as much as one of the start's
+WIDER = 1.35  # than copies that cover what the start does: so they take 0.8 to 1.05 of trained ones' time (4 scenes)
 KEPT = 4  # a cooldown is never shorter than one part in so many of the planned one
 
 
@@ -127,7 +127,7 @@ def _of_step(trial: Trainer, iteration: int) -> StepTime:
 
 
 def _resize(trial: Trainer, count: int) -> None:
-    """Copies of the Gaussians, or some of them, of a size that together covers as much as those that are trained do."""
+    """Copies of the Gaussians, or some of them, so wide that a step takes about what it will with trained ones."""
     present = len(trial.model)
     raw = {name: tensor.detach() for name, tensor in trial.model.parameters.items()}
     raw["scales"].add_(math.log(WIDER / math.sqrt(count / present)))

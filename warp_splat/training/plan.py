@@ -61,7 +61,7 @@ class Task(NamedTuple):
 
     pixels: int  # of a photograph at its full size
     start: int  # Gaussians at the start, where a plan has as many
-    least: int  # that a plan has: as many, where a growth shrinks not beyond what is allowed
+    least: int  # that a plan has: those of the start, but where a growth shrinks, not more than are allowed
     most: int  # Gaussians that the shape is made for
     shares: tuple[float, ...]  # of --coarse_until_iter, where sizes end
 
