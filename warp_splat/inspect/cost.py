@@ -35,7 +35,7 @@ def check_cost(subject: Subject, say: Report) -> Iterator[Finding]:
         with memory_explained(device, scene.points, sizes, "take smaller images (-r), or fewer Gaussians"):
             yield from _tried(scene, device)
     except InputError as error:
-        yield Finding("forecast", "warning", str(error))
+        yield Finding("forecast", "warning", f"no more can be tried: {error}")
 
 
 def _tried(scene: Scene, device: torch.device) -> Iterator[Finding]:

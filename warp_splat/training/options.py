@@ -112,7 +112,7 @@ class LearnOptions:
 class GrowOptions:
     """How the set grows; each growth has options of its own."""
 
-    max_gaussians: int = flag(0, "never grow beyond this many (--growth budget: shrink to it, too); 0: no limit")
+    max_gaussians: int = flag(0, "growth ends at this many; more points stay, unless --growth is budget; 0: no limit")
 
     growth: str = growing("reference", f"the rules: {', '.join(GROWTHS)}")
 
