@@ -173,8 +173,7 @@ def check_axes(subject: Subject) -> Iterator[Finding]:
         return
     points = sample(subject.points, 2000)
     photos = sample(subject.photos, VIEWS)
-    count = lambda turn: sum(np.count_nonzero(visible(turn(photo.camera), points)) for photo in photos)  # noqa: E731
-    seen = {name: count(turn) for name, turn in TURNS.items()}
+    seen = {name: sum(visible(turn(photo.camera), points).sum() for photo in photos) for name, turn in TURNS.items()}
     best = max(seen, key=lambda name: seen[name])
     shares = ", ".join(f"{name} {100 * count / (len(points) * len(photos)):.0f} %" for name, count in seen.items())
     if seen[best] > BETTER * seen["as stored"]:

@@ -51,9 +51,8 @@ def sfm(config: SfmConfig) -> int:
     require_pycolmap("warp-splat sfm")
     if not (source.is_dir() or is_video(source)):
         found = f"a file ending in {source.suffix!r}" if source.is_file() else "nothing"
-        endings = ", ".join(VIDEOS)
         raise InputError(
-            f"{source}: expected a folder of photographs or a video ({endings}), found {found}; check the path."
+            f"{source}: expected a folder of photographs or a video ({', '.join(VIDEOS)}), found {found}; name one."
         )
     if config.coordinates not in ("auto", "none"):
         read_places(Path(config.coordinates))  # hours before it is needed

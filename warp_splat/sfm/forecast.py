@@ -2,6 +2,7 @@
 
 import tempfile
 import time
+from itertools import combinations
 from pathlib import Path
 
 from warp_splat.config import CORES, SfmConfig
@@ -9,56 +10,62 @@ from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.scene.photos import PHOTOS, find_files, photo_root
 from warp_splat.sfm import stages
-from warp_splat.sfm.matching import match, pairs_compared
+from warp_splat.sfm.mapping import MANY
+from warp_splat.sfm.matching import match_pairs, pairs_compared
 from warp_splat.text import Report
 
-TRIED = 6  # photographs, of which each pair is matched
-LEAST = 30  # of fewer a trial would take too large a share of the work itself
-# Seconds of mapping for each feature, divided by the cube root of how many photographs there are: the least and the
-# most of eight captures of 25 to 3,000 (Intel Xeon). A loop in one room and a blurred video take the most.
-MAPPING = 3e-5, 1.4e-4
+# Of photographs at these places each pair is matched: a Golomb ruler, whose distances are as often small as large.
+RULER = (0, 1, 4, 10, 12, 17)
+NEAR = 27  # by name, the farthest apart of those tried, where those that look alike are compared
+LEAST = 30  # photographs; of fewer a trial would take too large a share of the work itself
+# Seconds of mapping, global and incremental, for one of features, divided by the cube root of how many photographs
+# there are. Of sound captures of 25 to 1,000: 0.25 to 0.37 and 0.11 to 0.25. Where half fits nowhere, up to four times.
+GLOBAL, INCREMENTAL = 0.3, 0.15
 OF_FEATURE = 2048  # bytes in mapping, for each: 0.92 to 1.04 of the peaks of four captures of 25 to 1,000 photographs
 
 
 def time_of_cameras(source: Path, say: Report) -> None:
     """Say what ``warp-splat sfm`` takes with the photographs below ``source``; nothing if that cannot be told.
 
-    Features and pairs of TRIED photographs are timed on this machine. The time of mapping is known by its order only.
+    Features and pairs of some photographs are timed on this machine, and mapping goes by the features.
     """
     root = photo_root(source)
     names = find_files(root, PHOTOS)
     count = len(names)
     if pycolmap is None or count < LEAST:
         return
-    say(f"Trying {TRIED} of {count} photographs ...")
+    matching, pairs = pairs_compared("auto", count)
+    spans, span = (1, count - 1) if matching == "exhaustive" else (2, NEAR)
+    starts = [(count - 1 - span) * (2 * place + 1) // (2 * spans) for place in range(spans)]
+    tried = [[names[start + round(mark / RULER[-1] * span)] for mark in RULER] for start in starts]
+    say(f"Trying {spans * len(RULER)} of {count} photographs ...")
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    config = SfmConfig(str(source), "", matching="exhaustive", threads=CORES, quiet=True)
     before = peak_memory() or 0
-    tried = [names[index * count // TRIED] for index in range(TRIED)]
     try:
-        extraction, features, matching = _measured(root, tried, config)
+        extraction, features, matching = _measured(root, tried, SfmConfig(str(source), "", threads=CORES, quiet=True))
     except RuntimeError:  # of pycolmap: no room for temporary files, for one; who needs the cameras will be told
         return
-    _, pairs = pairs_compared("auto", count)
+    mapping = (GLOBAL + INCREMENTAL * (count <= MANY)) * count ** (4 / 3) * extraction / 60  # on one thread
     extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
-    least, most = (extraction + matching + rate * features * count ** (4 / 3) / 60 for rate in MAPPING)
     memory = max(peak_memory() or 0, before + OF_FEATURE * features * count / 2**20) / 1024
     if features:
         say(
-            f"Cameras of {count} photographs will take about {least:.1f} to {most:.1f} min on {CORES} threads: "
-            f"features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping the rest; {memory:.1f} GiB of memory."
+            f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
+            f"threads: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}; "
+            f"{memory:.1f} GiB of memory."
         )
 
 
-def _measured(root: Path, tried: list[str], config: SfmConfig) -> tuple[float, float, float]:
+def _measured(root: Path, tried: list[list[str]], config: SfmConfig) -> tuple[float, float, float]:
     """Seconds of all threads for a photograph, its features, and seconds for a pair, as means of those ``tried``."""
+    pairs = [pair for group in tried for pair in combinations(group, 2)]
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
         began = time.process_time()
-        stages.extract(database, root, [tried], config, folder)
+        stages.extract(database, root, tried, config, folder)
         extracted = time.process_time()
         with stages.opened(database) as connection:
-            features = connection.num_keypoints()
-        match(database, config, print)
+            count, features = sum(map(len, tried)), connection.num_keypoints()
+        match_pairs(database, pairs, len(pairs), config)
         extraction, matching = extracted - began, time.process_time() - extracted
-    return extraction / len(tried), features / len(tried), matching / (len(tried) * (len(tried) - 1) / 2)
+    return extraction / count, features / count, matching / len(pairs)

@@ -43,7 +43,7 @@ def reconstruct(
     if not models.is_dir():
         images, matches = _sizes(database)
         begun = models.with_name("mapping")
-        seconds = SECONDS_PER_MATCH * matches * images ** (1 / 3)
+        seconds = round(SECONDS_PER_MATCH * matches * images ** (1 / 3)) + 1
         mappers = {"global": partial(_map_globally, seconds=seconds), "incremental": _map_stepwise}
         found: dict[str, list[pycolmap.Reconstruction]] = {}
         for name, mapper in mappers.items():
@@ -116,7 +116,7 @@ def _made(folder: Path, make: Callable[[Path], object]) -> list[pycolmap.Reconst
     return sorted(found, key=lambda model: model.num_reg_images(), reverse=True)
 
 
-def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, seconds: float) -> None:
+def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, seconds: int) -> None:
     """Global mapping (GLOMAP, Pan et al. 2024), with focal lengths from the view graph where no file says them."""
     with opened(database) as connection:
         known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
@@ -136,8 +136,7 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
             pycolmap.triangulate_points(model, calibrated, root, part / str(number), options=points)
 
     began = time.monotonic()
-    passed = lambda: int(time.monotonic() - began)  # noqa: E731
-    run_watched("cameras (s)", round(seconds) + 1, work, passed, config.quiet, stops=False)
+    run_watched("cameras (s)", seconds, work, lambda: int(time.monotonic() - began), config.quiet, stops=False)
     (part / database.name).unlink()
 
 

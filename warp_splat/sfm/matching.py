@@ -23,7 +23,7 @@ FAISS_THRESHOLD = "_ZN5faiss31distance_compute_blas_thresholdE"  # queries from 
 # Pairs are matched in blocks of BLOCK x BLOCK, and Ctrl-C is heard in between. Tried:
 # - 36 instead of 42 s for 1,225 pairs of 540 x 960 px: pycolmap's 50
 BLOCK = 10
-TYPICAL = 33  # pairs for each photograph that looks find
+TYPICAL = 30  # pairs for each photograph that looks find
 PER_FEATURE, PER_SQUARE = 7.5e-6, 3.4e-9  # seconds of one thread for a pair (AMD EPYC): of a feature, of its square
 MANY = 100  # photographs from which on "auto" compares those that look alike, and not all
 
@@ -116,7 +116,7 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
     tried, matched = set(), {}
     while pairs:
         tried.update(pairs)
-        _match_pairs(database, [(names[a], names[b]) for a, b in pairs], len(tried), config)
+        match_pairs(database, [(names[a], names[b]) for a, b in pairs], len(tried), config)
         found = {tuple(sorted(map(places.__getitem__, pair))): count for pair, count in fitting(database).items()}
         matched = {pair: count for pair, count in found.items() if pair in tried}
         pairs = looks.beyond(matched, tried)
@@ -124,7 +124,8 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
     say(f"{len(tried)} of {every} pairs of photographs compared, by their looks; {len(matched)} fit")
 
 
-def _match_pairs(database: Path, pairs: list[tuple[str, str]], total: int, config: SfmConfig) -> None:
+def match_pairs(database: Path, pairs: list[tuple[str, str]], total: int, config: SfmConfig) -> None:
+    """Match the ``pairs`` of names; ``total`` are to be there then, for the bar."""
     listed = database.with_name("pairs.txt")
     write_text(listed, "".join(" ".join(name.replace(" ", SPACE) for name in pair) + "\n" for pair in pairs))
     pairing = pycolmap.ImportedPairingOptions(block_size=BLOCK * BLOCK, match_list_path=listed)

@@ -50,9 +50,8 @@ def sample_frames(path: Path, folder: Path, config: SfmConfig, report: Report, a
             if end < 0.9 * told:
                 report(f"warning: the video's pictures end after {end:.1f} of {told:.1f} s: is the file cut off?")
         with av.open(str(path)) as container:
-            frames = enumerate(_decode(container, config.threads, damaged))
             span_of = lambda numbered: min(numbered[0] * count // max(total, 1), count - 1)  # noqa: E731
-            for span, numbered in groupby(frames, span_of):
+            for span, numbered in groupby(enumerate(_decode(container, config.threads, damaged)), span_of):
                 index, frame = max(numbered, key=lambda each: _sharpness_of(each[1]))
                 pixels = np.rot90(frame.to_ndarray(format="rgb24"), round(frame.rotation / 90))
                 with atomic_write(folder / f"frame_{index:06d}.jpg") as temporary:

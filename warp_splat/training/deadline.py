@@ -90,8 +90,7 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
                 f"--minutes {minutes:g}: expected time for one densification at least, found time for {steps} steps "
                 "before the end; give more, or smaller images (-r)."
             )
-    table = [Reached(**entry) for entry in json.loads(REACHED.read_text())] if REACHED.is_file() else []
-    say(comparable(table, plan, task))
+    say(comparable([Reached(**entry) for entry in json.loads(REACHED.read_text())], plan, task))
     return plan
 
 

@@ -146,8 +146,6 @@ class Reached(NamedTuple):
 def comparable(table: Sequence[Reached], config: TrainConfig, task: Task) -> str:
     """A sentence: what scenes of about this size reached by about as many steps, or what the table has else."""
     steps = config.learn.iterations
-    if not table:
-        return "No training was measured to compare this one with."
     alike = lambda one, other: max(one, other) <= LIKE * min(one, other)  # noqa: E731
     near = [entry for entry in table if alike(entry.pixels, task.pixels) and alike(entry.iterations, steps)]
     if near:
