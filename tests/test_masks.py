@@ -19,7 +19,8 @@ from test_losses import check, differentiated
 
 from warp_splat.evaluation.metrics import METRICS, psnr, ssim
 from warp_splat.evaluation.views import evaluate_views
-from warp_splat.scene.images import read_mask
+from warp_splat.scene import images
+from warp_splat.scene.images import read_counts, read_mask
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -73,6 +74,26 @@ def test_photographs_that_are_masked_all_over_are_left_out(tmp_path, monkeypatch
         write_image(root / "masks" / f"{name}.png", black)
     refusal(lambda: load(root), "all 3 images are black")
     assert len(load(root, invert_masks=True)[0].train) == 3
+
+
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_a_thumbnail_never_decides_that_a_mask_covers_all(tmp_path, monkeypatch, resolution):
+    """Of a photograph with a lens, it only tells that some pixels count."""
+    width, height, widths = 160, 120, []
+    masks = {name: np.zeros((height, width, 1), np.uint8) for name in ("black", "corner", "large", "small")}
+    masks["large"][30:90, 40:120] = masks["small"][56:60, 70:74] = masks["corner"][0, 0] = 255
+    root = write_colmap(
+        tmp_path,
+        [f"{name}.png" for name in masks],
+        texture(width, height),
+        camera=f"OPENCV {width} {height} 150 150 80 60 -0.15 0.04 0 0",
+    )
+    for name, mask in masks.items():
+        write_image(root / "masks" / f"{name}.png", mask)
+    monkeypatch.setattr(images, "read_counts", lambda *of: widths.append(of[1].width) or read_counts(*of))
+    kept = [view.name for view in load(root, resolution=resolution, memory=1.0)[0].train]
+    assert kept == ["large.png", "small.png"]
+    assert len(widths) == 7 and widths.count(min(widths)) == 4 and min(widths) < max(widths) / 10
 
 
 def test_masks_of_another_shape_are_refused(tmp_path):

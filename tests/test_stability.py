@@ -157,7 +157,7 @@ def test_run_writes_and_counts(tmp_path, monkeypatch):
     """With few cases: the table, the files, and the number of failed verdicts."""
     chains = [case for case in cases.CASES if case.name.startswith("chain_1")]
     wrong = verdict.Case("wrong", "none", "fails", lambda _mode: failing, modal=False)
-    failing = verdict.Outcome("nothing", 1.0, 0.0, None, 0.0, "-", ("stated, and not so",))
+    failing = verdict.Outcome("nothing", 1.0, None, 0.0, "-", ("stated, and not so",))
     monkeypatch.setattr(cases, "CASES", (*chains, wrong))
     lines = []
     assert cases.run_cases(tmp_path / "out", ["manual"], lines.append) == 1
@@ -172,7 +172,7 @@ def test_run_writes_and_counts(tmp_path, monkeypatch):
 
 
 def test_a_verdict_names_the_modes_that_failed():
-    good = verdict.Outcome("nothing", 0.0, 0.0, None, 0.0, "-", ())
+    good = verdict.Outcome("nothing", 0.0, None, 0.0, "-", ())
     bad = good._replace(failures=("wrong",))
     verdicts = [
         cases.Row(cases.CASES[0], {"manual": first, "stored": second}).verdict

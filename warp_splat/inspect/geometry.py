@@ -171,8 +171,7 @@ def check_axes(subject: Subject) -> Iterator[Finding]:
     """How many points the images would show if the poses were read in other conventions."""
     if not subject.photos or not len(subject.points):
         return
-    points = sample(subject.points, 2000)
-    photos = sample(subject.photos, VIEWS)
+    points, photos = sample(subject.points, 2000), sample(subject.photos, VIEWS)
     seen = {name: sum(visible(turn(photo.camera), points).sum() for photo in photos) for name, turn in TURNS.items()}
     best = max(seen, key=lambda name: seen[name])
     shares = ", ".join(f"{name} {100 * count / (len(points) * len(photos)):.0f} %" for name, count in seen.items())

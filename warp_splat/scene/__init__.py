@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,11 +114,11 @@ def _drop_masked(
     photos: list[Photo], views: list[View], invert_masks: bool, source: str | Path, report: Report
 ) -> list[View]:
     """The views with a pixel that counts; only masks are read."""
-    from warp_splat.scene.images import THREADS, read_counts  # noqa: PLC0415  keeps `import warp_splat` light
+    from warp_splat.scene.images import THREADS, has_counts  # noqa: PLC0415  keeps `import warp_splat` light
 
     with ThreadPoolExecutor(THREADS) as pool:
-        masks = pool.map(lambda photo, view: read_counts(photo, view.camera, invert_masks), photos, views)
-        kept = [view for view, mask in zip(views, masks, strict=True) if mask is None or mask.any()]
+        shown = pool.map(lambda photo, view: has_counts(photo, view.camera, invert_masks), photos, views)
+        kept = list(compress(views, shown))
     require_unmasked(len(views), len(views) - len(kept), source)
     if len(kept) < len(views):
         report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")

@@ -50,9 +50,8 @@ def time_of_cameras(source: Path, say: Report) -> None:
     memory = max(peak_memory() or 0, before + OF_FEATURE * features * count / 2**20) / 1024
     if features:
         say(
-            f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
-            f"threads: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}; "
-            f"{memory:.1f} GiB of memory."
+            f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min and "
+            f"{memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
         )
 
 

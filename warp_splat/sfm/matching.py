@@ -77,8 +77,7 @@ def pairs_compared(matching: str, images: int) -> tuple[str, int]:
 
 
 def _run(database: Path, run: Callable, pairing: object, total: int, config: SfmConfig) -> None:
-    threads = config.threads if avoid_blas() else 1
-    options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    options = pycolmap.FeatureMatchingOptions(num_threads=config.threads if avoid_blas() else 1, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
     work = partial(run, database, options, pairing, verification, pycolmap.Device.cpu)

@@ -69,7 +69,6 @@ class Outcome(NamedTuple):
 
     says: str  # float64
     value_error: float = 0.0
-    value_limit: float = 0.0
     gradient_error: float | None = None  # None where there is no gradient
     gradient_limit: float = 0.0
     counted: str = "-"
@@ -79,7 +78,7 @@ class Outcome(NamedTuple):
 def bounded(says: str, what: str, error: float, limit: float, counted: str = "-") -> Outcome:
     """That one error is below its limit."""
     failures = () if error < limit else (f"{what} off by {error:.1e} > {limit:.1e}",)
-    return Outcome(says, error, limit, counted=counted, failures=failures)
+    return Outcome(says, error, counted=counted, failures=failures)
 
 
 class Case(NamedTuple):
@@ -252,7 +251,7 @@ def judge(expected: Expected, mode: str) -> Outcome:
     failures = tuple(statement for holds, statement in statements if not holds)
     counted = count_text(culled=int((out.radii == 0).sum()), invalid=out.invalid, dropped=dropped_now)
     gradient = errors[worst], expected.gradient_limits[worst]
-    return Outcome(expected.says, value_error, expected.image_limit, *gradient, counted, failures)
+    return Outcome(expected.says, value_error, *gradient, counted, failures)
 
 
 def count_text(**counts: int) -> str:
