@@ -99,17 +99,26 @@ def test_any_budget_is_reached_in_two_billion_steps():
     assert not growth_on(model, 10**8, iterations=2**31 - 1).told()
 
 
-def test_where_it_is_full_the_faintest_make_room():
-    """Two of a hundred; what is split is what pulled most at its place in the views that showed it."""
+@pytest.mark.parametrize(("due", "pruned", "split"), [(50, 52, 2), (100, 3, 3), (102, 1, 3), (106, 0, 6), (199, 0, 99)])
+def test_the_faintest_make_room(due, pruned, split):
+    """So many that three of a hundred are split where the set grows by less."""
+    model = GaussianModel.from_points(np.random.default_rng(0).normal(size=(100, 3)), np.zeros((100, 3), np.uint8), 0)
+    change = growth_on(model, due)._grow(due)
+    assert (change.pruned, change.split, len(model)) == (pruned, split, due)
+
+
+def test_what_pulls_most_is_split():
+    """By the mean over the views that showed it; what goes are the faintest."""
     model = GaussianModel.from_points(np.random.default_rng(0).normal(size=(100, 3)), np.zeros((100, 3), np.uint8), 0)
     means, growth = model.parameters["means"].detach().clone(), growth_on(model)
-    model.parameters["opacities"].detach().copy_(torch.linspace(1.0, 2.0, 100))[[7, 40]] = 0.0
+    model.parameters["opacities"].detach().copy_(torch.linspace(1.0, 2.0, 100))[[7, 40, 41]] = 0.0
     growth.views[:], growth.views[50] = 1.0, 4.0
     growth.gradient[[7, 11, 12, 13, 50]] = torch.tensor([9.0, 3.0, 2.0, 1.0, 7.0])
     change = growth._grow(100)
-    assert (change.split, change.pruned, len(model)) == (2, 2, 100)
+    assert (change.split, change.pruned, len(model)) == (3, 3, 100)
     left = model.parameters["means"].detach()
-    assert [row for row in range(100) if not bool((left == means[row]).all(1).any())] == [7, 11, 12, 40]
+    gone = [row for row in range(100) if not bool((left == means[row]).all(1).any())]
+    assert gone == [7, 11, 12, 40, 41, 50]
 
 
 def some_splits():

@@ -12,7 +12,7 @@ from warp_splat.training.growth.reference import Reference, rotate, survivors
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting
 
-MOVED = 0.02  # share of the Gaussians that move, where there are as many as planned
+SPLIT = 0.03  # share of the Gaussians, at least, of each densification; the faintest make room for it
 APART = 0.7  # standard deviations from the middle of a Gaussian to those of its halves, along its longest axis
 NARROW = math.log(0.714)  # of that axis: 0.7^2 + 0.714^2 = 1, so the halves together were as wide as the whole,
 SMALLER = math.log(0.9)  # but for this of every axis: a seventh fewer pairs of Gaussians and pixels
@@ -65,10 +65,10 @@ class Budget(Reference):
         self.processes.merge(self.views)
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         keep, total = survivors(raw), self.processes.total
-        if (kept := total(int(keep.sum()))) >= due:
-            faint = torch.where(keep, raw["opacities"], torch.inf)  # the faintest go
-            keep &= ~self.processes.lowest(faint, max(round(MOVED * kept), kept - due))
         kept = total(int(keep.sum()))
+        leaving = max(min(round(SPLIT * min(kept, due)), due // 2) - (due - kept), 0)
+        keep &= ~self.processes.lowest(torch.where(keep, raw["opacities"], torch.inf), leaving)  # the faintest
+        kept -= leaving
         pruned, room = total(len(keep)) - kept, min(max(due - kept, 0), kept)
         if not pruned + room or not kept:  # an empty scene could never recover
             self.clear()
