@@ -71,6 +71,7 @@ def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys
     for done, said in (
         (lambda: None, True),
         (lambda: monkeypatch.setattr(stages, "opened", no_room), False),
+        (lambda: monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing")), False),
         (lambda: monkeypatch.undo() or [name.write_text("no picture") for name in names], False),
         (lambda: [name.unlink() for name in names[29:]], False),
     ):

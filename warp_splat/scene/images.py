@@ -238,8 +238,14 @@ def decode(photo: Photo, camera: Camera, white_background: bool, invert_masks: b
     return Decoded(color, None if pixels.alpha is None else _quantized(image[..., 3]), mask)
 
 
-def read_counts(photo: Photo, camera: Camera, invert_masks: bool) -> np.ndarray | None:
+def read_counts(photo: Photo, camera: Camera, invert_masks: bool, least: float = 0.5) -> np.ndarray | None:
     """The mask that :func:`decode` gives, read alone; of the photograph only the header is read.
+
+    Args:
+        photo: may have no mask, of which None comes.
+        camera: the photo's in any size.
+        invert_masks: the darker half counts.
+        least: how much of a pixel has to count, as the filters say, which go beyond 0 and 1.
 
     Raises:
         InputError: if a file cannot be read.
@@ -247,14 +253,17 @@ def read_counts(photo: Photo, camera: Camera, invert_masks: bool) -> np.ndarray 
     if photo.mask is None:
         return None
     counts = read_mask(photo.mask, read_size(photo.path), invert_masks)
-    return (_through_lens(counts[..., None], photo, camera, linear=False)[..., 0] >= 0.5).astype(np.uint8)
+    return (_through_lens(counts[..., None], photo, camera, linear=False)[..., 0] >= least).astype(np.uint8)
 
 
 def has_counts(photo: Photo, camera: Camera, invert_masks: bool) -> bool:
-    """Whether :func:`read_counts` gives any. Of a lens a thumbnail mostly tells, in a tenth of the time."""
+    """Whether :func:`read_counts` gives any. Of a lens a thumbnail mostly tells, in a tenth of the time.
+
+    Where 0.9 of a thumbnail's pixel count, half of one of those count that it stands for.
+    """
     small = camera.resized(camera.width // 16 + 1, camera.height // 16 + 1)
-    sizes = (small, camera) if photo.sampling else (camera,)
-    return photo.mask is None or any(read_counts(photo, size, invert_masks).any() for size in sizes)
+    sizes = ((small, 0.9), (camera, 0.5)) if photo.sampling else ((camera, 0.5),)
+    return photo.mask is None or any(read_counts(photo, size, invert_masks, least).any() for size, least in sizes)
 
 
 def _through_lens(image: np.ndarray, photo: Photo, camera: Camera, linear: bool) -> np.ndarray:

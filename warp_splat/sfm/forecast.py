@@ -43,15 +43,15 @@ def time_of_cameras(source: Path, say: Report) -> None:
     before = peak_memory() or 0
     try:
         extraction, features, matching = _measured(root, tried, SfmConfig(str(source), "", threads=CORES, quiet=True))
-    except RuntimeError:  # of pycolmap: no room for temporary files, for one; who needs the cameras will be told
+    except (RuntimeError, OSError):  # no room for temporary files, for one; who needs the cameras will be told
         return
     mapping = (GLOBAL + INCREMENTAL * (count <= MANY)) * count ** (4 / 3) * extraction / 60  # on one thread
     extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
     memory = max(peak_memory() or 0, before + OF_FEATURE * features * count / 2**20) / 1024
     if features:
         say(
-            f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min and "
-            f"{memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
+            f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
+            f"cores, {memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
         )
 
 
