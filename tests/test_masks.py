@@ -96,6 +96,16 @@ def test_a_thumbnail_never_decides_that_a_mask_covers_all(tmp_path, monkeypatch,
     assert len(widths) == 7 and widths.count(min(widths)) == 4 and min(widths) < max(widths) / 10
 
 
+def test_a_thumbnail_of_which_half_counts_decides_nothing(tmp_path):
+    """Filters go beyond 0 and 1: of this mask, more than half of the thumbnail counts, and no pixel of the view."""
+    lens = "SIMPLE_RADIAL 5 19 11.938137367123417 2.104866602890559 9.851091207763975 -0.05"
+    root = write_colmap(tmp_path, ["a.png", "b.png"], texture(5, 19), camera=lens)
+    first, second = (0, 1, 1, 1, 0, 0, 0, 1, 1, 1), (1, 0, 0, 0, 1, 1, 1, 0, 1, 1)
+    write_image(root / "masks" / "a.png", 255 * np.dstack([[first, second]]).astype(np.uint8).transpose(1, 0, 2))
+    scene, _ = load(root, resolution=8, memory=1.0, invert_masks=True)
+    assert [view.name for view in scene.train] == ["b.png"]
+
+
 def test_masks_of_another_shape_are_refused(tmp_path):
     write_image(tmp_path / "m.png", some_mask(WIDTH, HEIGHT))
     sizes = f"{WIDTH} x {HEIGHT}", f"got {HEIGHT} x {WIDTH}"
