@@ -97,12 +97,15 @@ def test_a_thumbnail_never_decides_that_a_mask_covers_all(tmp_path, monkeypatch,
 
 
 def test_a_thumbnail_of_which_half_counts_decides_nothing(tmp_path):
-    """Filters go beyond 0 and 1: of this mask, more than half of the thumbnail counts, and no pixel of the view."""
-    lens = "SIMPLE_RADIAL 5 19 11.938137367123417 2.104866602890559 9.851091207763975 -0.05"
-    root = write_colmap(tmp_path, ["a.png", "b.png"], texture(5, 19), camera=lens)
-    first, second = (0, 1, 1, 1, 0, 0, 0, 1, 1, 1), (1, 0, 0, 0, 1, 1, 1, 0, 1, 1)
-    write_image(root / "masks" / "a.png", 255 * np.dstack([[first, second]]).astype(np.uint8).transpose(1, 0, 2))
-    scene, _ = load(root, resolution=8, memory=1.0, invert_masks=True)
+    """Filters go beyond 0 and 1: of this band, half of a thumbnail's pixel counts, and no pixel of the view."""
+    side, names = 1024, ["a.png", "b.png"]
+    lens = f"SIMPLE_RADIAL {side} {side} {side} {side / 2} {side / 2} -0.05"
+    root, (y, x) = write_colmap(tmp_path, names, texture(side, side), camera=lens), np.mgrid[:side, :side]
+    shares = 30 * np.clip(np.minimum(x - 400, 656 - x) / 16, 0, 1)  # of 64 pixels that become one
+    order = np.random.default_rng(0).permutation(64).reshape(8, 8)[y % 8, x % 8]
+    for name, counts in zip(names, (shares > order, x < side / 2), strict=True):
+        write_image(root / "masks" / name, 255 * counts.astype(np.uint8)[..., None])
+    scene, _ = load(root, resolution=8, memory=1.0)
     assert [view.name for view in scene.train] == ["b.png"]
 
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 from commands import ROOT, SCENE, python
 from hostile import refusal
+from scene_files import write_colmap
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_own, save_checkpoint, save_in_blocks
@@ -138,6 +139,14 @@ def test_the_model_is_the_same_bytes_on_any_number_of_processes(growth, counts, 
         assert train(tmp_path / str(count), count, f"{options} --checkpoint_iterations {half}") == expected, count
         resume = f"--resume {tmp_path / str(count) / f'chkpnt{half}.safetensors'}"
         assert train(tmp_path / f"resumed{count}", count - 1, resume) == expected, count
+
+
+@pytest.mark.slow
+def test_views_may_show_nothing_of_a_process(tmp_path):
+    """Five Gaussians in three blocks, of which cameras see two Gaussians."""
+    points = np.array([[0.02, 0.3, -0.7], [0.3, -0.2, 0.1], *np.outer([1e3, 2e3, 3e3], [0.0, 0.0, -1.0])])
+    options = f"-s {write_colmap(tmp_path / 'scene', points=points)} --views 3 --iterations 12 --test_iterations"
+    assert train(tmp_path / "3", 3, options) == train(tmp_path / "1", 1, options)
 
 
 def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):

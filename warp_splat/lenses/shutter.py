@@ -75,8 +75,7 @@ def series(square: float, order: int) -> float:
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     """Of a rotation [3, 3] by less than a right angle."""
     twice = matrix - matrix.T
-    sine = 0.5 * np.array([twice[2, 1], twice[0, 2], twice[1, 0]])  # times the axis
-    found = sine
+    found = sine = 0.5 * np.array([twice[2, 1], twice[0, 2], twice[1, 0]])  # times the axis
     for _ in range(200):  # a contraction by (1 - angle / tan(angle)) a step
         found = sine / series(sum(number * number for number in found.tolist()), 1)
     return found

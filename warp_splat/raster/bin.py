@@ -249,8 +249,7 @@ def balanced_slices(ends: np.ndarray) -> list[int]:
     """Bounds of slices of tiles with about the same number of instances; an empty tile counts a little, too."""
     work = ends + 32 * np.arange(1, len(ends) + 1)
     parts = slice_count(int(work[-1]), SLICES_PER_THREAD)
-    inner = np.searchsorted(work, work[-1] * np.arange(1, parts) / parts)
-    return [0, *inner.tolist(), len(ends)]
+    return [0, *np.searchsorted(work, work[-1] * np.arange(1, parts) / parts).tolist(), len(ends)]
 
 
 def order_by_depth(depths: np.ndarray) -> np.ndarray:

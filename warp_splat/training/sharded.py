@@ -99,7 +99,7 @@ class Blocks:
         if rank < len(steps):
             splats = _unpacked(torch.cat(arrived))
             loss = trainer.differentiate_view(steps[rank], splats)
-            columns = [tensor.grad.reshape(len(tensor), -1) for tensor in splats[:LEARNED] if tensor.grad is not None]
+            columns = [tensor.grad.reshape(-1, width) for tensor, width in zip(splats, WIDTHS[:LEARNED], strict=False)]
             grads = torch.cat(columns, 1).split([len(part) for part in arrived])
             del splats
         returned, price = self.processes.exchange(grads), torch.zeros((), dtype=torch.float64, device=trainer.device)
@@ -172,7 +172,7 @@ def _packed(splats: Splats2D) -> torch.Tensor:
     """Those that are drawn, a row each."""
     drawn = (splats.radii > 0).nonzero()[:, 0]
     columns = [*splats[:-1], splats.radii.view(torch.float32)]
-    return torch.cat([tensor[drawn].reshape(len(drawn), -1) for tensor in columns], 1)
+    return torch.cat([table[drawn].reshape(-1, width) for table, width in zip(columns, WIDTHS, strict=True)], 1)
 
 
 def _unpacked(rows: torch.Tensor) -> Splats2D:
