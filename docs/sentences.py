@@ -284,7 +284,7 @@ def _cuda() -> list[tuple]:
     huge = f.on_card("Training step", "980 x 545", 5_000_000)[0]
     modes = f.on_card("Adjoints: time and memory", "980 x 545", 5_000_000)
     kernels = {row["kernel"].split("__")[0]: float(row["ms per step"]) for row in f.on_card("Kernels of a step")}
-    (ours,) = f.on_card("Beside gsplat", *million)
+    beside = f.on_card("Beside gsplat", *million)
     ways = [row["sum ms"] for row in f.on_card("Slots against atomics")]
     errors = [row for row in f.on_card("Adjoints: error against time", scene=f.MANY) if row["variant"] in f.MODES]
     shares = [row["share"].rstrip(" %") for row in f.on_card("Longest tile")]
@@ -307,9 +307,12 @@ def _cuda() -> list[tuple]:
             "it draws {} pictures a second without it and {} with it,",
             *(round(float(row["frames per second"])) for row in f.on_card("Orbit")),
         ),
-        ("Now ours takes {} and {} ms, with no", ours["forward ms"], ours["forward + backward ms"]),
         (
-            "take {} ms for the ball, atomic additions {}; for the crowd {} and {}; on",
+            "forward {} ms, gsplat {}; both passes {} ms, gsplat {}. Both hold",
+            *(row[what] for what in ("forward ms", "forward + backward ms") for row in beside),
+        ),
+        (
+            "take {} ms for the ball, atomic additions {}; for the crowd {} and {}. So",
             *(f.two(float(way)) for way in ways),
         ),
         (
