@@ -104,7 +104,7 @@ BAD = {
     ),
     "photos-of-phones": (
         file_case("a.heic", "x"),
-        ["found neither and no photographs", "convert its 1 files such as 'a.heic' to JPEG or PNG"],
+        ["found none of these and no photographs", "convert its 1 files such as 'a.heic' to JPEG or PNG"],
     ),
     "model": (folder_case("point_cloud"), ["found a trained model", "folder of its scene"]),
     "resolution-0": (colmap_case(options={"resolution": 0}), ["resolution", "got 0"]),

@@ -176,7 +176,7 @@ def read_photos(
         raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
     others = find_files(photo_root(source), OTHER_PHOTOS)
     hint = f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG" if others else "give another folder"
-    raise InputError(f"{source}: {expected}, found neither and no photographs; {hint}.")
+    raise InputError(f"{source}: {expected}, found none of these and no photographs; {hint}.")
 
 
 def has_cameras(source: str | Path) -> bool:

@@ -29,8 +29,7 @@ def time_of_cameras(source: Path, say: Report) -> None:
 
     Features and pairs of some photographs are timed on this machine, and mapping goes by the features.
     """
-    root = photo_root(source)
-    names = find_files(root, PHOTOS)
+    names = find_files(root := photo_root(source), PHOTOS)
     count = len(names)
     if pycolmap is None or count < LEAST:
         return
@@ -48,11 +47,11 @@ def time_of_cameras(source: Path, say: Report) -> None:
     mapping = (GLOBAL + INCREMENTAL * (count <= MANY)) * count ** (4 / 3) * extraction / 60  # on one thread
     extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
     memory = max(peak_memory() or 0, before + OF_FEATURE * features * count / 2**20) / 1024
-    if features:
-        say(
-            f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
-            f"cores, {memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
-        )
+    told = (
+        f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
+        f"cores, {memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
+    )
+    say(told if features else "Nothing can be told of the time that cameras take: these have no features.")
 
 
 def _measured(root: Path, tried: list[list[str]], config: SfmConfig) -> tuple[float, float, float]:
