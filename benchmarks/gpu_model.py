@@ -267,9 +267,9 @@ def main() -> None:
         ball = {"ball": scenes["ball"]}  # of the crowd gpu.py measures no step
         rows = measured_rows(arguments.measured, CARDS[arguments.card], ball)
         headers = ("scene", "stage", "measured ms", "modeled ms", "ratio")
-        tables.append((headers, rows, f"Measured on an {arguments.card}."))
+        tables.append((headers, rows, f"Measured on an {arguments.card} by `benchmarks/gpu.py`, with the host's waits."))
     parts = [f"{format_table(headers, rows)}\n\n{note}" for headers, rows, note in tables]
-    where = f"Modeled by `benchmarks/gpu_model.py` on {machine()}; no GPU was measured. {versions()}."
+    where = f"Modeled by `benchmarks/gpu_model.py` on {machine()}. {versions()}."
     text = "\n\n".join([*parts, where])
     print(text)
     if arguments.out:

@@ -68,12 +68,12 @@ def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys
     (photos / "output" / "mine" / "test").mkdir(parents=True)
     (photos / "output" / "mine" / "cfg_args").touch()
     shutil.copy(names[0], photos / "output" / "mine" / "test")  # a picture of a model, no photograph
-    for done, said in (
-        (lambda: None, True),
-        (lambda: monkeypatch.setattr(stages, "opened", no_room), False),
-        (lambda: monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing")), False),
-        (lambda: monkeypatch.undo() or [name.write_text("no picture") for name in names], False),
-        (lambda: [name.unlink() for name in names[29:]], False),
+    for done, said, instead in (
+        (lambda: None, True, ""),
+        (lambda: monkeypatch.setattr(stages, "opened", no_room), False, ""),
+        (lambda: monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing")), False, ""),
+        (lambda: monkeypatch.undo() or [name.write_text("no picture") for name in names], False, "have no features"),
+        (lambda: [name.unlink() for name in names[29:]], False, ""),
     ):
         done()
         assert main(["inspect", str(photos)]) == 1
@@ -81,6 +81,7 @@ def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys
         assert "photographs alone" in told.err and "`warp-splat sfm" in told.err
         assert (f"Cameras of {count} photographs will take about " in told.out) == said
         assert (f"{count * (count - 1) // 2} pairs" in told.out) == said
+        assert instead in told.out
 
 
 def no_room(*_):
