@@ -267,7 +267,7 @@ def main() -> None:
         ball = {"ball": scenes["ball"]}  # of the crowd gpu.py measures no step
         rows = measured_rows(arguments.measured, CARDS[arguments.card], ball)
         headers = ("scene", "stage", "measured ms", "modeled ms", "ratio")
-        tables.append((headers, rows, f"Measured on an {arguments.card} by `benchmarks/gpu.py`, with the host's waits."))
+        tables.append((headers, rows, f"Measured on an {arguments.card} by `gpu.py`, with the host's waits."))
     parts = [f"{format_table(headers, rows)}\n\n{note}" for headers, rows, note in tables]
     where = f"Modeled by `benchmarks/gpu_model.py` on {machine()}. {versions()}."
     text = "\n\n".join([*parts, where])
