@@ -142,10 +142,12 @@ def test_the_model_is_the_same_bytes_on_any_number_of_processes(growth, counts, 
 
 
 @pytest.mark.slow
-def test_views_may_show_nothing_of_a_process(tmp_path):
-    """Five Gaussians in three blocks, of which cameras see two Gaussians."""
-    points = np.array([[0.02, 0.3, -0.7], [0.3, -0.2, 0.1], *np.outer([1e3, 2e3, 3e3], [0.0, 0.0, -1.0])])
-    options = f"-s {write_colmap(tmp_path / 'scene', points=points)} --views 3 --iterations 12 --test_iterations"
+@pytest.mark.parametrize(("count", "growth"), [(5, "reference"), (2, "mcmc --max_gaussians 5")])
+def test_views_may_show_nothing_of_a_process(count, growth, tmp_path):
+    """So many Gaussians in three blocks, of which cameras see two; a block may be empty."""
+    points = np.array([[0.02, 0.3, -0.7], [0.3, -0.2, 0.1], *np.outer([1e3, 2e3, 3e3], [0.0, 0.0, -1.0])])[:count]
+    options = f"-s {write_colmap(tmp_path / 'scene', points=points)} --views 3 --iterations 12 --growth {growth}"
+    options += " --densify_from_iter 3 --densification_interval 3 --test_iterations"
     assert train(tmp_path / "3", 3, options) == train(tmp_path / "1", 1, options)
 
 

@@ -5,7 +5,7 @@ import torch
 
 def in_pairs(values: torch.Tensor) -> torch.Tensor:
     """The sum over the first axis of ``values`` [M, ...], in float64: of neighbors, then of these sums, and so on."""
-    sums = values.double() if len(values) else values.new_zeros(1, *values.shape[1:]).double()
+    sums = (values if len(values) else torch.cat([values, values.new_zeros(1, *values.shape[1:])])).double()
     while len(sums) > 1:
         if len(sums) % 2:
             sums = torch.cat([sums, sums.new_zeros(1, *sums.shape[1:])])
