@@ -148,7 +148,9 @@ def test_views_may_show_nothing_of_a_process(count, growth, tmp_path):
     points = np.array([[0.02, 0.3, -0.7], [0.3, -0.2, 0.1], *np.outer([1e3, 2e3, 3e3], [0.0, 0.0, -1.0])])[:count]
     options = f"-s {write_colmap(tmp_path / 'scene', points=points)} --views 3 --iterations 12 --growth {growth}"
     options += " --densify_from_iter 3 --densification_interval 3 --test_iterations"
-    assert train(tmp_path / "3", 3, options) == train(tmp_path / "1", 1, options)
+    expected = train(tmp_path / "1", 1, options)
+    assert train(tmp_path / "3", 3, f"{options} --checkpoint_iterations 6") == expected
+    assert train(tmp_path / "resumed", 2, f"--resume {tmp_path / '3' / 'chkpnt6.safetensors'}") == expected
 
 
 def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):
@@ -177,6 +179,7 @@ def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):
         of_blocks(save(iteration), count)
         assert len(list(tmp_path.glob("*"))) == 1 + count  # the older ones are gone
         check()
+    refusal(lambda: load_own(path, Shards(0, 11)), "one of 10 Gaussians, fewer than there are processes")
     (tmp_path / "checkpoint-4-1-of-2.safetensors").mkdir()
     refusal(lambda: of_blocks(save(4), 2), "process 1 could not write its block")
     assert load_own(path, Rows()).facts["iteration"] == 3

@@ -259,7 +259,7 @@ def load_own(path: str | Path, rows: Rows) -> Checkpoint:
                     {n: a[..., first:last] if n.startswith(OF_VIEWS) else a[first:last] for n, a in found.items()}
                 )
         if not taken:
-            raise Unexpected("one without Gaussians")
+            raise Unexpected(f"one of {end} Gaussians, fewer than there are processes")
         axes = {n: -1 if n.startswith(OF_VIEWS) else 0 for n in taken[0]}
         arrays = {n: np.concatenate([part[n] for part in taken], axis) for n, axis in axes.items()}
     return replace(whole, arrays={**whole.arrays, **arrays})
