@@ -42,7 +42,7 @@ def bin_by_counting(
     drawn, invalid = _drawn(splats2d.radii.numpy())
     count = len(drawn)
     splats, rows = empty(count, Splat2D, "cpu"), np.empty(count, dtype=np.int32)
-    gaussians, square = in_place(drawn), int(options.extent == "square")
+    gaussians, square = wp.array(drawn, copy=False, device="cpu"), int(options.extent == "square")
     inputs, groups = [gaussians, splats2d.view(), camera.height, options.alpha_min, square], -(-count // LANES)
     in_groups = even_slices(groups, each=LANES)
     launch(lists.make_pack(falloff_of(options).reach_of), groups, inputs, [splats, in_place(rows)], bounds=in_groups)
@@ -96,7 +96,7 @@ def bin_by_sorting(
     listed, numbers = torch.sort(listed, stable=True)
     new = partial(torch.empty, dtype=torch.int32, device=device)
     instances, places, ranges = new(count), new(count), new(tiles_x * tiles_y * pictures, 2)
-    inputs = [_listed(listed), view(numbers, wp.int64), view(ranks, wp.int32)]
+    inputs = [view(listed, wp.dtype_from_torch(listed.dtype)), view(numbers, wp.int64), view(ranks, wp.int32)]
     outputs = [view(numbers, wp.int32) for numbers in (instances, places, ranges)]
     launch(make_gather_tiles(narrow), count + 1, inputs, outputs, device=device)
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
@@ -129,7 +129,7 @@ def _list_tiles(
     """
     begins, ranks = (torch.empty(size, dtype=torch.int32, device=ends.device) for size in (len(ends) + 1, len(listed)))
     inputs = [splats, camera.width, camera.height, int(options.extent == "square"), view(ends, wp.int64)]
-    outputs = [view(begins, wp.int32), _listed(listed), view(ranks, wp.int32), view(counts, wp.int32)]
+    outputs = [view(table, wp.dtype_from_torch(table.dtype)) for table in (begins, listed, ranks, counts)]
     launch(make_list_tiles(listed.dtype == torch.int16), len(begins), inputs, outputs, device=ends.device)
     return begins, ranks
 
@@ -138,10 +138,6 @@ def _first_tiles(worlds: Sequence[int], tiles: int, device: torch.device) -> tor
     """The first tile of the picture that each Gaussian belongs to, [N] int32."""
     firsts, counts = torch.arange(0, tiles * len(worlds), tiles), torch.tensor(worlds)
     return torch.repeat_interleave(*(send(t, device) for t in (firsts.int(), counts)), output_size=sum(worlds))
-
-
-def _listed(tiles: torch.Tensor):
-    return view(tiles, wp.int16 if tiles.dtype == torch.int16 else wp.int32)
 
 
 def count_twice(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> tuple[torch.Tensor, torch.Tensor]:
@@ -268,7 +264,7 @@ def order_by_depth(depths: np.ndarray) -> np.ndarray:
         keys, values = np.empty(2 * count, dtype=np.float32), np.empty(2 * count, dtype=np.int32)  # it needs twice
         keys[:count], values[:count] = depths, order
         if count:
-            wp.utils.radix_sort_pairs(wp.array(keys, dtype=float, copy=False, device="cpu"), in_place(values), count)
+            wp.utils.radix_sort_pairs(*(wp.array(of, copy=False, device="cpu") for of in (keys, values)), count)
         return values[:count]
     now, then = (depths.view(np.int32), order), (np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32))
     bands, places = list(range(len(bounds))), in_place(np.array(bounds, dtype=np.int32))
@@ -288,6 +284,6 @@ def begins_of(counts: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray((ends - counts.T).T, dtype=np.int32)
 
 
-def in_place(values: np.ndarray) -> wp.array:
+def in_place(values: np.ndarray):
     """The same memory for a kernel."""
-    return wp.array(values, copy=False, device="cpu")
+    return view(torch.from_numpy(values), wp.dtype_from_numpy(values.dtype))

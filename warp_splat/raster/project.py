@@ -28,7 +28,7 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct, view
-from warp_splat.runtime.pool import even_slices, in_slices, set_all, torch_slices
+from warp_splat.runtime.pool import even_slices, in_slices, set_zero, torch_slices
 from warp_splat.runtime.timers import stage
 
 Tensors = Sequence[torch.Tensor]
@@ -194,10 +194,9 @@ class Project(torch.autograd.Function):
         count, new, lanes = means.shape[0], means.new_empty, it.driver.lanes
         splats = Splats2D(
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
-            radii=new(count, dtype=torch.int32),
+            radii=means.new_full((count,), int(UNSEEN), dtype=torch.int32),
         )
-        set_all(0, *splats[:-1])
-        set_all(int(UNSEEN), splats.radii)
+        set_zero(*splats[:-1])
         _launch_geometry(it, _shapes(gaussians), _geometry(splats))
         given = [it.cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
@@ -234,7 +233,7 @@ class Project(torch.autograd.Function):
                 numbers = [it.cam, means, seen, colors, adj_colors], [view(adj_rest, wp.vec3)]
                 launch(make_adj_rest(), adj_rest[..., 0].numel(), *numbers, device=device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
-            set_all(0, *shapes)
+            set_zero(*shapes)
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)

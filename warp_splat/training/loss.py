@@ -223,8 +223,6 @@ def _missing(groups: int, length: int) -> torch.Tensor:
     return missing.view(groups, LANES)
 
 
-def _taps(rows: torch.Tensor, dtype=vec16) -> wp.array:
+def _taps(rows: torch.Tensor, dtype=vec16):
     """[..., P] numbers as [..., P - 15] overlapping groups of sixteen: an unaligned load of any sixteen neighbors."""
-    shape = (*rows.shape[:-1], max(rows.shape[-1] - LANES + 1, 0))
-    strides = tuple(rows.element_size() * stride for stride in rows.stride())
-    return wp.array(ptr=rows.data_ptr(), dtype=dtype, shape=shape, strides=strides, device="cpu", copy=False)
+    return view(rows.unfold(-1, LANES, 1) if rows.shape[-1] >= LANES else rows.new_empty(0, 0, LANES), dtype)
