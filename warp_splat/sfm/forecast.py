@@ -51,7 +51,7 @@ def time_of_cameras(source: Path, say: Report) -> None:
         f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
         f"cores, {memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
     )
-    say(told if features else "Nothing can be told of the time that cameras take: these have no features.")
+    say(told if features else "Nothing can be told of what cameras take: these have no features, or cannot be read.")
 
 
 def _measured(root: Path, tried: list[list[str]], config: SfmConfig) -> tuple[float, float, float]:

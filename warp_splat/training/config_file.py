@@ -51,7 +51,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
     with reading(header.path, EXPECTED):
         found = header.facts.get("options")
         if not isinstance(found, dict):
-            raise Unexpected("one without options")
+            raise Unexpected("one without options, as a block of one is; name the file that names the blocks")
         for name, value in found.items():
             if name not in options:
                 raise Unexpected(f"an option that it does not have, {name!r:.50}")
