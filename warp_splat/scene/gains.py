@@ -46,13 +46,14 @@ def take_sample(image: np.ndarray, ids: np.ndarray, places: np.ndarray) -> Sampl
         ids: [M] int64.
         places: [M, 2] x and y as shares of the photograph's width and height.
     """
-    light = from_srgb(np.arange(256) / 255, np.where)[image] if image.dtype == np.uint8 else image.astype(np.float64)
     block = max(max(image.shape[:2]) // LONG, 1)
     height, width = (size // block for size in image.shape[:2])
-    light = light[: height * block, : width * block].reshape(height, block, width, block, 3).mean((1, 3))
     column, row = np.floor(places * (width, height)).astype(np.int64).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    found = light[row[inside], column[inside]]
+    inside, within = (column >= 0) & (column < width) & (row >= 0) & (row < height), np.arange(block)
+    rows, columns = (block * place[inside, None] + within for place in (row, column))
+    light = image[rows[:, :, None], columns[:, None]]  # where points are, a block each
+    light = from_srgb(np.arange(256) / 255, np.where)[light] if image.dtype == np.uint8 else light
+    found = light.mean((1, 2), dtype=np.float64)
     counts = ((found > DARKEST) & (found < BRIGHTEST)).all(1)
     return Sample(ids[inside][counts], found[counts])
 
