@@ -119,7 +119,7 @@ def launch(
     if whole:
         return
 
-    def run(low: int, high: int) -> None:  # in half of a launch's time, for which the interpreter is one thread's
+    def run(low: int, high: int) -> None:  # in two thirds of a launch's time: the interpreter is one thread's
         part = copy(packed)
         part.params = [*packed.params]
         part.set_dim(high - low)
