@@ -153,7 +153,7 @@ def find_checkpoint(path: str | Path) -> Path:
         path /= LAST
         if not path.is_file() and others:
             raise InputError(f"{path}: no such file; {others[-1]} can be named instead.")
-    if path.suffix in (".pth", ".pt", ".ckpt") and path.is_file():
+    if path.suffix in (".pth", ".pt", ".ckpt"):
         raise InputError(
             f"{path}: expected {EXPECTED} ({LAST}), found one of torch's, which can run code when it is read; convert "
             "its Gaussians to .ply with the program that wrote it."

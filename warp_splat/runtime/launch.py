@@ -114,8 +114,8 @@ def launch(
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
     where, whole = {"stream": _stream(device)} if on_gpu else {"device": "cpu"}, on_gpu or len(bounds) == 2
-    where |= {"record_tape": False, "record_cmd": not whole}
-    packed = wp.launch(kernel, dim, [0, *inputs], outputs, **where, **adjoint)
+    later = {} if whole else {"record_cmd": True}
+    packed = wp.launch(kernel, dim, [0, *inputs], outputs, record_tape=False, **where, **later, **adjoint)
     if whole:
         return
 
@@ -248,7 +248,9 @@ def launch_blocks(
     if blocks == 0:
         return
     where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
-    where |= {"block_dim": kernel.module.options["block_dim"], "record_tape": False, "adjoint": bool(adjoint)}
+    if adjoint:
+        where["adjoint"] = True
+    where |= {"block_dim": kernel.module.options["block_dim"], "record_tape": False}
     wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **where, **adjoint)
 
 
@@ -266,7 +268,7 @@ def _wrap(stream: torch.cuda.Stream) -> wp.Stream:
 def view(tensor: torch.Tensor, dtype):
     """``tensor`` as a kernel argument of element type ``dtype``, without a copy. The caller keeps the tensor alive.
 
-    In a quarter of the time of ``wp.from_torch``; a step asks for over a hundred of these, mostly of few shapes.
+    In a third of the time of ``wp.from_torch``; a step asks for over a hundred of these, mostly of few shapes.
     """
     array = _Array.from_buffer_copy(_described(tensor.shape, tensor.stride(), tensor.dtype, dtype))
     array.data, array._ref = tensor.data_ptr(), tensor  # a copy, say, that nobody else has
