@@ -19,6 +19,7 @@ PHOTOGRAPHS = {
     "full": ["-r", "1", "--eval", "--iterations", "7000"],
     "full, fast": ["-r", "1", "--eval", "--preset", "fast"],
     **{f"full, fast, seed {seed}": ["-r", "1", "--eval", "--preset", "fast", "--seed", f"{seed}"] for seed in (1, 2)},
+    "full, fast, --parts auto": ["-r", "1", "--eval", "--preset", "fast", "--parts", "auto"],
 }
 EARLY = 60  # s
 COLUMNS = {
