@@ -13,7 +13,6 @@ All memory is torch's, on either device: its caching allocator gives what a stag
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
-from copy import copy
 from typing import Any
 
 import psutil
@@ -113,19 +112,16 @@ def launch(
         return
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
-    where, whole = {"stream": _stream(device)} if on_gpu else {"device": "cpu"}, on_gpu or len(bounds) == 2
-    later = {} if whole else {"record_cmd": True}
-    packed = wp.launch(kernel, dim, [0, *inputs], outputs, record_tape=False, **where, **later, **adjoint)
-    if whole:
+    if on_gpu:
+        wp.launch(kernel, dim, [0, *inputs], outputs, stream=_stream(device), record_tape=False, **adjoint)
         return
 
-    def run(low: int, high: int) -> None:  # in two thirds of a launch's time: the interpreter is one thread's
-        part = copy(packed)
-        part.params = [*packed.params]
-        part.set_dim(high - low)
-        part.set_param_at_index(0, low)
-        part.launch()
+    def run(low: int, high: int) -> None:
+        where = {"device": "cpu", "record_tape": False}
+        wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, **where, **adjoint)
 
+    if len(bounds) > 2:
+        wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
     in_slices(run, bounds)
 
 

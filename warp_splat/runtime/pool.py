@@ -28,7 +28,10 @@ class _Job:
     """Slices of one launch, or of other work, shared by the threads: whoever is free takes the next one.
 
     A launch takes tenths of a millisecond, so what a thread costs counts. The caller waits for helpers that are at
-    work, but not for those that have not woken yet. Tried: an executor's futures, 0.1 ms more per launch, 2 ms a step.
+    work, but not for those that have not woken yet. Tried:
+
+    - 0.1 ms more per launch, 2 ms a step: an executor's futures
+    - no difference, and a crash where threads load kernels at once: arguments packed once for all slices (record_cmd)
     """
 
     def __init__(self, slices: list[Callable[[], None]]):
