@@ -68,7 +68,8 @@ def main() -> None:
     records = []
     for name in places:
         for recipe in RECIPES:
-            texts = [text for job in jobs if job[1:] == (name, recipe) if (text := paths[job].read_text())]
+            kept = [paths[job] for job in jobs if job[1:] == (name, recipe) and paths[job].exists()]
+            texts = [text for path in kept if (text := path.read_text())]  # empty: under way
             if not texts:
                 continue
             runs = [json.loads(text) for text in texts]
