@@ -3,13 +3,12 @@
 Exponentials are ours: the C library's, torch's and NumPy's differ from processor to processor.
 """
 
-import functools
 import math
 from typing import Any
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.falloff import LOG2_E
 from warp_splat.kernels.simd import TYPES, equal, fill, halved, less, over, pick, times, whole
 
@@ -54,7 +53,7 @@ def adj_logistic(opacity: Any, adj_opacity: Any):
     return times(times(adj_opacity, fill(1.0, opacity) - opacity), opacity)
 
 
-@functools.cache
+@once
 def make_activate(lanes: int) -> wp.Kernel:
     """The activations of ``lanes`` Gaussians at once."""
     number = TYPES[lanes].number
@@ -76,7 +75,7 @@ def make_activate(lanes: int) -> wp.Kernel:
     return activate
 
 
-@functools.cache
+@once
 def make_adj_activate(lanes: int) -> wp.Kernel:
     """The adjoint of :func:`make_activate`'s kernel, from its results."""
     number = TYPES[lanes].number

@@ -7,12 +7,11 @@ Memory limits it: for a number that is learned, four are read and three written.
 - 2 x the time: a group of rows of all tables, then the next; a core follows few streams of memory at a time
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.halves import HALF, noise, rounded, widened
 from warp_splat.kernels.simd import TYPES, fill, over, pick, root, times
 
@@ -31,7 +30,7 @@ def adam_step_of(value: Any, grad: Any, before: Any, before2: Any, numbers: Any,
     return value - over(m * numbers[table, RATE], spread), m, v
 
 
-@functools.cache
+@once
 def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
     """For ``lanes`` rows at once; ``sparse``: only of Gaussians that are drawn; ``halves``: moments in 16 bits."""
     number = TYPES[lanes].number

@@ -9,13 +9,12 @@ of a few ranges of depth: what lies behind others counts as little as it shows. 
 - 50 % longer blends: lists of all tiles of the boxes, which leave no corners
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.falloff import LOG2_E, FalloffFunctions
 from warp_splat.kernels.simd import fill, fma, times, where_less
 from warp_splat.kernels.structs import BinsView, Splats2DView
@@ -220,7 +219,7 @@ def alpha_error(rules: Rules, condition: float, shift: float, q: float):
     return rules.exp_error + 16.0 * EPS + condition * q + wp.sqrt(2.0 * q) * shift
 
 
-@functools.cache
+@once
 def make_beyond(fall_at: wp.Function) -> tuple[wp.Function, wp.Function]:
     """What is the most beside a row of blocks, and what adds the corners of a box; ``fall_at``: the falloff."""
 
@@ -272,7 +271,7 @@ def make_beyond(fall_at: wp.Function) -> tuple[wp.Function, wp.Function]:
     return beyond, add_corners
 
 
-@functools.cache
+@once
 def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
     """What of each Gaussian lies outside of where the blend looks, and how far its alpha may be off."""
     reach_of = falloff.reach_of

@@ -1,17 +1,15 @@
 """An affine map of an image's colors, and its adjoint: 12 numbers, columns of a matrix and then what is added."""
 
-import functools
-
 import warp as wp
 
 from warp_splat.kernels.columns import columns, rows
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.simd import TYPES, fill, fma, inner, times
 
 vec12 = wp.types.vector(length=12, dtype=float)
 
 
-@functools.cache
+@once
 def make_map_colors(lanes: int) -> wp.Kernel:
     """Of ``lanes`` pixels at once."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]
@@ -36,7 +34,7 @@ def make_map_colors(lanes: int) -> wp.Kernel:
     return map_colors
 
 
-@functools.cache
+@once
 def make_adj_map_colors(lanes: int) -> wp.Kernel:
     """Of ``lanes`` pixels at once."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]

@@ -1,11 +1,16 @@
-"""How Warp builds the kernels for the CPU, so that every processor computes the same bytes.
+"""How Warp builds kernels: once in a process, and for the CPU so that every processor computes the same bytes.
 
 The compiler fuses no multiplication with an addition and regroups no sum: where it would, depends on the processor's
 instructions and width. What pays is fused by hand (:func:`.simd.fma`), and lanes are vectors. No flag lets it assume
 that NaN or infinity never occur. The width is an upper bound, which AVX2 or NEON cut down.
 """
 
+import functools
 import os
+from collections.abc import Callable
+from typing import TypeVar
+
+import warp as wp
 
 from warp_splat.errors import InputError
 
@@ -31,3 +36,23 @@ _FLAGS = f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-
 DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS}
 
 FORWARD_ONLY = {**DIFFERENTIABLE, "enable_backward": False}
+
+_MADE = TypeVar("_MADE")
+#: Warp's own, under which it writes kernels down; what makes a kernel makes its functions, too.
+_making = wp._src.codegen._codegen_lock  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def once(make: Callable[..., _MADE]) -> Callable[..., _MADE]:
+    """As ``functools.cache``, but a thread that needs a kernel waits while another makes or loads one.
+
+    Warp and the parser of CPython 3.11 cannot do so in several threads at once: kernels of threads that rendered first
+    together were mixed up, or failed.
+    """
+    known = functools.cache(make)
+
+    @functools.wraps(make)
+    def made(*given, **named) -> _MADE:
+        with _making:
+            return known(*given, **named)
+
+    return made

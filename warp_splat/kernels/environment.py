@@ -3,12 +3,10 @@
 A color is that of a Gaussian with these coefficients: at least 0, and linear in them.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.kernels.columns import columns, rows
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.harmonics import C0, make_harmonics
 from warp_splat.kernels.simd import TYPES, fill, fma, inner, less, times, vec48
 
@@ -17,7 +15,7 @@ RUN = 32  # groups of pixels of a thread of the adjoint, which adds them up
 OPTIONS = {**FORWARD_ONLY, "max_unroll": 15}  # unrolls the loops over coefficients
 
 
-@functools.cache
+@once
 def make_see(lanes: int) -> wp.Function:
     """The harmonics in the directions of ``lanes`` rays of the camera."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]
@@ -36,7 +34,7 @@ def make_see(lanes: int) -> wp.Function:
     return see
 
 
-@functools.cache
+@once
 def make_put_behind(lanes: int) -> wp.Kernel:
     """Of ``lanes`` pixels at once."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]
@@ -77,7 +75,7 @@ def make_put_behind(lanes: int) -> wp.Kernel:
     return put_behind
 
 
-@functools.cache
+@once
 def make_adj_put_behind(lanes: int) -> wp.Kernel:
     """Of RUN times ``lanes`` pixels."""
     number, _integer, _row2, row3, _row4 = TYPES[lanes]

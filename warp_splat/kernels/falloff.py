@@ -11,14 +11,13 @@ the blend. Warp differentiates a user's falloff. Tried:
 - 2.9 x the time of ``stepwise``: three calls
 """
 
-import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from warp_splat.errors import InputError
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.simd import LANES, fill, fma, fraction, halved, times, vec16, whole
 
 wp.set_module_options(FORWARD_ONLY)
@@ -69,7 +68,7 @@ class FalloffFunctions(NamedTuple):
     reach_of: wp.Function  # of opacity and alpha_min: 2 q at which alpha has fallen to alpha_min
 
 
-@functools.cache
+@once
 def make_falloff(falloff: Falloff | int | None) -> FalloffFunctions:
     """Of the Gaussian by a polynomial's degree or by the C library (None), or of a user's falloff."""
     if not isinstance(falloff, Falloff):
@@ -93,7 +92,7 @@ def make_falloff(falloff: Falloff | int | None) -> FalloffFunctions:
     return FalloffFunctions(value, known, reach_of_fall)
 
 
-@functools.cache
+@once
 def make_fall_value(falloff: Falloff | int | None, number: type) -> wp.Function:
     """The falloff without its gradient, which what knows the value supplies."""
     fall_at = make_falloff(falloff).value
@@ -109,7 +108,7 @@ def make_fall_value(falloff: Falloff | int | None, number: type) -> wp.Function:
     return fall_value
 
 
-@functools.cache
+@once
 def make_evaluate(falloff: Falloff) -> wp.Kernel:
     """What a user's falloff is at some places, to see whether it is one."""
     fall, reach = falloff.fall, falloff.reach
@@ -130,7 +129,7 @@ def make_evaluate(falloff: Falloff) -> wp.Kernel:
     return evaluate
 
 
-@functools.cache
+@once
 def make_exp(degree: int | None) -> wp.Function:
     """2^-z for z >= 0 by a polynomial of ``degree`` (3 to 6), or by the C library (None).
 

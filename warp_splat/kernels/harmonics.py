@@ -1,11 +1,11 @@
 """Real spherical harmonics up to degree 3, with the signs of the reference implementation."""
 
-import functools
 from typing import NamedTuple
 
 import warp as wp
 
 from warp_splat.kernels import simd
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.simd import TYPES, fill, fma, inner, inverse, root
 
 C0 = 0.28209479177387814
@@ -24,7 +24,7 @@ class Harmonics(NamedTuple):
     weigh: wp.Function  # the functions, weighted, summed over all lanes: what one differentiates
 
 
-@functools.cache
+@once
 def make_harmonics(lanes: int) -> Harmonics:
     """The functions in ``lanes`` directions at once."""
     number = TYPES[lanes].number

@@ -4,10 +4,9 @@ Gaussians are put into the camera's frame, so that nothing of the camera but its
 are found in the shape's own frame, from where the camera stands in it: harmonics need not turn with the body.
 """
 
-import functools
-
 import warp as wp
 
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.harmonics import C0, make_harmonics
 
 NOTHING = wp.constant(wp.uint32(0xFFFFFFFF))  # as Newton's index of no shape
@@ -22,7 +21,7 @@ class ShapeView:
     sh: wp.array2d[wp.vec3]  # [N, K]
 
 
-@functools.cache
+@once
 def make_place(coefficients: int) -> wp.Kernel:
     """The Gaussians of shapes that are alike, as cameras see them; each with its color, as a harmonic of degree 0."""
     evaluate = make_harmonics(1).evaluate

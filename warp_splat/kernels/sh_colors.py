@@ -11,11 +11,9 @@ Tried:
 - 1.2 x the adjoint: no functions for groups of which none is drawn, or of degree 0; what may be absent stays in memory
 """
 
-import functools
-
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.harmonics import C0, make_harmonics
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.shared import INVALID
@@ -25,7 +23,7 @@ from warp_splat.kernels.structs import HarmonicsView, Splats2DView, mat53, mat73
 OPTIONS = {**FORWARD_ONLY, "max_unroll": 15}  # unrolls all loops but those over lanes
 
 
-@functools.cache
+@once
 def make_offsets(lanes: int) -> wp.Function:
     """From the camera to ``lanes`` Gaussians; beyond the last one, that one's."""
     number = TYPES[lanes].number
@@ -49,7 +47,7 @@ def make_offsets(lanes: int) -> wp.Function:
     return offsets
 
 
-@functools.cache
+@once
 def make_shade(lanes: int) -> wp.Kernel:
     """The colors of ``lanes`` Gaussians at once."""
     evaluate = make_harmonics(lanes).evaluate
@@ -94,7 +92,7 @@ def make_shade(lanes: int) -> wp.Kernel:
     return shade
 
 
-@functools.cache
+@once
 def make_adj_shade(lanes: int) -> wp.Kernel:
     """The adjoint of :func:`make_shade`'s kernel."""
     table, evaluate, _, weigh = make_harmonics(lanes)
@@ -171,7 +169,7 @@ def make_adj_shade(lanes: int) -> wp.Kernel:
     return adj_shade
 
 
-@functools.cache
+@once
 def make_adj_rest() -> wp.Kernel:
     """Of a GPU, the gradients of all coefficients but the first, which threads then store side by side."""
     evaluate = make_harmonics(1).evaluate

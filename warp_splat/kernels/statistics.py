@@ -1,15 +1,13 @@
 """What a growth remembers of the gradients of the 2D means."""
 
-import functools
-
 import warp as wp
 
 from warp_splat.kernels.columns import columns
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.simd import TYPES, equal, fill, less, pick, real, root, times
 
 
-@functools.cache
+@once
 def make_observe(lanes: int) -> wp.Kernel:
     """Of ``lanes`` Gaussians at once."""
     number, integer, row2, _row3, _row4 = TYPES[lanes]

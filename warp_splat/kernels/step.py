@@ -5,12 +5,11 @@ What they share with the loops that Warp differentiates whole is here, too. ``nu
 sliced so that the Gaussian is computed at one place of a kernel (:mod:`warp_splat.kernels.falloff`).
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.falloff import LN_2, LOG2_E, Falloff, make_falloff
 from warp_splat.kernels.simd import LANES, fill, fma, func_of, inner, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
@@ -78,7 +77,7 @@ class ReverseStep(NamedTuple):
     geometry: wp.Function
 
 
-@functools.cache
+@once
 def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) -> ReverseStep:
     """By hand (top of :mod:`warp_splat.kernels.splat`), or, ``stepwise``, by Warp.
 
@@ -136,7 +135,7 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
     }[mode]
 
 
-@functools.cache
+@once
 def make_step(falloff: Falloff | int | None, number: type) -> wp.Function:
     """A step whose adjoint is wp.grad(step), as in the rasterizer written in Slang (Bangaru et al. 2023).
 

@@ -5,13 +5,12 @@ tiles. All that follows is integer work, so no two kernels can round differently
 ``kernels/cpu/lists.py``, a GPU in ``kernels/cuda/lists.py``.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.falloff import LOG2_E, in_each_lane
 from warp_splat.kernels.simd import TYPES, fill, over, root, rounded_down, rounded_up, times, whole
 from warp_splat.kernels.splat import Splat2D
@@ -45,7 +44,7 @@ def square_of(x_extent: Any, y_extent: Any, xx: Any, xy: Any, reach: Any):
     return rounded_up(times(root(times(var_x + var_y + across, 0.5)), 3.0))
 
 
-@functools.cache
+@once
 def make_shaped(reach_of: wp.Function, lanes: int) -> wp.Function:
     """Half sides of the box, and the root, of a splat; ``reach_of`` says where its falloff ends."""
     number = TYPES[lanes].number

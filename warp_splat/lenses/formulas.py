@@ -58,8 +58,7 @@ def radial_of(k, r2):
 def fisheye(k, x, y, z):
     """A polynomial of the angle from the axis: Kannala and Brandt (2006), as OpenCV has it."""
     k1, k2, k3, k4 = k
-    u, v = _angles(x, y, z)
-    r2 = u * u + v * v
+    u, v, r2 = _angles(x, y, z)
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
     return u * radial, v * radial
 
@@ -67,8 +66,7 @@ def fisheye(k, x, y, z):
 def thin_prism_fisheye(k, x, y, z):
     """Of the angle: radial, tangential, and two coefficients of a thin prism (Weng et al. 1992)."""
     k1, k2, p1, p2, k3, k4, sx, sy = k
-    u, v = _angles(x, y, z)
-    r2 = u * u + v * v
+    u, v, r2 = _angles(x, y, z)
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
     u, v = _tangential(u * radial, v * radial, u, v, r2, p1, p2)
     return u + sx * r2, v + sy * r2
@@ -77,8 +75,7 @@ def thin_prism_fisheye(k, x, y, z):
 def prism_on_fisheye(k, x, y, z):
     """Of the angle: radial first; tangential and four of a thin prism from what that gives (Project Aria's)."""
     k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3 = k
-    u, v = _angles(x, y, z)
-    r2 = u * u + v * v
+    u, v, r2 = _angles(x, y, z)
     radial = 1 + r2 * (k0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * (k4 + r2 * k5)))))
     u, v = u * radial, v * radial
     r2 = u * u + v * v
@@ -126,9 +123,10 @@ def _tangential(u, v, x, y, r2, p1, p2):
 
 
 def _angles(x, y, z):
-    """The direction of (x, y), as long as the angle from the axis."""
+    """The direction of (x, y), as long as the angle from the axis; and the square of that."""
     ratio = _angle_over_radius(x * x + y * y, z)
-    return x * ratio, y * ratio
+    u, v = x * ratio, y * ratio
+    return u, v, u * u + v * v
 
 
 def _angle_over_radius(r2, z):

@@ -20,6 +20,7 @@ import torch
 import warp as wp
 
 from warp_splat.errors import InputError
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.pool import even_slices, in_slices, set_threads
@@ -117,11 +118,9 @@ def launch(
         return
 
     def run(low: int, high: int) -> None:
-        where = {"device": "cpu", "record_tape": False}
-        wp.launch(kernel, dim=high - low, inputs=[low, *inputs], outputs=outputs, **where, **adjoint)
+        wp.launch(kernel, high - low, [low, *inputs], outputs, device="cpu", record_tape=False, **adjoint)
 
-    if len(bounds) > 2:
-        wp.load_module(kernel.module, device="cpu")  # here, not in two threads at once
+    load("cpu", kernel)
     in_slices(run, bounds)
 
 
@@ -225,7 +224,8 @@ def arrays_of(types: Sequence[type], tensors: Sequence[torch.Tensor]) -> list:
     return [view(t if t.shape[1:] == inner else t.view(-1, *inner), dtype) for t, inner, dtype in given]
 
 
-def load(device: torch.device, *kernels: wp.Kernel) -> None:
+@once
+def load(device: torch.device | str, *kernels: wp.Kernel) -> None:
     """Compile and load ``kernels``, and what else is in their modules."""
     wp.init()
     for kernel in kernels:

@@ -45,23 +45,21 @@ def reconstruct(
         begun = models.with_name("mapping")
         seconds = round(SECONDS_PER_MATCH * matches * images ** (1 / 3)) + 1
         mappers = {"global": partial(_map_globally, seconds=seconds), "incremental": _map_stepwise}
-        found: dict[str, list[pycolmap.Reconstruction]] = {}
+        found, fits = {}, {}
         for name, mapper in mappers.items():
             found[name] = _made(begun / name, partial(mapper, database, root, config))
-            if images > MANY and found[name] and _is_enough(found[name][0], database, images):
-                break
-        best = max(found, key=lambda name: goodness(found[name][0], database) if found[name] else (0, 0))
-        told = ", ".join(f"{name} {_told(each[0], database) if each else 'none'}" for name, each in found.items())
+            if found[name]:
+                fits[name] = matches_that_fit(found[name][0], database)
+                if images > MANY and _is_enough(found[name][0], *fits[name], images):
+                    break
+        # the most photographs; of as many, the most matches that fit
+        best = max(fits, key=lambda name: (found[name][0].num_reg_images(), fits[name][0].sum()), default="global")
+        told = ", ".join(f"{name} {_told(found[name][0], *fits[name]) if name in fits else 'none'}" for name in found)
         say(f"cameras by {best} mapping; photographs of {images}: {told}")
         every = found[best] + [model for name, each in found.items() if name != best for model in each]
         _made(models, partial(_finish, database, root, config, every, images))
         shutil.rmtree(begun)
     return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir()}
-
-
-def goodness(model: pycolmap.Reconstruction, database: Path) -> tuple[int, int]:
-    """What makes one model better than another: photographs; at as many, matches that fit."""
-    return model.num_reg_images(), int(matches_that_fit(model, database)[0].sum())
 
 
 def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -87,16 +85,15 @@ def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np
     return tuple(np.array(found).T)
 
 
-def _is_enough(model: pycolmap.Reconstruction, database: Path, images: int) -> bool:
+def _is_enough(model: pycolmap.Reconstruction, fit: np.ndarray, every: np.ndarray, images: int) -> bool:
     """Whether incremental mapping could add little: photographs are there, and what surely fits does so here."""
-    fit, every = matches_that_fit(model, database)
     torn = (2 * fit < every)[every >= SURE]
     return model.num_reg_images() >= ENOUGH * images and bool(torn.sum() <= TORN * len(torn))
 
 
-def _told(model: pycolmap.Reconstruction, database: Path) -> str:
-    (fit, every), error = np.sum(matches_that_fit(model, database), axis=1), model.compute_mean_reprojection_error()
-    return f"{model.num_reg_images()} ({100 * fit / max(every, 1):.1f} % of {every} matches fit, {error:.2f} px)"
+def _told(model: pycolmap.Reconstruction, fit: np.ndarray, every: np.ndarray) -> str:
+    share, error = 100 * fit.sum() / max(every.sum(), 1), model.compute_mean_reprojection_error()
+    return f"{model.num_reg_images()} ({share:.1f} % of {every.sum()} matches fit, {error:.2f} px)"
 
 
 def _sizes(database: Path) -> tuple[int, int]:

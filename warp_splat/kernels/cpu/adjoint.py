@@ -3,12 +3,10 @@
 Both recover T by division, both sum over the pixels of a tile in lanes and write one row per tile instance.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, LANE_X, LANE_Y, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, VECTORS, fma, times, total, vec16, where_less
@@ -44,7 +42,7 @@ def folded_eight(rows: wp.array[vec16], row: int) -> vec8:
     """Sums of eight rows of lanes, found together."""
 
 
-@functools.cache
+@once
 def make_upstream(variant: BlendVariant) -> wp.Kernel:
     """The start of every adjoint: upstream gradients from pixels to blocks, those that are not finite dropped."""
     CHANNELS = variant.channels
@@ -118,7 +116,7 @@ def make_upstream(variant: BlendVariant) -> wp.Kernel:
     return upstream
 
 
-@functools.cache
+@once
 def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The reverse loop with the step of ``mode``."""
     CHANNELS, GRADS = variant.channels, variant.columns

@@ -31,13 +31,11 @@ Tried:
 - 7 to 10 % slower, not 2 to 4: what was seen as bits of one number, not as sixteen numbers that become bits in the end
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, brightness, own_light, sure, unsure
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.cpu.settle import SETTLED, make_settle, rows_from
 from warp_splat.kernels.falloff import make_falloff
@@ -177,7 +175,7 @@ def walk(bins, near, start, count, way, known, out, begin, step, finish, tile):
             break
 
 
-@functools.cache
+@once
 def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     CHANNELS = variant.channels

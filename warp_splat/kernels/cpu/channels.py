@@ -5,12 +5,10 @@ forward they repeat the weights, backward they recover T as ``manual`` and ``ste
 cache, which is why channels go in groups. Kernels for one group serve any number of channels in it.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.adjoint import folded
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.falloff import make_falloff
@@ -58,7 +56,7 @@ def row_of_splat(rows: wp.array2d[float], splat: int):
     return wp.array(ptr=rows.ptr + wp.uint64(4 * AT_ONCE) * wp.uint64(splat), shape=(AT_ONCE,), dtype=float)
 
 
-@functools.cache
+@once
 def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     """The sums of weights times channels; nothing stands behind them.
 
@@ -154,7 +152,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     return beside
 
 
-@functools.cache
+@once
 def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
     """The adjoint of the sums, by hand or by Warp's derivative of a step.
 

@@ -1,15 +1,13 @@
 """Sums of each Gaussian's rows of gradients, which lie where its instances stand in the tiles' lists."""
 
-import functools
-
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 
 AHEAD = wp.constant(24)  # rows for which memory is asked before they are read
 
 
-@functools.cache
+@once
 def make_gather(widths: tuple[int, ...]) -> wp.Kernel:
     """For rows whose numbers belong to tables of these ``widths``, one after another."""
     width = sum(widths)

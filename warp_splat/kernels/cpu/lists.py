@@ -18,12 +18,10 @@ rows are. Tried:
 - no faster: a row to a line of the cache
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.simd import LANES, vec16, vec16i
@@ -37,7 +35,7 @@ DIGITS = 2**11  # of the radix sort
 AHEAD = wp.constant(32)  # rounds for which memory is asked before
 
 
-@functools.cache
+@once
 def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
     """Splats as the blends read them, and how many rows of tiles each has; ``reach_of``: where their falloff ends."""
     shaped = make_shaped(reach_of, LANES)

@@ -4,14 +4,12 @@ What the blend does not see is settled where a map of depth begins, and at the e
 block of pixels.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels import bound as bounds
 from warp_splat.kernels.bound import BoundView, Since
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.simd import LANES, fma, times, vec16, where_less
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
@@ -31,7 +29,7 @@ def rows_from(first: int, rgb: int | None = None) -> tuple[int, ...]:
     return rows if rgb is None else (0, rows[1], rgb, *rows[3:])
 
 
-@functools.cache
+@once
 def make_settle(rgb: int, rows: tuple[int, ...], ahead: int) -> tuple[wp.Function, ...]:
     """What starts, settles before entries, and concludes.
 

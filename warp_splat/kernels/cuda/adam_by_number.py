@@ -3,12 +3,10 @@
 What it computes is :mod:`warp_splat.kernels.adam`'s. What changes with every step comes as numbers of the launch.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.kernels.adam import adam_step_of
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.halves import HALF, noise, rounded, widened
 
 AT_ONCE = 6  # tables of a launch
@@ -20,7 +18,7 @@ mat_numbers = wp.types.matrix(shape=(AT_ONCE, 7), dtype=float)
 mat_addresses = wp.types.matrix(shape=(AT_ONCE, 4), dtype=wp.uint64)
 
 
-@functools.cache
+@once
 def make_adam_by_number(sparse: bool, halves: bool = False) -> wp.Kernel:
     """``sparse``: only of Gaussians that are drawn; ``halves``: moments in 16 bits."""
     moment = HALF[1] if halves else float

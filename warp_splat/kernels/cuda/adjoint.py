@@ -16,11 +16,10 @@ A row is linear in what pixels add to it: every lane makes one of its own pixels
 - 530, 80 registers, 128 bytes an instance: a lane per Gaussian, without sums; pixels' states go along the warp
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
@@ -53,7 +52,7 @@ def clear_rest(bins: BinsView, tile: int, thread: int, steps: int, slots_out: wp
                 slots_out[first + place, grad] = 0.0
 
 
-@functools.cache
+@once
 def make_upstream(variant: BlendVariant) -> wp.Kernel:
     """The start of every adjoint: upstream gradients by tile and thread, those that are not finite dropped."""
     CHANNELS = variant.channels
@@ -109,7 +108,7 @@ def make_upstream(variant: BlendVariant) -> wp.Kernel:
     return upstream
 
 
-@functools.cache
+@once
 def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The reverse loop by hand, its step by hand (``manual``) or by Warp (``stepwise``); a warp per tile."""
     CHANNELS, GRADS = variant.channels, variant.columns

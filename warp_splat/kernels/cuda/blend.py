@@ -5,12 +5,11 @@ and which blocks its ellipse touches; the warps blend those that touch one of th
 stopped. The mathematics is that of the CPU's lanes (:mod:`warp_splat.kernels.splat`), for one pixel.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.bound import BoundView, Since
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.cuda.settle import EACH, at_start, conclude, expect, make_ideal, vec_each
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
@@ -78,7 +77,7 @@ def place_of(lane: int, block: int):
     return warps.down_of(lane, block) * TILE + warps.across_of(lane, block)
 
 
-@functools.cache
+@once
 def make_blend(variant: BlendVariant) -> wp.Kernel:
     """The blend; a fourth channel carries z; with ``keep``, every T is stored for the adjoint."""
     falloff, CHANNELS = make_falloff(variant.falloff), variant.channels

@@ -3,11 +3,10 @@
 A Gaussian's channels are read from global memory, by all threads of the block at once.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.cuda.adjoint import clear_rest, row_of
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of
 from warp_splat.kernels.cuda.warps import AT_ONCE, COLUMNS, WARP, block_sum, column_of, vec10, vec_channels
@@ -20,7 +19,7 @@ from warp_splat.kernels.structs import BinsView
 from warp_splat.kernels.tiles import first_pixel_of
 
 
-@functools.cache
+@once
 def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     """The sums of weights times channels; or, with ``most``, the weights of so many strongest Gaussians."""
     fall_at, WIDTH, MOST = make_falloff(variant.falloff).value, AT_ONCE, most or 0
@@ -101,7 +100,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     return beside
 
 
-@functools.cache
+@once
 def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Kernel:
     """The adjoint of the sums, by hand or by Warp's derivative of a step.
 

@@ -4,10 +4,9 @@ A warp sums the rows of a splat with many together, lane by lane and then over t
 the order of every sum, depends on the lists alone: two runs give the same bits.
 """
 
-import functools
-
 import warp as wp
 
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.cuda.warps import AT_ONCE, WARP, WARP_OPTIONS, column_of, lane_sum, vec_channels
 
 MANY = wp.constant(64)  # rows of a splat from which on its warp sums them together
@@ -24,7 +23,7 @@ class GradientsView:
     fifth: wp.array2d[float]  # [N, ...]
 
 
-@functools.cache
+@once
 def make_gather(widths: tuple[int, ...]) -> wp.Kernel:
     """For rows whose numbers belong to tables of these ``widths``, one after another; sixteen numbers at a time."""
     width = sum(widths)

@@ -8,11 +8,10 @@ There may be room for more instances than there are. What is left over belongs t
 room for fewer: then nothing is written beyond it.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import Splats2DView
@@ -37,7 +36,7 @@ def tiles_of_row(splat: Splat2D, row: int, width: int, square: int):
     return left // TILE, wp.max(right // TILE - left // TILE + 1, 0)
 
 
-@functools.cache
+@once
 def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
     """Splats by rank, and the tiles of each; ``reach_of`` says where their falloff ends."""
     shaped = make_shaped(reach_of, 1)
@@ -86,7 +85,7 @@ def begin_of(ends: wp.array[wp.int64], i: int, room: int):
     return int(wp.min(begin, wp.int64(room)))
 
 
-@functools.cache
+@once
 def make_list_tiles(narrow: bool) -> wp.Kernel:
     """Instances by rank; ``narrow``: tiles in 16 bits."""
     number = wp.int16 if narrow else int
@@ -136,7 +135,7 @@ def make_list_tiles(narrow: bool) -> wp.Kernel:
     return list_tiles
 
 
-@functools.cache
+@once
 def make_gather_tiles(narrow: bool) -> wp.Kernel:
     """Instances by tile, after the sort; ``narrow``: tiles in 16 bits."""
     number = wp.int16 if narrow else int

@@ -1,12 +1,11 @@
 """The bound beside CUDA's blend, as ``kernels/cpu/settle.py`` keeps it: a row for each sum, a column for each pixel."""
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels import bound as bounds
 from warp_splat.kernels.bound import BoundView, Since
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.cuda.warps import across_of, down_of, vec12
 from warp_splat.kernels.simd import where_less
 from warp_splat.kernels.slots import CHANNEL, OPACITY
@@ -70,7 +69,7 @@ def expect(
     return m, bounds.watch(bound, since, bins, k, count)
 
 
-@functools.cache
+@once
 def make_ideal(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
     """What keeps the ideal: from the picture's sums, if those are its own, and with one more Gaussian."""
 

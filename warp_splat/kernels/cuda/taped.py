@@ -5,11 +5,10 @@ read as one vector, whose custom gradient sums over the block's pixels and write
 it from global memory: they would all add to the adjoint of a staged element.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import TILE
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.cuda.adjoint import row_of
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, staged_of
 from warp_splat.kernels.cuda.warps import COLUMNS, WARP, block_sum, column_of, vec10
@@ -52,7 +51,7 @@ def adj_behind_of(front: float, w: float, adj_ret: float):
     wp.adjoint[w] -= adj_ret
 
 
-@functools.cache
+@once
 def make_walk(mode: str, variant: BlendVariant) -> wp.Kernel:
     """The blend over the instances that were blended, for its generated adjoint in ``mode``."""
     CHANNELS, GRADS = variant.channels, variant.columns

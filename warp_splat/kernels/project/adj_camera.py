@@ -15,14 +15,13 @@ conic C = (A A' + e I)^-1 says all, without a difference of large numbers. With 
 That holds for every projection and every lens whose limits and coefficients stay as they are.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from warp_splat.config import COMPENSATION_MIN
 from warp_splat.kernels.columns import columns
-from warp_splat.kernels.compiler import FORWARD_ONLY
+from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import TYPES, equal, fill, fma, inner, less, pick, root, times
 
@@ -35,7 +34,7 @@ def total_where(mask: Any, x: Any):
     return inner(pick(mask, x, fill(0.0, x)), fill(1.0, x))
 
 
-@functools.cache
+@once
 def make_adj_pose(lanes: int) -> wp.Kernel:
     """Of ``lanes`` Gaussians at once."""
     number, _integer, _row2, row3, row4 = TYPES[lanes]
@@ -83,7 +82,7 @@ def make_adj_pose(lanes: int) -> wp.Kernel:
     return adj_pose
 
 
-@functools.cache
+@once
 def make_adj_intrinsics(lanes: int) -> wp.Kernel:
     """Of ``lanes`` Gaussians at once."""
     number, _integer, row2, row3, _row4 = TYPES[lanes]

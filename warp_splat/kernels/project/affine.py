@@ -1,15 +1,14 @@
 """EWA splatting with an affine camera (Zwicker et al. 2001; Kerbl et al. 2023, eq. 5): linearized at the mean."""
 
-import functools
-
 import warp as wp
 
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.project import Projection, lens
 from warp_splat.kernels.project.camera_view import CameraView, turn
 from warp_splat.kernels.simd import TYPES, fill, fma, inverse, less, over, pick, times
 
 
-@functools.cache
+@once
 def make_pinhole(lanes: int, limited: bool = True) -> wp.Function:
     """The pinhole camera; ``limited``: its derivative far outside the image is that at the limits of the slopes."""
     number = TYPES[lanes].number

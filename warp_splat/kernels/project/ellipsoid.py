@@ -11,11 +11,10 @@ We take k = 2. Against the volume (benchmarks/volume.py) its footprint is better
 that of k = 3 worse by 1 to 6.
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.config import OUTLINE, OUTLINE_REACH
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.affine import make_pinhole
 from warp_splat.kernels.project.camera_view import CameraView
@@ -29,7 +28,7 @@ def make_lens(lanes: int) -> wp.Function:
     return make_pinhole(lanes, limited=False)
 
 
-@functools.cache
+@once
 def make_outline(lanes: int) -> wp.Function:
     """The mean and the rows of A that belong to the outline."""
 

@@ -8,12 +8,12 @@ A panorama ends where it begins. A Gaussian near a pole is as wide as the pictur
 copies, a turn to either side (:mod:`warp_splat.raster.seam`), add up to almost the same at all longitudes.
 """
 
-import functools
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.formula import Notes, Number, write_function
 from warp_splat.kernels.project import COEFFICIENTS, Projection
 from warp_splat.lenses.formulas import Family
@@ -24,14 +24,14 @@ WIDEST = 0.4  # of a panorama's width, a standard deviation: three copies add up
 OUTLINE = ("z", "px", "py", "a10", "a11", "a12", "a20", "a21", "a22", "t0", "t1", "t2", "sx", "sy", "sz", "drawn")
 
 
-@functools.cache
+@once
 def through(family: Family, learned: bool = False) -> Projection:
     """EWA splatting (Zwicker et al. 2001), linearized at the mean by the lens's own derivative.
 
     ``learned``: its coefficients are numbers of the kernel that get a gradient, not the camera's.
     """
 
-    @functools.cache
+    @once
     def make_lens(lanes: int) -> wp.Function:
         notes = Notes()
         place, slopes, seen = image_of(notes, family, *(Number(notes, name) for name in "xyz"), learned=learned)
@@ -84,7 +84,7 @@ def bent(
     return family.formula([notes.number(*kind) for kind in kinds], *variables), excess, seen
 
 
-@functools.cache
+@once
 def make_narrow(lanes: int) -> wp.Function:
     """The outline of what a panorama shows: no wider than WIDEST."""
     notes = Notes()

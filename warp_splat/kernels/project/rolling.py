@@ -14,7 +14,6 @@ So a camera that does not move then sees a Gaussian that has been moved and shea
 Rows are those of the lens. Their derivative by the point is written down by forward differentiation, as of any lens.
 """
 
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,6 +21,7 @@ import warp as wp
 
 from warp_splat.config import FRUSTUM_MARGIN
 from warp_splat.kernels.columns import columns
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.formula import Notes, Number, write_function
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.lens import LIMIT, bent
@@ -36,7 +36,7 @@ GIVEN = ("wx", "wy", "wz", "per_slope", "dx", "dy", "dz", "first", "ox", "oy", "
 Vector = list[Number]
 
 
-@functools.cache
+@once
 def make_expose(family: Family, lanes: int, steps: int = STEPS) -> wp.Function:
     """For the lenses of a family: where the camera of the middle row would have to see a Gaussian.
 

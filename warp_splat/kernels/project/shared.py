@@ -10,12 +10,10 @@ of the time of vectors and matrices of one Gaussian. Tried:
 - zeros written here instead of by the caller: the adjoint reads them, and gains nothing
 """
 
-import functools
-
 import warp as wp
 
 from warp_splat.kernels.columns import columns, rows
-from warp_splat.kernels.compiler import DIFFERENTIABLE
+from warp_splat.kernels.compiler import DIFFERENTIABLE, once
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
@@ -25,7 +23,6 @@ from warp_splat.kernels.project.pieces import all_finite, offset, rotation, size
 from warp_splat.kernels.simd import TYPES, equal, fill, fma, inverse, less, pick, real, root, some, times, vec16, whole
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
-CULLED = wp.constant(0)
 INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
 
 
@@ -41,7 +38,7 @@ for number in (float, vec16):
         pass
 
 
-@functools.cache
+@once
 def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expose: wp.Function | None) -> wp.Kernel:
     """The geometry of ``lanes`` Gaussians at once: 16 on a CPU, 1 on a GPU.
 
@@ -75,7 +72,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         opacities_out: wp.array[number],  # [N / lanes] after antialiasing
         depths_out: wp.array[number],  # [N / lanes] z in the camera
         extents_out: wp.array[row2],  # [N / lanes] px, half sides of the box where alpha >= alpha_min
-        radii_out: wp.array[integer],  # [N / lanes] px, farthest such point; CULLED, INVALID if not; read first
+        radii_out: wp.array[integer],  # [N / lanes] px, farthest such point; 0 (culled), INVALID if not; read first
     ):
         g = first + wp.tid()
         mx, my, mz = columns(means[g])
@@ -92,7 +89,7 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
         valid = times(finite, less(zero, size))
         # the adjoint skips what the forward pass left out: no work, and no 0 times infinity
         here = times(valid, less(zero, real(radii_out[g])))
-        radii_out[g] = whole(valid - one)  # CULLED or INVALID
+        radii_out[g] = whole(valid - one)  # 0 or INVALID
         ox, oy, oz = offset(camera, here, mx, my, mz)
         if wp.static(expose is not None):
             ox, oy, oz, n00, n01, n02, n10, n11, n12, n20, n21, n22 = expose(camera, quats, g, ox, oy, oz)

@@ -13,12 +13,12 @@ to the middle, and by (sqrt(8) - 2) (m - p_0) / 2 beyond. So the determinant is 
 of each two of the six vectors, over 9 (Cauchy and Binet).
 """
 
-import functools
 import itertools
 
 import numpy as np
 import warp as wp
 
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.formula import Notes, Number, write_function
 from warp_splat.kernels.project import COEFFICIENTS, Projection
 from warp_splat.kernels.project.lens import NOWHERE, OUTLINE, image_of
@@ -29,7 +29,7 @@ BEYOND = (8.0**0.5 - 2.0) / 2.0  # of the mean: its weight of 2 comes with the m
 LEAST = 1.0e-30  # px^2 or px^4, of what has a root
 
 
-@functools.cache
+@once
 def make_identity(lanes: int) -> wp.Function:
     """The camera's own axes: the outline, not the lens, makes an image of them."""
     notes = Notes()
@@ -37,11 +37,11 @@ def make_identity(lanes: int) -> wp.Function:
     return write_function("identity", notes, "xyz", [Number(notes, "x"), Number(notes, "y"), *turns], lanes)
 
 
-@functools.cache
+@once
 def through(family: Family, learned: bool = False) -> Projection:
     """For the lenses of a family; ``learned`` as in :mod:`.lens`."""
 
-    @functools.cache
+    @once
     def make_outline(lanes: int) -> wp.Function:
         notes = Notes()
         given = {name: Number(notes, name) for name in OUTLINE}
