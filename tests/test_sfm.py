@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -154,8 +155,25 @@ TRIAL = """
 import os, signal, threading, time
 from warp_splat.sfm.stages import run_watched
 threading.Timer(1, os.kill, (os.getpid(), signal.SIGINT)).start()
-run_watched("", 1, lambda: time.sleep(300), int, True, False, {!r})
+run_watched({!r}, "", 1, lambda: time.sleep(300), int, True, stops=False)
 """
+
+
+@pytest.mark.parametrize("free", [[], [stages.ROOM, stages.ROOM]], ids=["before", "meanwhile"])
+def test_a_full_disk_ends_a_stage_with_a_sentence(tmp_path, monkeypatch, free):
+    """Before pycolmap, whose thread would abort, finds it so."""
+    begun = []
+
+    def work(cancellation_token):
+        begun.append(True)
+        while not cancellation_token.is_cancelled():
+            time.sleep(0.01)
+
+    told = iter([*free, 0])
+    rest = [stages.ROOM]  # what was removed meanwhile does not make the stage whole
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=next(told, *rest)))
+    refusal(lambda: stages.run_watched(tmp_path, "", 1, work, int, quiet=True), str(tmp_path), "64 MiB")
+    assert bool(begun) == bool(free)
 
 
 def test_photographs_that_cannot_be_read_are_left_out(photos, tmp_path, capsys):

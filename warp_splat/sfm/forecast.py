@@ -6,6 +6,7 @@ from itertools import combinations
 from pathlib import Path
 
 from warp_splat.config import CORES, SfmConfig
+from warp_splat.errors import InputError
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.scene.photos import PHOTOS, find_files, photo_root
@@ -42,7 +43,11 @@ def time_of_cameras(source: Path, say: Report) -> None:
     before = peak_memory() or 0
     try:
         extraction, features, matching = _measured(root, tried, SfmConfig(str(source), "", threads=CORES, quiet=True))
-    except (RuntimeError, OSError):  # no room for temporary files, for one; who needs the cameras will be told
+    except (
+        RuntimeError,
+        OSError,
+        InputError,
+    ):  # no room for temporary files, for one; who needs the cameras will be told
         return
     mapping = (GLOBAL + INCREMENTAL * (count <= MANY)) * count ** (4 / 3) * extraction / 60  # on one thread
     extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
@@ -60,7 +65,7 @@ def _measured(root: Path, tried: list[list[str]], config: SfmConfig) -> tuple[fl
     with tempfile.TemporaryDirectory() as folder:
         database = Path(folder) / "database.db"
         began = time.process_time()
-        stages.extract(database, root, tried, config, folder)
+        stages.extract(database, root, tried, config, stops=False)
         extracted = time.process_time()
         with stages.opened(database) as connection:
             count, features = sum(map(len, tried)), connection.num_keypoints()

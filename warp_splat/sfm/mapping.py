@@ -133,7 +133,7 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
             pycolmap.triangulate_points(model, calibrated, root, part / str(number), options=points)
 
     began = time.monotonic()
-    run_watched("cameras (s)", seconds, work, lambda: int(time.monotonic() - began), config.quiet, stops=False)
+    run_watched(part, "cameras (s)", seconds, work, lambda: int(time.monotonic() - began), config.quiet, stops=False)
     (part / database.name).unlink()
 
 
@@ -187,7 +187,7 @@ def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, sta
         "next_image_callback": lambda: registered.append(1),
     }
     work = partial(pycolmap.incremental_mapping, database, root, part, options, input_path=start or "", **found)
-    run_watched("cameras", _sizes(database)[0], work, lambda: len(registered), config.quiet)
+    run_watched(part, "cameras", _sizes(database)[0], work, lambda: len(registered), config.quiet)
 
 
 def _finish(

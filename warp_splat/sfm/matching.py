@@ -82,7 +82,7 @@ def _run(database: Path, run: Callable, pairing: object, total: int, config: Sfm
     verification.ransac.random_seed = config.seed
     work = partial(run, database, options, pairing, verification, pycolmap.Device.cpu)
     with opened(database) as connection:
-        run_watched("matches", total, work, connection.num_matched_image_pairs, config.quiet)
+        run_watched(database.parent, "matches", total, work, connection.num_matched_image_pairs, config.quiet)
 
 
 def fitting(database: Path) -> dict[tuple[int, int], int]:

@@ -23,33 +23,50 @@ from warp_splat.scene.colmap_library import pycolmap
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
+ROOM = 2**26  # bytes of a disk: where it has none left, pycolmap ends the process
 SPACE = "\x1f"  # stands for a space in names while a list of pairs is matched: pycolmap splits its lines at spaces
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
 
 def run_watched(
-    title: str, total: int, work: Callable, count: Callable[[], int], quiet: bool, stops: bool = True, trial: str = ""
+    folder: Path, title: str, total: int, work: Callable, count: Callable[[], int], quiet: bool, stops: bool = True
 ) -> None:
     """Run ``work`` in a thread and show a bar until it ends; Ctrl-C lets it end at the next image, then raises.
 
-    What does not stop, Ctrl-C ends with the whole process, and the folder of a ``trial`` with it.
+    What does not stop, Ctrl-C ends with the whole process, and the ``folder`` that it writes with it.
+
+    Raises:
+        InputError: if the disk of ``folder`` is full, or becomes so, which ends it likewise.
     """
+    check_room(folder)
     token = {"cancellation_token": pycolmap.CancellationToken()} if stops else {}
     pause = 0.1 if sys.stderr.isatty() else 10.0  # seconds between two lines; a log keeps them all
     bar = tqdm(total=total, desc=title, disable=quiet, bar_format=BAR, mininterval=pause, maxinterval=pause)
+    full = False
     with interruptible() as interrupted, bar, ThreadPoolExecutor(1) as pool:
         running = pool.submit(work, **token)
         while not running.done():
             wait([running], POLL)
             bar.update(min(count(), total) - bar.n)
             if interrupted and not stops:
-                shutil.rmtree(trial, ignore_errors=True)
+                shutil.rmtree(folder, ignore_errors=True)
                 leave("warp-splat: interrupted; what was saved before stays.")
-            if interrupted:
+            full = full or shutil.disk_usage(folder).free < ROOM
+            if stops and (interrupted or full):
                 token["cancellation_token"].cancel()
     if interrupted:
         raise KeyboardInterrupt
+    check_room(folder, full)
     running.result()  # what it raised, in the thread that the user sees
+
+
+def check_room(folder: Path, full: bool = False) -> None:
+    """Raise InputError if the disk of a folder is, or was, full."""
+    if full or shutil.disk_usage(folder).free < ROOM:
+        raise InputError(
+            f"{folder}: expected {ROOM >> 20} MiB free on its disk, found less; free some and run the same again, "
+            "which goes on here."
+        )
 
 
 def opened(database: Path) -> pycolmap.Database:
@@ -70,8 +87,8 @@ def rename(database: Path, old: str, new: str) -> None:
                 connection.update_image(image)
 
 
-def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig, trial: str = "") -> None:
-    """Find SIFT features in the photographs below ``root``; those of a group share a lens. ``trial``: run_watched's."""
+def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig, stops: bool = True) -> None:
+    """Find SIFT features in the photographs below ``root``; those of a group share a lens. ``stops``: run_watched's."""
     rename(database, SPACE, " ")  # of a run that was killed while it matched
     for names in groups:  # first, so that images are numbered by name and not by which thread was faster
         reader = pycolmap.ImageReaderOptions()
@@ -89,7 +106,7 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
     with opened(database) as connection:
         numbers = [image.image_id for image in connection.read_all_images()]
         found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
-        run_watched("features", len(numbers), work, found, config.quiet, not trial, trial)
+        run_watched(database.parent, "features", len(numbers), work, found, config.quiet, stops)
 
 
 def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, config: SfmConfig) -> None:
@@ -108,7 +125,7 @@ def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, co
     def written() -> int:
         return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
 
-    run_watched(title, count, work, written, config.quiet)
+    run_watched(scene, title, count, work, written, config.quiet)
     if written() < count:
         raise InputError(f"{part}: only {written()} of {count} images could be written; free some space and run again.")
     os.replace(part / "images", scene / "images")
