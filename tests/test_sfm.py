@@ -166,7 +166,7 @@ def test_a_full_disk_ends_a_stage_with_a_sentence(tmp_path, monkeypatch, free):
 
     def work(cancellation_token):
         begun.append(True)
-        while not cancellation_token.is_cancelled():
+        while not cancellation_token.is_cancelled:
             time.sleep(0.01)
 
     told = iter([*free, 0])
