@@ -1,10 +1,11 @@
 """Formats of Gaussians: bytes against what their documents say, axes, round trips, what is lost, and renders."""
 
 import struct
+from functools import partial
 
 import numpy as np
 import pytest
-from commands import changes_told
+from commands import changes_told, full_disk
 from common import picture_of
 from hostile import refusal
 from scenes import C0
@@ -236,6 +237,19 @@ def test_round_trip_returns_the_scene(tmp_path, ending, coefficients):
     again = tmp_path / f"b{ending}"
     after = save_gaussians(again, after, report=silent)
     assert "color" not in str(losses(after, load_gaussians(again)))  # a second time costs nothing
+
+
+@pytest.mark.parametrize("left", [-20, 500], ids=["all but its end", "its beginning"])
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_full_disk_leaves_no_part_of_a_file(tmp_path, ending, left):
+    write = partial(save_gaussians, tmp_path / f"a{ending}", some_file(200), report=silent)
+    write()
+    size = max(path.stat().st_size for path in tmp_path.iterdir())
+    for path in tmp_path.iterdir():
+        path.unlink()
+    with full_disk(left % size):
+        refusal(write, str(tmp_path), "could not be written")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("ending", [".compressed.ply", ".usda"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.files import Unexpected, atomic_write, reading
+from warp_splat.formats.files import Unexpected, reading, write_bytes
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
@@ -36,8 +36,7 @@ def save_splat(path: str | Path, file: SplatFile, report: Report = print) -> Non
     rows["rgba"][:, :3] = np.rint(255 * colors)
     rows["rgba"][:, 3] = np.rint(255 * sigmoid(opacities))
     rows["quat"] = np.clip(np.rint(128 * unit_quats(quats) + 128), 0, 255)
-    with atomic_write(path) as temporary:
-        rows.tofile(temporary)
+    write_bytes(path, rows.tobytes())  # NumPy does not tell when the end is missing
 
 
 def load_splat(path: str | Path, report: Report = print) -> SplatFile:

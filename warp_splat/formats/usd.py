@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from zipfile import is_zipfile
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
     Raises:
         InputError: if the file cannot be written, or the package usd-core is not there.
     """
-    with _library(path):
+    with atomic_write(path) as temporary, TemporaryDirectory() as folder, _library(path, OSError):
         from pxr import Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: PLC0415 - optional
 
         stage = Usd.Stage.CreateInMemory()
@@ -74,15 +75,15 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
         layer = stage.GetRootLayer()
         if coordinates := kept(file.coordinates, "x east, y up, z south"):
             layer.customLayerData = {COORDINATES: json.dumps(coordinates)}
-        with atomic_write(path) as temporary, TemporaryDirectory() as folder:
-            package = temporary.suffix.lower() == ".usdz"
-            inner = f"{folder}/gaussians.usdc" if package else str(temporary)
-            written = layer.Export(inner)
-            if package:
-                os.utime(inner, 2 * (time.mktime(PACKED_AT),))
-                written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary))
-            if not written:
-                raise OSError("by USD")
+        package = temporary.suffix.lower() == ".usdz"
+        inner = f"{folder}/gaussians.usdc" if package else str(temporary)
+        written = layer.Export(inner)
+        if package:
+            os.utime(inner, 2 * (time.mktime(PACKED_AT),))
+            written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary))
+            written = written and is_zipfile(temporary)  # USD does not tell when the end is missing
+        if not written:
+            raise OSError("by USD; its disk may be full")
 
 
 def load_usd(path: str | Path, report: Report = print) -> SplatFile:
@@ -182,8 +183,8 @@ def _extent(means: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndar
 
 
 @contextmanager
-def _library(path: str | Path) -> Iterator[None]:
-    """Turn what usd-core says into the errors of ``reading`` and ``atomic_write``, and that it is not there into one.
+def _library(path: str | Path, kind: type[Exception] = ValueError) -> Iterator[None]:
+    """Make of what usd-core says the ``kind`` of error that ``reading`` or ``atomic_write`` tell.
 
     Raises:
         InputError: if it is not installed, or older than the schema.
@@ -196,4 +197,4 @@ def _library(path: str | Path) -> Iterator[None]:
     try:
         yield
     except Tf.ErrorException as error:
-        raise ValueError(str(error).split(" : '")[-1].strip("\n\t'")) from error
+        raise kind(str(error).split(" : '")[-1].strip("\n\t'")) from error

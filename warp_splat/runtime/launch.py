@@ -59,7 +59,7 @@ def _keep_freed_memory() -> None:
     """Let glibc reuse what a step frees instead of returning it to the system and faulting it in again.
 
     A step allocates tens of megabytes; first touches of fresh pages cost 1 to 5 us each on virtual machines, up to
-    half of a step. Elsewhere than on glibc nothing happens.
+    half of a step. Elsewhere than on glibc nothing happens. No difference: huge pages (glibc.malloc.hugetlb=1).
     """
     try:
         mallopt = ctypes.CDLL("libc.so.6").mallopt

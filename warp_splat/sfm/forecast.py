@@ -43,11 +43,7 @@ def time_of_cameras(source: Path, say: Report) -> None:
     before = peak_memory() or 0
     try:
         extraction, features, matching = _measured(root, tried, SfmConfig(str(source), "", threads=CORES, quiet=True))
-    except (
-        RuntimeError,
-        OSError,
-        InputError,
-    ):  # no room for temporary files, for one; who needs the cameras will be told
+    except (RuntimeError, OSError, InputError):  # no room for files, for one; who needs the cameras will be told
         return
     mapping = (GLOBAL + INCREMENTAL * (count <= MANY)) * count ** (4 / 3) * extraction / 60  # on one thread
     extraction, matching = extraction * count / CORES / 60, matching * pairs / CORES / 60
