@@ -1,7 +1,9 @@
 """Formats of Gaussians: bytes against what their documents say, axes, round trips, what is lost, and renders."""
 
+import errno
 import struct
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,6 +251,16 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path, ending, left):
         path.unlink()
     with full_disk(left % size):
         refusal(write, str(tmp_path), "could not be written")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_no_buffer_alone(tmp_path, monkeypatch):
+    def cut(path, text, **_):
+        path.write_bytes(text.encode()[:-1])
+        raise OSError(errno.ENOSPC, "no space left")
+
+    monkeypatch.setattr(Path, "write_text", cut)
+    refusal(partial(save_gaussians, tmp_path / "a.gltf", some_file(9), report=silent), "no space left")
     assert not list(tmp_path.iterdir())
 
 

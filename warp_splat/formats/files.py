@@ -49,7 +49,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             with suppress(OSError):  # failing to tidy up must not hide the error that made it necessary
                 temporary.unlink(missing_ok=True)
     except OSError as error:
-        older = "; an older file of this name is untouched" if os.path.exists(path) else ""
+        older = "; an older file of this name is untouched" if os.path.isfile(path) else ""
         raise InputError(
             f"{path}: could not be written ({error.strerror or error}){older}. "
             f"{'Free some space or choose' if error.errno in FULL else 'Choose'} another folder."

@@ -16,7 +16,7 @@ from warp_splat import __version__
 from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
-from warp_splat.formats.files import Unexpected, entries_of, reading, write_bytes, write_text
+from warp_splat.formats.files import Unexpected, atomic_write, entries_of, reading, write_bytes
 from warp_splat.formats.gltf_container import CHUNK, HEADER, Document
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
@@ -55,9 +55,10 @@ def save_gltf(path: str | Path, file: SplatFile, report: Report = print) -> None
         document["extras"] = {COORDINATES: coordinates}
     if path.suffix.lower() == ".gltf":
         buffer = path.with_name(f"{path.stem}.{hashlib.sha256(data).hexdigest()[:8]}.bin")
-        write_bytes(buffer, data)
         document["buffers"][0]["uri"] = buffer.name
-        write_text(path, json.dumps(document, indent=1, allow_nan=False))
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
+            write_bytes(buffer, data)  # last, so that it does not stay alone where the disk becomes full
         return
     text = json.dumps(document, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)  # chunks are padded to four bytes; every attribute is

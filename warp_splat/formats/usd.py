@@ -7,10 +7,11 @@ The schema has no word for Mip-Splatting, nor for where in the world a scene is:
 
 # pyright: reportAttributeAccessIssue=false
 # usd-core has no types
+import errno
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -47,7 +48,8 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
     Raises:
         InputError: if the file cannot be written, or the package usd-core is not there.
     """
-    with atomic_write(path) as temporary, TemporaryDirectory() as folder, _library(path, OSError):
+    failed = OSError(errno.ENOSPC, "by USD: its disk, or that of temporary files, may be full")
+    with atomic_write(path) as temporary, TemporaryDirectory() as folder, _library(path, lambda _: failed):
         from pxr import Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: PLC0415 - optional
 
         stage = Usd.Stage.CreateInMemory()
@@ -83,7 +85,7 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
             written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary))
             written = written and is_zipfile(temporary)  # USD does not tell when the end is missing
         if not written:
-            raise OSError("by USD; its disk may be full")
+            raise failed
 
 
 def load_usd(path: str | Path, report: Report = print) -> SplatFile:
@@ -183,8 +185,8 @@ def _extent(means: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndar
 
 
 @contextmanager
-def _library(path: str | Path, kind: type[Exception] = ValueError) -> Iterator[None]:
-    """Make of what usd-core says the ``kind`` of error that ``reading`` or ``atomic_write`` tell.
+def _library(path: str | Path, error_of: Callable[[str], Exception] = ValueError) -> Iterator[None]:
+    """Make of what usd-core says an error that ``reading`` or ``atomic_write`` tell.
 
     Raises:
         InputError: if it is not installed, or older than the schema.
@@ -197,4 +199,4 @@ def _library(path: str | Path, kind: type[Exception] = ValueError) -> Iterator[N
     try:
         yield
     except Tf.ErrorException as error:
-        raise kind(str(error).split(" : '")[-1].strip("\n\t'")) from error
+        raise error_of(str(error).split(" : '")[-1].strip("\n\t'")) from error
