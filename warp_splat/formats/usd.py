@@ -52,6 +52,7 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
     with atomic_write(path) as temporary, TemporaryDirectory() as folder, _library(path, lambda _: failed):
         from pxr import Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: PLC0415 - optional
 
+        temporary.touch()  # tells why nothing can be written there, as USD does not
         stage = Usd.Stage.CreateInMemory()
         UsdGeom.SetStageUpAxis(stage, "Y")
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -82,8 +83,8 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
         written = layer.Export(inner)
         if package:
             os.utime(inner, 2 * (time.mktime(PACKED_AT),))
-            written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary))
-            written = written and is_zipfile(temporary)  # USD does not tell when the end is missing
+            # it does not tell when the end is missing
+            written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary)) and is_zipfile(temporary)
         if not written:
             raise failed
 
