@@ -81,10 +81,10 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
         package = temporary.suffix.lower() == ".usdz"
         inner = f"{folder}/gaussians.usdc" if package else str(temporary)
         written = layer.Export(inner)
-        if package:
+        if written and package:
             os.utime(inner, 2 * (time.mktime(PACKED_AT),))
             # it does not tell when the end is missing
-            written = written and UsdUtils.CreateNewUsdzPackage(inner, str(temporary)) and is_zipfile(temporary)
+            written = UsdUtils.CreateNewUsdzPackage(inner, str(temporary)) and is_zipfile(temporary)
         if not written:
             raise failed
 
