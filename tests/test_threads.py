@@ -127,6 +127,16 @@ def test_every_slice_runs_once(threads):
     assert sorted(done) == sorted([*range(5)] * 2)
 
 
+def test_calls_at_once_share_their_own_work(threads):
+    done = []
+
+    def share(first: int) -> None:
+        pool.in_slices(lambda low, high: done.extend(range(low, high)), [first, first + 2, first + 5])
+
+    pool.at_once(lambda: share(0), lambda: share(5), lambda: share(10))
+    assert sorted(done) == [*range(15)]
+
+
 @pytest.mark.parametrize(
     ("rows", "value", "finite"), [([], 0.0, True), ([COUNT - 1], torch.nan, False), ([0, -1], torch.inf, False)]
 )

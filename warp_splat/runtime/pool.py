@@ -175,6 +175,11 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
     _Job(slices).share(helpers)
 
 
+def at_once(*calls: Callable[[], None]) -> None:
+    """Run ``calls`` at once if threads are free; each may share its own work as well."""
+    in_slices(lambda number, _: calls[number](), list(range(len(calls) + 1)))
+
+
 def set_zero(*tensors: torch.Tensor) -> None:
     """Set all numbers of dense ``tensors``, N rows each, to zero on the threads of the CPU; on a GPU, in one launch."""
 
