@@ -39,7 +39,8 @@ def bin_by_counting(
         InputError: if the tile instances are more than the kernels can number, or than fit.
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-    drawn, invalid = _drawn(splats2d.radii.numpy())
+    radii = splats2d.radii.numpy()
+    drawn, invalid = np.flatnonzero(radii > 0).astype(np.int32), np.count_nonzero(radii < 0)
     count = len(drawn)
     splats, rows = empty(count, Splat2D, "cpu"), np.empty(count, dtype=np.int32)
     gaussians, square = wp.array(drawn, copy=False, device="cpu"), int(options.extent == "square")
@@ -68,7 +69,7 @@ def bin_by_counting(
     )
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))
-    return Bins(len(splats2d.radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)
+    return Bins(len(radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)
 
 
 def bin_by_sorting(
@@ -171,18 +172,6 @@ def _sort_by_tile(
     outputs = [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)]
     _launch_bands(lists.scatter, bounds, [*(in_place(table) for table in (order, begins, row_ends)), spans], outputs)
     return instances, places, ends
-
-
-def _drawn(radii: np.ndarray) -> tuple[np.ndarray, int]:
-    """The Gaussians whose ``radii`` are positive, ascending, and how many have negative ones."""
-    parts, invalid = {}, []
-
-    def run(low: int, high: int) -> None:
-        parts[low] = np.flatnonzero(radii[low:high] > 0).astype(np.int32) + np.int32(low)
-        invalid.append(np.count_nonzero(radii[low:high] < 0))
-
-    in_slices(run, torch_slices(len(radii)))
-    return np.concatenate([np.empty(0, np.int32), *(parts[low] for low in sorted(parts))]), int(sum(invalid))
 
 
 def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
