@@ -51,6 +51,14 @@ def test_slices_cover_everything_in_whole_widths(threads):
     assert pool.torch_slices(10**6) == [0, 10**6]
 
 
+def test_shares_fall_and_the_first_leaves_something_to_each_thread(threads):
+    for work in (0, 1, 4095, 9000, 20_000, 50_000, 10**6):
+        sizes = np.diff(shares := pool.falling_shares(work))
+        assert shares[0] == 0.0 and shares[-1] == 1.0 and (np.diff(sizes) < 1e-12).all()
+        assert len(sizes) == 1 or sizes[0] <= max(1.0 / len(sizes), 0.6 / threads) + 1e-12
+        assert threads == 1 or work < 10**6 or sizes[-1] < 0.1 * sizes[0]
+
+
 def test_steps_are_those_of_adam_in_torch(threads, model):
     """The coefficients of higher degrees get no gradients at first: zeros to torch."""
     optimizer = Optimizer(model, TrainConfig().learn, extent=2.0)

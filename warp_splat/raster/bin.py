@@ -17,14 +17,12 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.runtime.launch import check_memory, empty, launch, read_later, send, view
-from warp_splat.runtime.pool import at_once, even_slices, in_slices, slice_count, torch_slices
+from warp_splat.runtime.pool import at_once, even_slices, falling_shares, in_slices, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
-SLICES_PER_THREAD = 5  # of the blends: tiles differ in cost by more than their number of instances says
 IN_BANDS = 2**19  # splats from which on all threads order them by depth; below, one alone is faster than two
-BITS = DIGITS.bit_length() - 1  # of such a sort, at once
 
 
 def bin_by_counting(
@@ -232,14 +230,9 @@ def _check_longest(count: int) -> None:
 
 
 def balanced_slices(ends: np.ndarray) -> list[int]:
-    """Bounds of slices of tiles by their instances, the last ones small; an empty tile counts a little, too.
-
-    So threads end at the same time. Equal slices, eight to a thread: 1 to 3 % longer steps on two threads.
-    """
+    """Bounds of slices of tiles by the number of their instances; an empty tile counts a little, too."""
     work = ends + 32 * np.arange(1, len(ends) + 1)
-    parts = slice_count(int(work[-1]), SLICES_PER_THREAD)
-    rest = (np.arange(parts - 1, 0, -1) / parts) ** 3
-    return [0, *np.searchsorted(work, work[-1] * (1.0 - rest)).tolist(), len(ends)]
+    return [0, *np.searchsorted(work, work[-1] * falling_shares(int(work[-1]))[1:-1]).tolist(), len(ends)]
 
 
 def order_by_depth(depths: np.ndarray) -> np.ndarray:
@@ -261,12 +254,11 @@ def order_by_depth(depths: np.ndarray) -> np.ndarray:
             wp.utils.radix_sort_pairs(*(wp.array(of, copy=False, device="cpu") for of in (keys, values)), count)
         return values[:count]
     now, then = (depths.view(np.int32), order), (np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32))
-    for shift in range(0, 32, BITS):
+    for shift in range(0, 32, DIGITS.bit_length() - 1):
         counts = np.zeros((len(bounds) - 1, DIGITS), dtype=np.int32)
-        keys, values = (in_place(array) for array in now)
-        _launch_bands(count_digits, bounds, [keys, shift], [in_place(counts)])
-        outputs = [in_place(begins_of(counts)), *(in_place(array) for array in then)]
-        _launch_bands(sort_digits, bounds, [keys, values, shift], outputs)
+        given, found = ([in_place(array) for array in arrays] for arrays in (now, then))
+        _launch_bands(count_digits, bounds, [given[0], shift], [in_place(counts)])
+        _launch_bands(sort_digits, bounds, [*given, shift], [in_place(begins_of(counts)), *found])
         now, then = then, now if shift else (np.empty(count, dtype=np.int32), order)  # the depths stay
     return now[1]
 

@@ -11,7 +11,7 @@ from warp_splat.kernels.cuda import adam_by_number as numbered
 from warp_splat.kernels.simd import LANES
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import launch, load, view
-from warp_splat.runtime.pool import even_slices
+from warp_splat.runtime.pool import falling_shares
 
 HALF = torch.bfloat16
 KEY = 0x9E3779B1  # odd: what differs stays different times it
@@ -43,8 +43,8 @@ def _launch(tables: list, numbers: list, keys: list[int], count: int, radii: tor
     arrays.append(view(torch.tensor(numbers, dtype=torch.float32, device="cpu"), wp.float32))
     for lanes, start, stop in ((LANES, 0, count - count % LANES), (1, count - count % LANES, count)):
         groups = (stop - start) // lanes
-        # slices of as many numbers, which the tables share out among them by their widths
-        shares = np.array(even_slices(groups, each=lanes)) / max(groups, 1) * sum(widths)
+        # by their numbers, which the tables share out among them by their widths; those of narrow ones take longer
+        shares = falling_shares(stop - start) * sum(widths)
         bounds = np.interp(shares, np.cumsum([0, *widths]), range(len(tables) + 1)) * groups
         addresses = torch.tensor(_addresses(tables, widths, start), dtype=torch.int64, device="cpu")
         inputs = [groups, start, *arrays, arrays[0] if radii is None else view(radii[start:stop], wp.int32)]
