@@ -30,8 +30,9 @@ def bin_by_counting(
 ) -> Bins:
     """The Gaussians of each tile by depth (ties by index) on the CPU: a counting sort by tile, a band per thread.
 
-    A CPU knows their number in time, and needs no ``room``. With ``worlds``, how many of the Gaussians belong to each
-    of several pictures, one after the other, lists are those of the tiles of the first picture, then of the next.
+    Their number does not show in the result. A CPU knows that of instances in time, and needs no ``room``. With
+    ``worlds``, how many of the Gaussians belong to each of several pictures, one after the other, lists are those of
+    the tiles of the first picture, then of the next.
 
     Raises:
         InputError: if the tile instances are more than the kernels can number, or than fit.
@@ -44,12 +45,11 @@ def bin_by_counting(
     gaussians, square = wp.array(drawn, copy=False, device="cpu"), int(options.extent == "square")
     inputs, groups = [gaussians, splats2d.view(), camera.height, options.alpha_min, square], -(-count // LANES)
     in_groups = even_slices(groups, each=LANES)
-    pack, depths, ordered = lists.make_pack(falloff_of(options).reach_of), splats2d.depths.detach().numpy(), []
-    at_once(
+    pack, depths = lists.make_pack(falloff_of(options).reach_of), splats2d.depths.detach().numpy()
+    _, order = at_once(
         lambda: launch(pack, groups, inputs, [splats, in_place(rows)], bounds=in_groups),
-        lambda: ordered.append(order_by_depth(_taken(depths, drawn))),
+        lambda: order_by_depth(_taken(depths, drawn)),
     )
-    order = ordered[0]
     row_ends, begins, row_count = _sums(_taken(rows, order))
     check_count(row_count, camera, count, splats2d.radii.device)
     begins = _put(begins, order)
@@ -60,11 +60,15 @@ def bin_by_counting(
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
-    _, begins, total = _sums(counts)
-    check_count(total, camera, count, splats2d.radii.device)
-    instances, places, ends = _sort_by_tile(
-        order, _taken(begins, order), row_ends, spans, total, tiles_x * tiles_y * pictures
+    bands = even_slices(count)
+    (cursor, ends), (_, begins, total) = at_once(
+        lambda: _count_in_bands(bands, row_ends, spans, tiles_x * tiles_y * pictures), lambda: _sums(counts)
     )
+    check_count(total, camera, count, splats2d.radii.device)
+    instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
+    inputs = [*(in_place(table) for table in (order, _taken(begins, order), row_ends)), spans]
+    outputs = [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)]
+    _launch_bands(lists.scatter, bands, inputs, outputs)
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))
     return Bins(len(radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)
@@ -151,25 +155,14 @@ def count_twice(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> t
     return counts, again
 
 
-def _sort_by_tile(
-    order: np.ndarray, begins: np.ndarray, row_ends: np.ndarray, spans: wp.array, count: int, tile_count: int
-) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
-    """Instances [M] by tile, nearest first, their places [M], and where each tile's end [T].
-
-    A counting sort in bands of splats, one per thread: each band counts its instances of every tile, then writes
-    them after those of the bands before it. The result is the same for any number of bands.
-    """
-    bounds = even_slices(len(order))
+def _count_in_bands(bounds: list[int], row_ends: np.ndarray, spans: wp.array, tiles: int) -> list[np.ndarray]:
+    """Where each band's instances of each tile go [B, T], after those of the bands before it; each tile's end [T]."""
     rows = [int(row_ends[bound - 1]) if bound else 0 for bound in bounds]
-    changes = np.zeros((len(bounds) - 1, tile_count + 1), dtype=np.int32)
+    changes = np.zeros((len(bounds) - 1, tiles + 1), dtype=np.int32)
     _launch_bands(lists.count_tiles, rows, [spans], [in_place(changes)])
     counts = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
     _check_longest(int(counts.sum(0).max(initial=0)))
-    cursor, ends = begins_of(counts), np.cumsum(counts.sum(0, dtype=np.int64))
-    instances, places = (torch.empty(count, dtype=torch.int32, device="cpu") for _ in range(2))
-    outputs = [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)]
-    _launch_bands(lists.scatter, bounds, [*(in_place(table) for table in (order, begins, row_ends)), spans], outputs)
-    return instances, places, ends
+    return [begins_of(counts), np.cumsum(counts.sum(0, dtype=np.int64))]
 
 
 def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 import torch
@@ -188,9 +189,11 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
     _Job(slices).share(helpers)
 
 
-def at_once(*calls: Callable[[], None]) -> None:
-    """Run ``calls`` at once if threads are free; each may share its own work as well."""
-    in_slices(lambda number, _: calls[number](), list(range(len(calls) + 1)))
+def at_once(*calls: Callable[[], Any]) -> list:
+    """What ``calls`` return. They run at the same time if threads are free; each may share its own work as well."""
+    found: dict[int, Any] = {}
+    in_slices(lambda number, _: found.update({number: calls[number]()}), list(range(len(calls) + 1)))
+    return [found[number] for number in range(len(calls))]
 
 
 def set_zero(*tensors: torch.Tensor) -> None:
