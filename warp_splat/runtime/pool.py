@@ -34,7 +34,6 @@ class _Job:
     work, but not for those that have not woken yet. Tried:
 
     - 0.1 ms more per launch, 2 ms a step: an executor's futures
-    - no difference, and a crash where threads load kernels at once: arguments packed once for all slices (record_cmd)
     - no difference, though waking one takes 0.1 ms: helpers that spin; two or four equal slices for each thread
     """
 
