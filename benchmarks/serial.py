@@ -6,7 +6,9 @@ to take
     serial + max((time on one thread - serial) / P, bytes / bandwidth)
 
 with the bytes of ``work.py`` and half of one thread's bandwidth per core: 16 cores have 8 times as much. With more
-threads than cores, serial time must not grow: that checks the bookkeeping. Sizes are those of ``step.py``; times are
+threads than cores, serial time must not grow: that checks the bookkeeping. What starting slices takes of the
+interpreter, which is one thread's at a time, does not show on few cores: so steps are timed as well whose slices are
+those of 16 threads, all run by one. Sizes are those of ``step.py``; times are
 the least of several rounds.
 
     python benchmarks/serial.py [-s path/to/fox --models output/fox] [--out docs/benchmarks]
@@ -16,6 +18,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from unittest import mock
 
 from common import parse, write_table
 from gpu_steps import STAGES
@@ -31,6 +34,7 @@ from warp_splat.training.trainer import Trainer
 
 CORES_PREDICTED = (4, 8, 16, 32)
 SHARED, MORE = max(CORES, 2), 4 * max(CORES, 2)  # threads that share the work
+MANY = 16  # threads for which a step on one is cut
 HOST, WHOLE = "host", "whole step"
 
 Spans = list[tuple[float, float]]
@@ -117,6 +121,20 @@ def measure_trainer(trainer: Trainer, rounds: int) -> tuple[dict, dict, dict]:
     return alone, serial, check
 
 
+def measure_slices(step: Callable[[], None], rounds: int) -> float:
+    """Seconds that a step on one thread takes longer when it is cut into slices for MANY; the least of each."""
+    found = defaultdict(list)
+    with mock.patch.object(pool._Job, "share", lambda job, helpers: job._run_slices()):
+        for _ in range(rounds + 1):
+            for threads in (1, MANY):
+                pool.set_threads(threads)
+                start = time.perf_counter()
+                for _ in range(VIEWS):
+                    step()
+                found[threads].append((time.perf_counter() - start) / VIEWS)
+    return min(found[MANY][1:]) - min(found[1][1:])
+
+
 def predict(alone: dict, serial: dict, counts: Counts, bandwidth: float, cores: int) -> dict[str, float]:
     """Seconds of each stage on so many cores."""
     work, found = work_of(counts), {}
@@ -143,9 +161,14 @@ def main() -> None:
             milliseconds = [f"{1e3 * seconds:.2f}" for seconds in times]
             rows.append([name, stage, *milliseconds[:3], f"{1e-6 * moved:.1f}", *milliseconds[3:]])
         gains = ", ".join(f"{alone[WHOLE] / predicted[cores][WHOLE]:.1f} on {cores}" for cores in CORES_PREDICTED)
-        notes.append(f"{name}: {100 * serial[WHOLE] / alone[WHOLE]:.1f} % of a step is serial; predicted gain {gains}.")
+        slices = measure_slices(steps_of(trainer), rounds)
+        notes.append(
+            f"{name}: {100 * serial[WHOLE] / alone[WHOLE]:.1f} % of a step is serial; predicted gain {gains}; in "
+            f"slices for {MANY}, one thread takes {1e3 * slices:.1f} ms longer."
+        )
         print(notes[-1])
-        data[name] = {"seconds": alone, "serial": serial, f"serial, {MORE} threads": check, "predicted": predicted}
+        found = {"seconds": alone, "serial": serial, f"serial, {MORE} threads": check, "predicted": predicted}
+        data[name] = {**found, "slices": {WHOLE: slices}}
     headers = ("size", "stage", "1 thread: ms", f"serial, {SHARED} threads: ms", f"serial, {MORE} threads: ms", "MB")
     headers += tuple(f"{cores} cores: ms" for cores in CORES_PREDICTED)
     write_table("serial", arguments.out, headers, rows, f"{' '.join(notes)} {1e-9 * bandwidth:.1f} GB/s.", data)
