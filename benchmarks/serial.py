@@ -7,9 +7,8 @@ to take
 
 with the bytes of ``work.py`` and half of one thread's bandwidth per core: 16 cores have 8 times as much. With more
 threads than cores, serial time must not grow: that checks the bookkeeping. What starting slices takes of the
-interpreter, which is one thread's at a time, does not show on few cores: so steps are timed as well whose slices are
-those of 16 threads, all run by one. Sizes are those of ``step.py``; times are
-the least of several rounds.
+interpreter, which is one thread's at a time, does not show on few cores. So steps are timed as well whose slices are
+those of 16 threads, all run by one. Sizes are those of ``step.py``; times are the least of several rounds.
 
     python benchmarks/serial.py [-s path/to/fox --models output/fox] [--out docs/benchmarks]
 """

@@ -151,7 +151,7 @@ def falling_shares(work: int) -> np.ndarray:
     """Bounds, from 0 to 1, of slices of ``work`` indices whose cost is not known well: the last ones are small.
 
     So all threads end at about the same time. With equal slices, eight to a thread for the blends and one for Adam, a
-    step of 200,000 Gaussians takes 3 % longer on two threads.
+    step of 200,000 Gaussians took 3 % longer on two threads.
     """
     parts = slice_count(work, PER_THREAD)
     power = max(3.0 * parts / (PER_THREAD * _threads), 1.0)  # the first is never more than 0.6 of a thread's share
@@ -183,8 +183,8 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
             call()
         return
     while len(_helpers) < helpers:
-        _helpers.append(threading.Thread(target=_help, name="warp_splat", daemon=True))
-        _helpers[-1].start()
+        _helpers.append(helper := threading.Thread(target=_help, name="warp_splat", daemon=True))
+        helper.start()  # this one: another thread may have appended its own meanwhile
     _Job(slices).share(helpers)
 
 
