@@ -175,6 +175,7 @@ def test_a_gpu_gets_one_launch_on_the_stream_of_torch(monkeypatch):
     launch.launch_blocks(add_index, 0, ["in"], ["out"], "cuda")
     assert not any(options.pop("record_tape") for options in calls)
     whole, adjoint, blocks = calls
+    assert not blocks.pop("adjoint")
     assert whole == {"dim": 9000, "inputs": [0, "in"], "outputs": ["out"], "stream": "stream of cuda:1"}
     assert adjoint["adjoint"] and adjoint["adj_inputs"] == [None, "grad"] and adjoint["adj_outputs"] == ["up"]
     assert blocks == {"dim": [12], "inputs": ["in"], "outputs": ["out"], "block_dim": 256, "stream": "stream of cuda:1"}

@@ -184,6 +184,14 @@ def test_rasterize_of_tensors_inside_a_tape_records_nothing_and_says_nothing(mod
     assert "Warp" not in "".join(capfd.readouterr()).replace("Warp CUDA warning", "")
 
 
+def test_a_capture_on_the_cpu_is_refused():
+    """It would replay nothing."""
+    scene = cloud(3, 50, make_camera(40, 30), degree=1)
+    with pytest.raises(InputError, match="ScopedCapture: expected none on the CPU"), wp.ScopedCapture(device="cpu"):
+        warp_splat.rasterize(*scene.parameters(), scene.camera)
+    warp_splat.rasterize(*scene.parameters(), scene.camera)
+
+
 @pytest.mark.parametrize(
     ("name", "change", "found"),
     [

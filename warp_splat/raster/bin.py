@@ -30,16 +30,16 @@ def bin_by_counting(
 ) -> Bins:
     """The Gaussians of each tile by depth (ties by index) on the CPU: a counting sort by tile, a band per thread.
 
-    Their number does not show in the result. A CPU knows that of instances in time, and needs no ``room``. With
-    ``worlds``, how many of the Gaussians belong to each of several pictures, one after the other, lists are those of
-    the tiles of the first picture, then of the next.
+    The number of bands does not show in the result. A CPU knows the number of instances in time, and needs no ``room``.
+    With ``worlds``, how many of the Gaussians belong to each of several pictures, one after the other, lists are those
+    of the tiles of the first picture, then of the next.
 
     Raises:
         InputError: if the tile instances are more than the kernels can number, or than fit.
     """
     tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
     radii = splats2d.radii.numpy()
-    drawn, invalid = np.flatnonzero(radii > 0).astype(np.int32), np.count_nonzero(radii < 0)
+    drawn, invalid = np.flatnonzero(radii > 0).astype(np.int32), int(np.count_nonzero(radii < 0))
     count = len(drawn)
     splats, rows = empty(count, Splat2D, "cpu"), np.empty(count, dtype=np.int32)
     gaussians, square = wp.array(drawn, copy=False, device="cpu"), int(options.extent == "square")
@@ -62,9 +62,10 @@ def bin_by_counting(
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
     bands = even_slices(count)
     (cursor, ends), (_, begins, total) = at_once(
-        lambda: _count_in_bands(bands, row_ends, spans, tiles_x * tiles_y * pictures), lambda: _sums(counts)
+        lambda: _count_bands(bands, row_ends, spans, tiles_x * tiles_y * pictures), lambda: _sums(counts)
     )
     check_count(total, camera, count, splats2d.radii.device)
+    _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
     instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
     inputs = [*(in_place(table) for table in (order, _taken(begins, order), row_ends)), spans]
     outputs = [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)]
@@ -155,14 +156,13 @@ def count_twice(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> t
     return counts, again
 
 
-def _count_in_bands(bounds: list[int], row_ends: np.ndarray, spans: wp.array, tiles: int) -> list[np.ndarray]:
+def _count_bands(bounds: list[int], row_ends: np.ndarray, spans: wp.array, tiles: int) -> tuple[np.ndarray, np.ndarray]:
     """Where each band's instances of each tile go [B, T], after those of the bands before it; each tile's end [T]."""
     rows = [int(row_ends[bound - 1]) if bound else 0 for bound in bounds]
     changes = np.zeros((len(bounds) - 1, tiles + 1), dtype=np.int32)
     _launch_bands(lists.count_tiles, rows, [spans], [in_place(changes)])
     counts = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
-    _check_longest(int(counts.sum(0).max(initial=0)))
-    return [begins_of(counts), np.cumsum(counts.sum(0, dtype=np.int64))]
+    return begins_of(counts), np.cumsum(counts.sum(0, dtype=np.int64))
 
 
 def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

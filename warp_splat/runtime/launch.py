@@ -120,6 +120,8 @@ def launch(
 
     load("cpu", kernel)
     it = wp.launch(kernel, dim, [0, *inputs], outputs, device="cpu", record_tape=False, record_cmd=True, **adjoint)
+    if it.device.is_capturing:
+        raise InputError("wp.ScopedCapture: expected none on the CPU, where it records no launch of warp_splat's.")
 
     def run(low: int, high: int) -> None:  # holds the interpreter for a quarter of a launch's time
         _invoke(kernel, it.hooks, [type(it.bounds)((high - low,)), ctypes.c_int(low), *it.params[2:]], it.adjoint)
@@ -247,9 +249,7 @@ def launch_blocks(
     if blocks == 0:
         return
     where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
-    if adjoint:
-        where["adjoint"] = True
-    where |= {"block_dim": kernel.module.options["block_dim"], "record_tape": False}
+    where |= {"block_dim": kernel.module.options["block_dim"], "record_tape": False, "adjoint": bool(adjoint)}
     wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **where, **adjoint)
 
 

@@ -148,13 +148,13 @@ def even_slices(dim: int, smallest: int = 0, each: int = 1) -> list[int]:
 
 
 def falling_shares(work: int) -> np.ndarray:
-    """Bounds, from 0 to 1, of slices of ``work`` indices whose cost is not known well: the last ones are small.
+    """Bounds, from 0 to 1, of slices of ``work`` indices whose cost is not known well: if many, the last are small.
 
     So all threads end at about the same time. With equal slices, eight to a thread for the blends and one for Adam, a
     step of 200,000 Gaussians took 3 % longer on two threads.
     """
-    parts = slice_count(work, PER_THREAD)
-    power = max(3.0 * parts / (PER_THREAD * _threads), 1.0)  # the first is never more than 0.6 of a thread's share
+    parts = slice_count(work, PER_THREAD if work >= 2 * _threads * SMALLEST_SLICE else 1)
+    power = max(3.0 * parts / (PER_THREAD * _threads), 1.0)  # the first is 0.6 of a thread's share, or all are equal
     return 1.0 - (np.arange(parts, -1, -1) / parts) ** power
 
 

@@ -43,7 +43,7 @@ def _launch(tables: list, numbers: list, keys: list[int], count: int, radii: tor
     arrays.append(view(torch.tensor(numbers, dtype=torch.float32, device="cpu"), wp.float32))
     for lanes, start, stop in ((LANES, 0, count - count % LANES), (1, count - count % LANES, count)):
         groups = (stop - start) // lanes
-        # by their numbers, which the tables share out among them by their widths; those of narrow ones take longer
+        # by their numbers, which the tables share out among them by their widths; each of a narrow one takes longer
         shares = falling_shares(stop - start) * sum(widths)
         bounds = np.interp(shares, np.cumsum([0, *widths]), range(len(tables) + 1)) * groups
         addresses = torch.tensor(_addresses(tables, widths, start), dtype=torch.int64, device="cpu")

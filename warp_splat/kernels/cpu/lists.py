@@ -151,7 +151,7 @@ def digit_of(key: int, shift: int):
 
 @wp.kernel
 def count_digits(
-    first: int,  # always 0: one launch index per band
+    first: int,  # band of this slice
     bounds: wp.array[int],  # [B + 1] of the bands in `keys`
     keys: wp.array[int],  # [V] bits of depths
     shift: int,
@@ -188,7 +188,7 @@ def sort_digits(
 
 @wp.kernel
 def count_tiles(
-    first: int,  # always 0: one launch index per band
+    first: int,  # band of this slice
     bands: wp.array[int],  # [B + 1] bounds of the bands in `spans`
     spans: wp.array[wp.vec2i],  # [R]
     # out
