@@ -102,7 +102,8 @@ def recorded(monkeypatch: pytest.MonkeyPatch, named: dict[int, int] | None = Non
             shape, block_dim = (dim,), kernel.module.options["block_dim"]
         blocks = -(-math.prod(shape) // block_dim)
         launches.append(Launch(kernel, adjoint, shape, blocks, block_dim, arguments, before, read()))
-        return SimpleNamespace(hooks=None, bounds=(), params=[], adjoint=adjoint)
+        host = SimpleNamespace(is_capturing=False)
+        return SimpleNamespace(hooks=None, bounds=(), params=[], adjoint=adjoint, device=host)
 
     threads = pool.get_threads()
     pool.set_threads(1)  # or another thread's part of a launch writes between what is read before and after

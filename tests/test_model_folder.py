@@ -146,7 +146,7 @@ def test_find_iteration_takes_the_largest_number(tmp_path):
     (tmp_path / "point_cloud" / "notes.txt").write_text("")
     assert model_folder.find_iteration(tmp_path) == 30000
     assert model_folder.find_iteration(tmp_path, 7000) == 7000
-    with pytest.raises(InputError, match="iteration 8000 was not saved; there are 999, 7000, 30000"):
+    with pytest.raises(InputError, match="iteration 8000 was not saved; those saved: 999, 7000, 30000"):
         model_folder.find_iteration(tmp_path, 8000)
 
 

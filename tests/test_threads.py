@@ -1,6 +1,7 @@
 """What the threads of the CPU share of torch's work is what one of them computes alone, bit for bit."""
 
 import hashlib
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -134,6 +135,18 @@ def test_every_slice_runs_once(threads):
     for bounds in ([0, 0], [0, 5], [0, 1, 2, 3, 4, 5]):
         pool.in_slices(lambda low, high: done.extend(range(low, high)), bounds)
     assert sorted(done) == sorted([*range(5)] * 2)
+
+
+def test_who_gets_no_more_threads_does_with_those_there_are(threads, monkeypatch):
+    def refuse(_):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(pool, "_helpers", [])
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    done = []
+    for _ in range(2):
+        pool.in_slices(lambda low, high: done.extend(range(low, high)), [0, 2, 3, 5])
+    assert sorted(done) == sorted([*range(5)] * 2) and not pool._helpers
 
 
 def test_calls_at_once_share_their_own_work(threads):

@@ -166,7 +166,7 @@ def find_checkpoint(path: str | Path) -> Path:
     if path.is_dir():
         raise InputError(f"{path}: expected {EXPECTED}, found a folder of this name; remove it or name another.")
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a model folder with {LAST}, or a checkpoint in it.")
+        raise InputError(f"{path}: no such file; expected one of a training that began, or its folder.")
     return path
 
 

@@ -120,7 +120,7 @@ def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     if iteration == -1:
         return saved[-1]
     if iteration not in saved:
-        raise InputError(f"{folder}: iteration {iteration} was not saved; there are {', '.join(map(str, saved))}.")
+        raise InputError(f"{folder}: iteration {iteration} was not saved; those saved: {', '.join(map(str, saved))}.")
     return iteration
 
 

@@ -6,6 +6,7 @@ import os
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from numbers import Integral
 from typing import Any
@@ -168,7 +169,7 @@ def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
     return [min(WIDTH * bound, dim) for bound in even_slices(-(-dim // WIDTH), SMALLEST_OF_TORCH // WIDTH)]
 
 
-def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
+def in_slices(run: Callable[[int, int], object], bounds: list[int]) -> None:
     """Call ``run`` with the bounds of every slice that is not empty, on the threads of the CPU.
 
     Slices must write different elements. Helpers record no gradients.
@@ -182,10 +183,12 @@ def in_slices(run: Callable[[int, int], None], bounds: list[int]) -> None:
         for call in slices:
             call()
         return
-    while len(_helpers) < helpers:
-        _helpers.append(helper := threading.Thread(target=_help, name="warp_splat", daemon=True))
-        helper.start()  # this one: another thread may have appended its own meanwhile
-    _Job(slices).share(helpers)
+    for _ in range(helpers - len(_helpers)):
+        helper = threading.Thread(target=_help, name="warp_splat", daemon=True)
+        with suppress(RuntimeError):  # the system may give no more threads; then there are fewer
+            helper.start()
+            _helpers.append(helper)
+    _Job(slices).share(min(helpers, len(_helpers)))
 
 
 def at_once(*calls: Callable[[], Any]) -> list:
