@@ -166,7 +166,7 @@ def find_checkpoint(path: str | Path) -> Path:
     if path.is_dir():
         raise InputError(f"{path}: expected {EXPECTED}, found a folder of this name; remove it or name another.")
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected one of a training that began, or its folder.")
+        raise InputError(f"{path}: no such file; expected the {LAST} of a training that has begun, or its folder.")
     return path
 
 
