@@ -19,6 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from work import count
 
+from warp_splat import runtime
 from warp_splat.camera import Camera
 from warp_splat.config import ALPHA_MIN, TILE, RasterOptions
 from warp_splat.gaussians import GaussianModel
@@ -99,7 +100,7 @@ def counted_launches(counts: np.ndarray) -> Iterator[None]:
         return run
 
     with (
-        mock.patch.object(wp, "launch", counting(wp.launch)),
+        mock.patch.object(runtime.launch, "_bound", counting(runtime.launch._bound)),
         mock.patch.object(wp, "launch_tiled", counting(wp.launch_tiled)),
     ):
         yield

@@ -11,6 +11,7 @@ minutes.
 
 import time
 from functools import partial
+from unittest import mock
 
 import newton
 import numpy as np
@@ -20,6 +21,7 @@ from common import option, parse, synchronize, write_table
 from newton.sensors import SensorCamera
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from warp_splat import runtime
 from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
 from warp_splat.compare.oracle import Render, exact_render
@@ -117,16 +119,23 @@ class Counted(TorchDispatchMode):
 
     def __enter__(self):
         self.launches = self.operations = 0
-        self.launch, wp.launch = wp.launch, self.launched
+        places = (wp, "launch"), (runtime.launch, "_bound")  # the latter on the CPU
+        self.patches = [mock.patch.object(*place, self.counting(getattr(*place))) for place in places]
+        for patch in self.patches:
+            patch.start()
         return super().__enter__()
 
     def __exit__(self, *error):
-        wp.launch = self.launch
+        for patch in self.patches:
+            patch.stop()
         return super().__exit__(*error)
 
-    def launched(self, *arguments, **more):
-        self.launches += 1
-        return self.launch(*arguments, **more)
+    def counting(self, function):
+        def launched(*arguments, **more):
+            self.launches += 1
+            return function(*arguments, **more)
+
+        return launched
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         self.operations += 1

@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -97,13 +96,14 @@ def recorded(monkeypatch: pytest.MonkeyPatch, named: dict[int, int] | None = Non
             launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, **more, **where)
             shape = (*dim, block_dim)
         else:
-            where.pop("record_cmd")  # it happens here, between what is read before and after
             launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **more, **where)
             shape, block_dim = (dim,), kernel.module.options["block_dim"]
         blocks = -(-math.prod(shape) // block_dim)
         launches.append(Launch(kernel, adjoint, shape, blocks, block_dim, arguments, before, read()))
-        host = SimpleNamespace(is_capturing=False)
-        return SimpleNamespace(hooks=None, bounds=(), params=[], adjoint=adjoint, device=host)
+
+    def bound(kernel, inputs, outputs, adjoint):
+        where = {"device": "cpu", "record_tape": False, **adjoint}
+        return lambda low, high: record(kernel, high - low, [low, *inputs[1:]], outputs, **where)
 
     threads = pool.get_threads()
     pool.set_threads(1)  # or another thread's part of a launch writes between what is read before and after
@@ -112,7 +112,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch, named: dict[int, int] | None = Non
             patch.setattr(wp, "launch_tiled", record)
             if named is not None:
                 patch.setattr(wp, "launch", record)
-                patch.setattr(runtime.launch, "_invoke", lambda *_: None)
+                patch.setattr(runtime.launch, "_bound", bound)
             yield launches
     finally:
         pool.set_threads(threads)

@@ -112,7 +112,7 @@ def test_a_failing_launch_waits_for_its_helpers(monkeypatch, threads):
         held.append(weakref.ref(tensor))
         image()
 
-    monkeypatch.setattr(launch, "_invoke", failing)
+    monkeypatch.setattr(launch, "_bound", lambda *_: failing)
     gc.disable()
     try:
         with pytest.raises(RuntimeError, match="planted"):

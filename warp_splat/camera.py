@@ -116,8 +116,7 @@ class Camera:
         turn = tuple(rotation_vector(turned))
         rotation, _ = Shutter(turn).moved(0.5, first.rotation, first.translation)
         shift, center = rotation @ (last.center - first.center), 0.5 * (first.center + last.center)
-        shutter = Shutter(turn, tuple(shift))
-        return replace(first, rotation=rotation, translation=-rotation @ center, shutter=shutter)
+        return replace(first, rotation=rotation, translation=-rotation @ center, shutter=Shutter(turn, tuple(shift)))
 
     def at(self, row: float) -> Camera:
         """The camera that stands still where this one is when the middle of ``row`` is read, from 0 to height - 1."""

@@ -175,8 +175,7 @@ def _checked(name: str, array: Any) -> wp.array:
     kinds = (wp.float32, wp.float64) if name in ("twist", "intrinsics") else (wp.float32,)
     if not isinstance(array, wp.array):
         raise InputError(f"{name}: expected a Warp array, got {type(array).__name__}; rasterize takes torch tensors.")
-    scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
-    if scalar not in kinds:
+    if getattr(array.dtype, "_wp_scalar_type_", array.dtype) not in kinds:
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise InputError(f"{name}: expected an array of {wanted}, got one of {array.dtype.__name__}.")
     return array

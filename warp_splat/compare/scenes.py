@@ -32,8 +32,7 @@ def look(width: int = 24, height: int = 20, fov: float = 50.0, **pose) -> Camera
 
 def distinct_depths(rng: np.random.Generator, count: int, low: float, high: float) -> np.ndarray:
     """``count`` numbers in random order, no two closer than half an even spacing: depths that cannot swap."""
-    step = (high - low) / max(count, 1)
-    return low + step * (rng.permutation(count) + rng.uniform(0.25, 0.75, count))
+    return low + (high - low) / max(count, 1) * (rng.permutation(count) + rng.uniform(0.25, 0.75, count))
 
 
 def to_world(points: np.ndarray, camera: Camera) -> np.ndarray:

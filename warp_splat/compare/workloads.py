@@ -120,6 +120,5 @@ def all_workloads(scenes: dict[str, Scene], device: torch.device, say: Callable[
 
 def sample_pixels(camera: Camera) -> torch.Tensor:
     """:data:`SAMPLES` pixels of the image at random, or all if it has no more, [P, 2] (row, column)."""
-    count = camera.width * camera.height
-    chosen = np.random.default_rng(0).permutation(count)[:SAMPLES]
+    chosen = np.random.default_rng(0).permutation(camera.width * camera.height)[:SAMPLES]
     return torch.from_numpy(np.stack([chosen // camera.width, chosen % camera.width], 1))

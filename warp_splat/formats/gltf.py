@@ -139,14 +139,13 @@ def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
     if antialiased:
         extension["extras"] = {RENDER_MODE: "mip"}
     indices = {name: index for index, name in enumerate(attributes)}
-    primitive = {"mode": 0, "attributes": indices, "extensions": {NAME: extension}}
     return {
         "asset": {"version": "2.0", "generator": f"warp_splat {__version__}"},
         "extensionsUsed": [NAME],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": indices, "extensions": {NAME: extension}}]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],

@@ -131,8 +131,7 @@ class Document:
             raise Unexpected(f"a buffer outside of its folder ({uri!r:.80})")
         if not path.is_file():
             raise Unexpected(f"no file {path.name!r:.80} beside it, where its data should be")
-        length = path.stat().st_size
-        return Buffer(path, 0, whole_number(entry.get("byteLength"), "byteLength of a buffer", length))
+        return Buffer(path, 0, whole_number(entry.get("byteLength"), "byteLength of a buffer", path.stat().st_size))
 
     def _read_chunks(self, source, size: int) -> tuple[bytes, Buffer | None]:
         """The JSON and where the binary chunk is, if there is one."""

@@ -148,8 +148,7 @@ class _Bundle:
 
     def _harmonics(self) -> np.ndarray:
         """[N, K - 1, 3] float32."""
-        part = self._part("shN")
-        entries = files.whole_number(part.get("count"), "count of the palette", PALETTE_MOST)
+        entries = files.whole_number(self._part("shN").get("count"), "count of the palette", PALETTE_MOST)
         size = (PALETTE_ROW * (self.coefficients - 1), -(-entries // PALETTE_ROW))
         table = self._image("shN", 0, size).reshape(-1, self.coefficients - 1, 4)[:entries, :, :3]
         labels = self._pixels("shN", 1)

@@ -86,6 +86,5 @@ def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None
     for index in np.argsort(changes, kind="stable")[::-1][:SHOWN]:
         view = views[index]
         for rows, render in zip(sections.values(), pairs[index], strict=True):
-            said = f"PSNR {psnr(render, view.picture, view.mask):.2f} dB"
-            rows.append((view.name, view.picture, render, said))
+            rows.append((view.name, view.picture, render, f"PSNR {psnr(render, view.picture, view.mask):.2f} dB"))
     contact_sheet(path, sections)

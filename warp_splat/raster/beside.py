@@ -238,8 +238,7 @@ def _differentiate(
     inputs += [view(group.rows, wp.float32), view(ranks, wp.float32), group.begin, group.count]
     driver.launch_tiles(kernel, bins, [*inputs, view(adj_pixels, wp.float32)], [view(slots, wp.float32)])
     tables = [slots.new_empty(bins.gaussian_count, size) for size in (2, 3, 1, width) if size]
-    geometry = driver.gather(bins, slots, tables)[:3]
-    return geometry, tables[-1][:, : group.count]
+    return driver.gather(bins, slots, tables)[:3], tables[-1][:, : group.count]
 
 
 def _without_bad(adj_pixels: torch.Tensor, blending: Blending) -> torch.Tensor:

@@ -68,8 +68,7 @@ def bin_by_counting(
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
     instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
     inputs = [*(in_place(table) for table in (order, _taken(begins, order), row_ends)), spans]
-    outputs = [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)]
-    _launch_bands(lists.scatter, bands, inputs, outputs)
+    _launch_bands(lists.scatter, bands, inputs, [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)])
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))
     return Bins(len(radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)

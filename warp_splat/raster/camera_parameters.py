@@ -194,8 +194,7 @@ def _prepared(lens: Lens) -> np.ndarray:
 
 def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> torch.Tensor:
     """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
-    sums = launch_in_lanes(make, lanes, len(like), inputs, [], like.device, sums=(columns, wp.float32))
-    return in_pairs(sums)
+    return in_pairs(launch_in_lanes(make, lanes, len(like), inputs, [], like.device, sums=(columns, wp.float32)))
 
 
 def _numbers(tensor: torch.Tensor) -> np.ndarray:

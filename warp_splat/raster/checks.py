@@ -38,9 +38,8 @@ def check_camera(camera: Camera | CameraParameters) -> Camera:
 def explained(options: RasterOptions, means: torch.Tensor, cameras: Iterable[Camera]) -> Iterator[None]:
     """Turn into an InputError what memory that runs out says, and Warp of functions of the user's own."""
     advice = "render smaller images (Camera.resized) or fewer Gaussians"
-    sizes = ((camera.width, camera.height) for camera in cameras)
     try:
-        with memory_explained(means.device, means, sizes, advice):
+        with memory_explained(means.device, means, ((camera.width, camera.height) for camera in cameras), advice):
             yield
     except Exception as error:
         words, functions = str(error.args[:1]), {"projection": options.projection, "falloff": options.falloff}

@@ -13,8 +13,7 @@ def find_crossing(splats: Splats2D, camera: Camera) -> Crossing:
     if not (camera.lens and camera.lens.family.around):
         return []
     place, reach, drawn = splats.means2d[:, 0].detach(), splats.extents[:, 0], splats.radii > 0
-    crossing = (place < reach, place + reach > camera.width)
-    return [torch.nonzero(drawn & crosses)[:, 0] for crosses in crossing]
+    return [torch.nonzero(drawn & crosses)[:, 0] for crosses in (place < reach, place + reach > camera.width)]
 
 
 def with_copies(tensor: torch.Tensor, crossing: Crossing) -> torch.Tensor:

@@ -31,8 +31,7 @@ from warp_splat.runtime.launch import empty, launch, send, view
 def takes(camera: Camera, options: RasterOptions) -> bool:
     """Whether :class:`Worlds` do: in a panorama splats show twice, and some options ask for more than they give."""
     around = camera.lens is not None and camera.lens.family.around
-    more = options.bound or options.normals or options.median_depth or options.tolerance is not None
-    return not (around or more)
+    return not (around or options.bound or options.normals or options.median_depth or options.tolerance is not None)
 
 
 class Worlds:

@@ -27,8 +27,8 @@ from warp_splat.runtime.pool import even_slices, in_slices, set_threads
 
 #: Else Warp leaves assembling to newer drivers; benchmarks/cubins.py looks at what its own assembler makes.
 wp.config.cuda_output = wp.config.cuda_output or "cubin"
-#: What a kernel gets as an array, and the last of what wp.launch does on a CPU.
-_Array, _invoke = wp._src.types.array_t, wp._src.context.invoke  # pyright: ignore[reportAttributeAccessIssue]
+#: What a kernel gets as an array, and as the number of its indices.
+_Array, _Bounds = wp._src.types.array_t, wp._src.types.launch_bounds_t  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def prepare(device: str, threads: int) -> torch.device:
@@ -119,14 +119,46 @@ def launch(
         return
 
     load("cpu", kernel)
-    it = wp.launch(kernel, dim, [0, *inputs], outputs, device="cpu", record_tape=False, record_cmd=True, **adjoint)
-    if it.device.is_capturing:
+    in_slices(_bound(kernel, [0, *inputs], outputs, adjoint), bounds)
+
+
+#: By kernel, and whether its adjoint: its module, which stays loaded; a function; tables of what that is given.
+_codes: dict[tuple[wp.Kernel, bool], tuple[Any, Callable, list[type[ctypes.Structure]]]] = {}
+
+
+def _bound(kernel: wp.Kernel, inputs: Sequence, outputs: Sequence, adjoint: dict) -> Callable[[int, int], None]:
+    """A function that runs a slice of ``kernel`` on the CPU.
+
+    Warp's own launch tells once what there is to call: to look for it and to check arguments takes it 0.1 ms each time.
+    """
+    if wp.get_device("cpu").is_capturing:
         raise InputError("wp.ScopedCapture: expected none on the CPU, where it records no launch of warp_splat's.")
+    if (code := _codes.get((kernel, bool(adjoint)))) is None:
+        it = wp.launch(kernel, 1, inputs, outputs, device="cpu", record_tape=False, record_cmd=True, **adjoint)
+        names, types = [argument.label for argument in kernel.adj.args], list(map(type, it.params[1:]))
+        fields = [list(zip(names, types[i : i + len(names)], strict=True)) for i in range(0, len(types), len(names))]
+        tables = [type("Arguments", (ctypes.Structure,), {"_fields_": of}) for of in fields]
+        code = it.module_exec, it.hooks.backward if adjoint else it.hooks.forward, tables
+        _codes[kernel, bool(adjoint)] = code
+    _, begin, tables = code
+    rows = [*inputs, *outputs], [*adjoint.get("adj_inputs", ()), *adjoint.get("adj_outputs", ())]
+    arguments, *adjoints = map(_packed, tables, rows)
 
-    def run(low: int, high: int) -> None:  # holds the interpreter for a quarter of a launch's time
-        _invoke(kernel, it.hooks, [type(it.bounds)((high - low,)), ctypes.c_int(low), *it.params[2:]], it.adjoint)
+    def run(low: int, high: int) -> None:
+        own = type(arguments).from_buffer_copy(arguments)
+        ctypes.c_int.from_buffer(own).value = low
+        begin(ctypes.byref(_Bounds((high - low,))), ctypes.byref(own), *map(ctypes.byref, adjoints))
 
-    in_slices(run, bounds)
+    return run
+
+
+def _packed(table: type[ctypes.Structure], values: Sequence) -> ctypes.Structure:
+    """Arguments as a kernel reads them, or adjoints; None is zero."""
+    found = table()
+    for field, value in zip(table._fields_, values, strict=True):
+        if value is not None:
+            setattr(found, field[0], value.__ctype__() if hasattr(value, "__ctype__") else value)
+    return found
 
 
 def open_tape() -> wp.Tape | None:
@@ -219,7 +251,7 @@ def read_later(values: torch.Tensor) -> Callable[[], list]:
 
 def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     """With rows of zeros up to so many; the tensor itself, if it has them."""
-    missing = rows - len(tensor)
+    missing = rows - tensor.shape[0]
     return torch.cat([tensor, tensor.new_zeros(missing, *tensor.shape[1:])]) if missing else tensor
 
 

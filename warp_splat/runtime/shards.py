@@ -62,8 +62,7 @@ class Shards(Processes):
     def lowest(self, values: torch.Tensor, count: int) -> torch.Tensor:
         """As of the whole."""
         (start,), _ = self._starts([len(values)])
-        places = torch.arange(start, start + len(values))
-        return self._parts(_ordered(values), places, [count]).to(values.device) == 0
+        return self._parts(_ordered(values), torch.arange(start, start + len(values)), [count]).to(values.device) == 0
 
     def between(self, values: torch.Tensor, spare: int) -> tuple[torch.Tensor, torch.Tensor]:
         """As of the whole."""

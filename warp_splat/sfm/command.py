@@ -121,8 +121,7 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
             raise _nothing_found(source)
     else:
         files = [(source.name, source)]
-    sizes = {name: path.stat().st_size for name, path in files}
-    record = json.dumps({"options": options, "files": sizes}, indent=1)
+    record = json.dumps({"options": options, "files": {name: path.stat().st_size for name, path in files}}, indent=1)
     if (work / "input.json").is_file():
         if (work / "input.json").read_bytes() != record.encode():
             raise InputError(

@@ -175,8 +175,7 @@ class Trainer:
     def see(self, out: RenderOutput | Observed, step: Step) -> None:
         """Note what a view showed of the Gaussians."""
         with stage("densify"):
-            grows = self.config.learn.grows_at(step.iteration)
-            for observe in having([self.growth] if grows else [], "observe"):
+            for observe in having([self.growth] if self.config.learn.grows_at(step.iteration) else [], "observe"):
                 observe(out, step)
         self._radii = torch.maximum(self._radii, out.radii)
 

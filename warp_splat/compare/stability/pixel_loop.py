@@ -43,8 +43,7 @@ def chain(layers: int) -> Problem:
     """So many Gaussians over a 2 x 2 image, all blended; together they let e^-5 or so through."""
     camera = look(2, 2, seed=None)
     arrays = cloud(4, layers, camera, sigma=(4, 8), opacity=(2.5 / layers, 7.5 / layers), aspect=0.5)
-    limit = max(GRADIENT_LIMIT, layers * EPS)
-    return Problem(tensors(arrays), camera, EVERYTHING, gradient_limit=limit)
+    return Problem(tensors(arrays), camera, EVERYTHING, gradient_limit=max(GRADIENT_LIMIT, layers * EPS))
 
 
 def underflow() -> Problem:
@@ -108,8 +107,7 @@ def zero_upstream(mode: str) -> Outcome:
     out, gradients = _gradients(tuple(torch.zeros_like(weight) for weight in truth(ordinary).upstream), mode)
     largest = max(value.abs().max().item() for value in gradients.values())
     failures = () if largest == 0 else (f"gradient of {largest:.1e} out of nothing",)
-    counted = check.count_text(pixels=out.dropped.pixels)
-    return Outcome("gradient 0", 0.0, largest, 0.0, counted, failures)
+    return Outcome("gradient 0", 0.0, largest, 0.0, check.count_text(pixels=out.dropped.pixels), failures)
 
 
 def nan_upstream(mode: str) -> Outcome:
@@ -132,8 +130,7 @@ def nan_upstream(mode: str) -> Outcome:
             if not torch.equal(value, results[1][name]):
                 failures.append(f"gradient of {name} changed")
                 worst = max(worst, (value - results[1][name]).abs().max().item())
-    counted = check.count_text(pixels=dropped)
-    return Outcome("the other pixels' gradients", 0.0, worst, 0.0, counted, tuple(failures))
+    return Outcome("the other pixels' gradients", 0.0, worst, 0.0, check.count_text(pixels=dropped), tuple(failures))
 
 
 CASES = (

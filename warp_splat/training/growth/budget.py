@@ -79,8 +79,7 @@ class Budget(Reference):
         split = self.processes.lowest(-score, room).nonzero()[:, 0]
         keep[split] = False
         self.optimizer.replace(keep.nonzero()[:, 0], halves(raw, split))
-        sizes = [int(keep.sum()), len(split), len(split)]
-        self.optimizer.arrange(self.model.arranging(self.processes, sizes))
+        self.optimizer.arrange(self.model.arranging(self.processes, [int(keep.sum()), len(split), len(split)]))
         self.clear()
         return Change(0, len(split), pruned)
 

@@ -92,8 +92,7 @@ class Mcmc:
         rows = alive[torch.from_numpy(sources).to(alive.device)]
         keep[rows] = False
         self.optimizer.replace(keep.nonzero()[:, 0], crowds(raw, rows, torch.from_numpy(times + 1)))
-        sizes = [int(keep.sum()), int((times + 1).sum())]
-        self.optimizer.arrange(self.model.arranging(self.processes, sizes))
+        self.optimizer.arrange(self.model.arranging(self.processes, [int(keep.sum()), int((times + 1).sum())]))
         return Change(due - kept, 0, before - kept)
 
     def grows(self, iterations: int) -> bool:

@@ -128,8 +128,7 @@ class Pose:
             twist = in_pairs(ways[place] * moves[place].double()[:, None])
         free = self.options.pose_intrinsics == "all"
         units = [camera.fx, camera.fy, free * camera.width, free * camera.height]
-        given = [camera.fx, camera.fy, camera.cx, camera.cy]
-        lens, units = torch.tensor([given, units], dtype=torch.float64)
+        lens, units = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy], units], dtype=torch.float64)
         if self.options.pose_intrinsics and intrinsics_of(view) in self.lenses:
             stretch = stretches[self.lenses[intrinsics_of(view)]].double()
             lens = send(lens, stretch.device) + send(units, stretch.device) * stretch
