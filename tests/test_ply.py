@@ -227,6 +227,13 @@ def test_atomic_write_removes_what_an_error_left(tmp_path, error):
     assert not list(path.parent.iterdir())
 
 
+def test_atomic_write_refuses_a_folder_before_anything_is_written(tmp_path):
+    (tmp_path / "a.gltf").mkdir()
+    with pytest.raises(InputError, match="could not be written"), atomic_write(tmp_path / "a.gltf"):
+        (tmp_path / "a.bin").touch()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.gltf"]
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_atomic_write_reports_a_full_device(tmp_path):
     full = pytest.raises(InputError, match="No space left")

@@ -18,7 +18,7 @@ from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
-from warp_splat.formats.files import write_json
+from warp_splat.formats.files import write_array, write_json
 from warp_splat.formats.png import save_png
 from warp_splat.inspect.page import address_of, write_page
 from warp_splat.inspect.subject import Finding
@@ -108,12 +108,12 @@ def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
     out.mkdir(parents=True, exist_ok=True)
     write_files(out, stored(*workload.gaussians[:4], workload.gaussians.sh), workload.camera)
     expected = exact_image(workload)
-    np.save(out / "expected.npy", expected)
+    write_array(out / "expected.npy", expected)
     save_png(out / "expected.png", (in_eight_bits(expected) * 255).astype(np.uint8))
     count = f"{name}: {(many := len(workload.gaussians.means))} Gaussian{'s' * (many > 1)} on {background}"
     if answer is None:
         return 1
-    np.save(out / "found.npy", answer.image)
+    write_array(out / "found.npy", answer.image)
     save_png(out / "found.png", (in_eight_bits(np.nan_to_num(answer.image)) * 255).astype(np.uint8))
     error = float(np.abs(np.nan_to_num(answer.image - expected, nan=np.inf)).max())
     print(f"{count}, off by {error:.3g} at most; expected and found in {out}.")

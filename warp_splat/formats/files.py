@@ -38,6 +38,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     temporary = path.with_name(f".tmp-{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
+        if path.is_dir():  # before files that belong to it are written
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             yield temporary
@@ -73,6 +75,17 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     """
     with atomic_write(path) as temporary:
         temporary.write_bytes(data)
+
+
+def write_array(path: str | Path, values: np.ndarray) -> None:
+    """Write ``values`` as NumPy does, whole or not at all.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    content = io.BytesIO()
+    np.save(content, values)  # to a file, NumPy does not tell when the end is missing
+    write_bytes(path, content.getvalue())
 
 
 def write_json(path: str | Path, value) -> None:

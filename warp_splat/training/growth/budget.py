@@ -107,8 +107,7 @@ def halves(raw: dict[str, torch.Tensor], split: torch.Tensor) -> dict[str, torch
     """
     rows = {name: tensor[split] for name, tensor in raw.items()}
     scales, opacities = activate(rows["scales"].contiguous(), rows["opacities"].contiguous())
-    longest = rows["scales"].argmax(1, keepdim=True)
-    axis = torch.zeros_like(scales).scatter_(1, longest, 1.0)
+    axis = torch.zeros_like(scales).scatter_(1, rows["scales"].argmax(1, keepdim=True), 1.0)  # the longest
     offset = rotate(rows["quats"], APART * scales * axis)
     clear = np.sqrt(np.maximum(1.0 - opacities.cpu().double().numpy(), CLEAREST))
     logits = logarithm(np.maximum(1.0 - clear, CLEAREST)) - logarithm(clear)

@@ -127,8 +127,7 @@ def crowds(raw: dict[str, torch.Tensor], rows: torch.Tensor, counts: torch.Tenso
     n = counts.numpy()
     clear = whole_root(1.0 - a, n)
     b = 1.0 - clear
-    bells = np.array(BELLS)[:, None]
-    shares = 1.0 - whole_power(1.0 - b * bells, n)  # of n in a row, at each distance
+    shares = 1.0 - whole_power(1.0 - b * np.array(BELLS)[:, None], n)  # of n in a row, at each distance
     width = SPACING * (2.0 * shares.sum(0) - shares[0])  # integral over the line; of the one: a sqrt(pi)
     narrower = logarithm(a * math.sqrt(math.pi) / width)
     crowded = {name: tensor[rows] for name, tensor in raw.items()}
