@@ -143,6 +143,16 @@ def test_every_index_once(device):
         assert torch.equal(sums, values + torch.arange(5000.0, device=device))
 
 
+@pytest.mark.parametrize("values", [wp.float64, wp.vec2])
+def test_each_launch_is_checked_as_the_first(values):
+    """What Warp found out once does not let an array of another type through."""
+    right, sums = (wp.zeros(10, dtype=wp.float32, device="cpu") for _ in range(2))
+    launch.launch(add_index, 10, [right], [sums])
+    with pytest.raises(RuntimeError, match="expects an array with dtype"):
+        launch.launch(add_index, 10, [wp.zeros(10, dtype=values, device="cpu")], [sums])
+    assert sums.numpy().tolist() == list(range(10))
+
+
 FIRST_LAUNCH = """
 import torch, warp as wp
 from warp_splat.runtime import launch

@@ -234,6 +234,14 @@ def test_atomic_write_refuses_a_folder_before_anything_is_written(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.gltf"]
 
 
+def test_atomic_write_replaces_a_link_to_a_folder(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "a.txt").symlink_to(tmp_path / "folder")
+    with atomic_write(tmp_path / "a.txt") as temporary:
+        temporary.write_text("text")
+    assert (tmp_path / "a.txt").read_text() == "text" and not list((tmp_path / "folder").iterdir())
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_atomic_write_reports_a_full_device(tmp_path):
     full = pytest.raises(InputError, match="No space left")

@@ -38,7 +38,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     temporary = path.with_name(f".tmp-{uuid.uuid4().hex[:12]}{path.suffix}")
     try:
-        if path.is_dir():  # before files that belong to it are written
+        if path.is_dir() and not path.is_symlink():  # before files that belong to it are written
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

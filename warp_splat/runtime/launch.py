@@ -27,8 +27,9 @@ from warp_splat.runtime.pool import even_slices, in_slices, set_threads
 
 #: Else Warp leaves assembling to newer drivers; benchmarks/cubins.py looks at what its own assembler makes.
 wp.config.cuda_output = wp.config.cuda_output or "cubin"
-#: What a kernel gets as an array, and as the number of its indices.
+#: What a kernel gets as an array and as the number of its indices; what makes its arguments of all else.
 _Array, _Bounds = wp._src.types.array_t, wp._src.types.launch_bounds_t  # pyright: ignore[reportAttributeAccessIssue]
+_pack = wp._src.context.pack_arg  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def prepare(device: str, threads: int) -> torch.device:
@@ -142,7 +143,7 @@ def _bound(kernel: wp.Kernel, inputs: Sequence, outputs: Sequence, adjoint: dict
         _codes[kernel, bool(adjoint)] = code
     _, begin, tables = code
     rows = [*inputs, *outputs], [*adjoint.get("adj_inputs", ()), *adjoint.get("adj_outputs", ())]
-    arguments, *adjoints = map(_packed, tables, rows)
+    arguments, *adjoints = (_packed(kernel, *pair) for pair in zip(tables, rows, strict=False))
 
     def run(low: int, high: int) -> None:
         own = type(arguments).from_buffer_copy(arguments)
@@ -152,13 +153,12 @@ def _bound(kernel: wp.Kernel, inputs: Sequence, outputs: Sequence, adjoint: dict
     return run
 
 
-def _packed(table: type[ctypes.Structure], values: Sequence) -> ctypes.Structure:
-    """Arguments as a kernel reads them, or adjoints; None is zero."""
-    found = table()
-    for field, value in zip(table._fields_, values, strict=True):
-        if value is not None:
-            setattr(found, field[0], value.__ctype__() if hasattr(value, "__ctype__") else value)
-    return found
+def _packed(kernel: wp.Kernel, table: type[ctypes.Structure], values: Sequence) -> ctypes.Structure:
+    """Arguments of ``kernel`` as it reads them, or adjoints; Warp checks all but numbers and what :func:`view` made."""
+    known, pairs = (_Array, int, float), zip(kernel.adj.args, values, strict=True)
+    return table(
+        *(v if isinstance(v, known) else _pack(kernel, a.type, a.label, v, "cpu", v is None) for a, v in pairs)
+    )
 
 
 def open_tape() -> wp.Tape | None:

@@ -50,7 +50,8 @@ def time_of_cameras(source: Path, say: Report) -> None:
     memory = max(peak_memory() or 0, before + OF_FEATURE * features * count / 2**20) / 1024
     told = (
         f"Cameras of {count} photographs will take about {extraction + matching + mapping:.1f} min on {CORES} "
-        f"cores, {memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f}."
+        f"cores, {memory:.1f} GiB: features {extraction:.1f}, {pairs} pairs {matching:.1f}, mapping {mapping:.1f} "
+        "(up to four times that, if half of them do not fit together)."
     )
     say(told if features else "Nothing can be told of what cameras take: these have no features, or cannot be read.")
 
