@@ -204,5 +204,6 @@ CHECKS = (check_reprojection, check_coverage, check_sky, check_axes, check_expos
 
 def worst_and_best(subject: Subject, photos: list[Photo], count: int) -> list[Photo]:
     """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
-    ranked = sorted(photos, key=lambda photo: -subject.medians.get(photo.name, 0.0))
+    medians = subject.medians
+    ranked = sorted(photos, key=lambda photo: -medians.get(photo.name, 0.0))
     return ranked[: count // 2] + sample(ranked[count // 2 :], count - count // 2)

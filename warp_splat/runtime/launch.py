@@ -156,9 +156,8 @@ def _bound(kernel: wp.Kernel, inputs: Sequence, outputs: Sequence, adjoint: dict
 def _packed(kernel: wp.Kernel, table: type[ctypes.Structure], values: Sequence) -> ctypes.Structure:
     """Arguments of ``kernel`` as it reads them, or adjoints; Warp checks all but numbers and what :func:`view` made."""
     known, pairs = (_Array, int, float), zip(kernel.adj.args, values, strict=True)
-    return table(
-        *(v if isinstance(v, known) else _pack(kernel, a.type, a.label, v, "cpu", v is None) for a, v in pairs)
-    )
+    given = (v if isinstance(v, known) else _pack(kernel, a.type, a.label, v, "cpu", v is None) for a, v in pairs)
+    return table(*given)
 
 
 def open_tape() -> wp.Tape | None:

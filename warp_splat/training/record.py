@@ -119,9 +119,10 @@ def keep(trainer: Trainer, run: Run, named: bool = False) -> None:
         options = {name: value for name, value in trainer.config.flat().items() if name not in OF_ONE_RUN}
         facts |= {"options": options, "iteration": run.iteration, "history": run.history}
         facts |= {"seconds": run.seconds, "spent": run.spent, "wall": time.perf_counter() - run.start}
+        arrays = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
         try:
             for name in [LAST, f"chkpnt{run.iteration}.safetensors"][: 1 + named]:
-                save(run.folder / name, {name: tensor.cpu().numpy() for name, tensor in tensors.items()}, facts)
+                save(run.folder / name, arrays, facts)
             run.kept = run.iteration
         except InputError as error:
             warn(error)

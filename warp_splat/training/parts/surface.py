@@ -81,8 +81,7 @@ class SurfacePart:
             z_there = torch.where(z > 0, z, torch.inf)
             u, v = other.fx * x / z_there + other.cx, other.fy * y / z_there + other.cy
             grid = torch.stack([2 * u / other.width - 1, 2 * v / other.height - 1], -1)[None]
-            kept = self.kept[place][None, None]
-            nearness = torch.nn.functional.grid_sample(kept, grid, align_corners=False)[0, 0]
+            nearness = torch.nn.functional.grid_sample(self.kept[place][None, None], grid, align_corners=False)[0, 0]
         error = (1 - z * nearness).abs()
         return torch.where((nearness > 0) & (error < SAME), error, 0.0)
 
