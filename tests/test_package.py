@@ -4,6 +4,7 @@ import gc
 import itertools
 import os
 import signal
+import sys
 import threading
 import time
 import weakref
@@ -145,6 +146,29 @@ def test_an_interrupted_launch_waits_for_its_helpers(threads):
     finally:
         signal.signal(signal.SIGINT, before)
     assert len(ended) == 1
+
+
+def test_an_interrupt_at_any_step_leaves_nothing_locked(threads):
+    """Ctrl-C may come between any two steps of the caller's, also within the library's own threading."""
+    threads(2)
+    image()  # a helper is there
+    for chosen in itertools.count():
+        steps = itertools.count()
+
+        def interrupt(frame, event, _, steps=steps, chosen=chosen):
+            if frame.f_code.co_filename in (pool.__file__, threading.__file__) and next(steps) == chosen:
+                raise KeyboardInterrupt  # ends the tracing, too
+            return interrupt
+
+        sys.settrace(interrupt)
+        try:
+            pool.in_slices(lambda low, high: time.sleep(0.001), [0, 1, 2, 3])
+        except KeyboardInterrupt:
+            continue
+        finally:
+            sys.settrace(None)
+        break
+    assert chosen > 20
 
 
 FIRST_RENDERS = """

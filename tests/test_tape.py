@@ -240,6 +240,18 @@ def test_a_body_in_flight_is_fitted_to_pictures(tmp_path, monkeypatch):
     assert np.allclose(names["spin"].numpy(), names["SPIN"], atol=2e-3)
 
 
+@pytest.mark.parametrize("name", ["means", "image"])
+def test_worlds_of_another_number_than_cameras_are_refused(name, device):
+    scene, *_ = scene_of(device)
+    arrays, shape = arrays_of(scene), (3, scene.camera.height, scene.camera.width)
+    if name == "means":
+        arrays[name] = wp.from_torch(torch.stack([scene.means] * 3), wp.vec3)
+    out = {"image": wp.zeros(shape, dtype=wp.vec3, device=device)} if name == "image" else None
+    given = [arrays[each] for each in ("means", "quats", "scales", "opacities", "sh")]
+    with pytest.raises(InputError, match=f"{name}: expected one array for each of 2 cameras, got 3"):
+        tape.rasterize_worlds(*given, cameras=[scene.camera] * 2, out=out)
+
+
 def test_worlds_are_separate_calls_into_one_array(device):
     """Two worlds of their own means, the rest in common, each with its camera; and no new arrays for the pictures."""
     scene, _, weights = scene_of(device)

@@ -245,17 +245,22 @@ def rasterize_worlds(
         InputError: as :func:`rasterize` does.
     """
     given = dict(zip(("means", "quats", "scales", "opacities", "sh"), (means, *gaussians), strict=True)) | more
+    ranks = RANKS | dict.fromkeys(out or {}, 0)
 
     def of(world: int, name: str, value: Any) -> Any:
         """What of ``value`` is of one world."""
         if isinstance(value, tuple):
             return tuple(of(world, name, part) for part in value)
         inner = len(getattr(getattr(value, "dtype", None), "_shape_", ()))
-        return value[world] if isinstance(value, wp.array) and value.ndim + inner > RANKS.get(name, 9) else value
+        if not isinstance(value, wp.array) or value.ndim + inner <= ranks.get(name, 9):
+            return value
+        if len(value) != len(cameras):
+            raise InputError(f"{name}: expected one array for each of {len(cameras)} cameras, got {len(value)}.")
+        return value[world]
 
     found = []
     for world, camera in enumerate(cameras):
-        room = {name: array[world] for name, array in (out or {}).items()}
+        room = {name: of(world, name, array) for name, array in (out or {}).items()}
         own = {name: of(world, name, value) for name, value in given.items()}
         found.append(rasterize(**own, camera=camera, out=room))
     return found

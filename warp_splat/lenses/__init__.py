@@ -164,8 +164,7 @@ def check_picture(lens: Lens, left: float, top: float, right: float, bottom: flo
         return
     corners = np.array([(x, y) for x in (left, right) for y in (top, bottom)])
     edges = np.array([(left, 0.0), (right, 0.0), (0.0, top), (0.0, bottom)])
-    rays = lens.undistorted(edges if lens.family.wide else corners)
-    unseen = np.isnan(rays[:, 0])
+    unseen = np.isnan(lens.undistorted(edges if lens.family.wide else corners)[:, 0])
     if lens.limit < math.pi and (unseen.all() if lens.family.wide else unseen.any()):
         raise InputError(
             f"Camera lens {lens.model}: expected coefficients that show farther out what lies farther out, all over "

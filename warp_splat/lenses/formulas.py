@@ -107,8 +107,7 @@ def enhanced_unified(k, x, y, z):
 def equirectangular(_k, x, y, z):
     """Longitude and latitude. So near to a pole that it makes no difference, the longitude is that of the axis."""
     across, square = x * x + z * z, x * x + y * y + z * z
-    pole = across < 1e-6 * square
-    z = np.where(pole, 1e-3 * np.sqrt(square), z)
+    z = np.where(across < 1e-6 * square, 1e-3 * np.sqrt(square), z)
     return np.arctan2(x, z), np.arctan2(y, np.sqrt(x * x + z * z))
 
 

@@ -41,8 +41,7 @@ class _Job:
 
     def __init__(self, slices: list[Callable[[], None]]):
         self.slices = slices[::-1]
-        self.lock, self.idle = threading.Lock(), threading.Event()
-        self.idle.set()
+        self.lock, self.ended = threading.Lock(), queue.SimpleQueue()  # a Ctrl-C in an Event's code leaves it locked
         self.helping = 0
         self.error: BaseException | None = None
 
@@ -57,7 +56,8 @@ class _Job:
                 for _ in range(helpers):
                     _jobs.put(self)
                 self._run_slices()
-                self.idle.wait()
+                while self.helping:
+                    self.ended.get()
                 break
             except BaseException as raised:  # Ctrl-C comes at any of these lines, mostly while waiting
                 error, helpers = raised, 0
@@ -82,7 +82,6 @@ class _Job:
             if not self.slices:
                 return
             self.helping += 1
-            self.idle.clear()
         try:
             self._run_slices()
         except BaseException as error:
@@ -90,8 +89,7 @@ class _Job:
         finally:
             with self.lock:
                 self.helping -= 1
-                if not self.helping:
-                    self.idle.set()
+            self.ended.put(None)
 
 
 @torch.no_grad()
