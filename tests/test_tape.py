@@ -252,6 +252,17 @@ def test_worlds_of_another_number_than_cameras_are_refused(name, device):
         tape.rasterize_worlds(*given, cameras=[scene.camera] * 2, out=out)
 
 
+def test_worlds_share_features_and_write_into_one_array(device):
+    scene, *_ = scene_of(device)
+    features = torch.rand(len(scene.means), 2, device=device)
+    shown = wp.zeros((2, scene.camera.height, scene.camera.width, 2), dtype=float, device=device)
+    given = [arrays_of(scene)[name] for name in ("means", "quats", "scales", "opacities", "sh")]
+    cameras = [scene.camera, make_camera(scene.camera.width, scene.camera.height, seed=3)]
+    tape.rasterize_worlds(*given, cameras=cameras, features=wp.from_torch(features), out={"features": shown})
+    for camera, found in zip(cameras, wp.to_torch(shown), strict=True):
+        assert torch.equal(found, warp_splat.rasterize(*scene.parameters(), camera, features=features).features)
+
+
 def test_worlds_are_separate_calls_into_one_array(device):
     """Two worlds of their own means, the rest in common, each with its camera; and no new arrays for the pictures."""
     scene, _, weights = scene_of(device)

@@ -232,11 +232,11 @@ def rasterize_worlds(
     """:func:`rasterize` for several worlds, each through its camera.
 
     Args:
-        means: those of all worlds, or one more dimension in front: [worlds, N]. So may every array.
+        means: those of all worlds, or one more dimension in front: [worlds, N].
         gaussians: quats, scales, opacities and sh, likewise.
         cameras: one for each world.
         out: arrays [worlds, H, W] to write into.
-        more: what :func:`rasterize` takes besides; arrays as above.
+        more: what :func:`rasterize` takes besides; ``features``, ``hidden_from`` and ``twist`` likewise.
 
     Returns:
         A :class:`TapeOutput` for each world.
@@ -245,14 +245,13 @@ def rasterize_worlds(
         InputError: as :func:`rasterize` does.
     """
     given = dict(zip(("means", "quats", "scales", "opacities", "sh"), (means, *gaussians), strict=True)) | more
-    ranks = RANKS | dict.fromkeys(out or {}, 0)
 
-    def of(world: int, name: str, value: Any) -> Any:
+    def of(world: int, name: str, value: Any, rank: int) -> Any:
         """What of ``value`` is of one world."""
         if isinstance(value, tuple):
-            return tuple(of(world, name, part) for part in value)
+            return tuple(of(world, name, part, rank) for part in value)
         inner = len(getattr(getattr(value, "dtype", None), "_shape_", ()))
-        if not isinstance(value, wp.array) or value.ndim + inner <= ranks.get(name, 9):
+        if not isinstance(value, wp.array) or value.ndim + inner <= rank:
             return value
         if len(value) != len(cameras):
             raise InputError(f"{name}: expected one array for each of {len(cameras)} cameras, got {len(value)}.")
@@ -260,8 +259,8 @@ def rasterize_worlds(
 
     found = []
     for world, camera in enumerate(cameras):
-        room = {name: of(world, name, array) for name, array in (out or {}).items()}
-        own = {name: of(world, name, value) for name, value in given.items()}
+        room = {name: of(world, name, array, 0) for name, array in (out or {}).items()}
+        own = {name: of(world, name, value, RANKS.get(name, 9)) for name, value in given.items()}
         found.append(rasterize(**own, camera=camera, out=room))
     return found
 
