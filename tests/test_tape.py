@@ -254,11 +254,12 @@ def test_worlds_of_another_number_than_cameras_are_refused(name, device):
 
 def test_worlds_share_features_and_write_into_one_array(device):
     scene, *_ = scene_of(device)
-    features = torch.rand(len(scene.means), 2, device=device)
+    features, twists = torch.rand(len(scene.means), 2, device=device), wp.zeros(2, wp.spatial_vector, device=device)
     shown = wp.zeros((2, scene.camera.height, scene.camera.width, 2), dtype=float, device=device)
     given = [arrays_of(scene)[name] for name in ("means", "quats", "scales", "opacities", "sh")]
     cameras = [scene.camera, make_camera(scene.camera.width, scene.camera.height, seed=3)]
-    tape.rasterize_worlds(*given, cameras=cameras, features=wp.from_torch(features), out={"features": shown})
+    more = {"features": wp.from_torch(features), "twist": twists, "out": {"features": shown}}
+    tape.rasterize_worlds(*given, cameras=cameras, **more)
     for camera, found in zip(cameras, wp.to_torch(shown), strict=True):
         assert torch.equal(found, warp_splat.rasterize(*scene.parameters(), camera, features=features).features)
 

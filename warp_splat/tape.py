@@ -255,7 +255,7 @@ def rasterize_worlds(
             return value
         if len(value) != len(cameras):
             raise InputError(f"{name}: expected one array for each of {len(cameras)} cameras, got {len(value)}.")
-        return value[world]
+        return value[world] if value.ndim > 1 else value[world : world + 1]
 
     found = []
     for world, camera in enumerate(cameras):
