@@ -259,7 +259,7 @@ def test_worlds_share_features_and_write_into_one_array(device):
     given = [arrays_of(scene)[name] for name in ("means", "quats", "scales", "opacities", "sh")]
     cameras = [scene.camera, make_camera(scene.camera.width, scene.camera.height, seed=3)]
     more = {"features": wp.from_torch(features), "twist": twists, "out": {"features": shown}}
-    tape.rasterize_worlds(*given, cameras=cameras, **more)
+    tape.rasterize_worlds(*given[:4], sh=given[4], cameras=cameras, **more)
     for camera, found in zip(cameras, wp.to_torch(shown), strict=True):
         assert torch.equal(found, warp_splat.rasterize(*scene.parameters(), camera, features=features).features)
 

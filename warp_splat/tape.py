@@ -244,11 +244,12 @@ def rasterize_worlds(
     Raises:
         InputError: as :func:`rasterize` does.
     """
-    given = dict(zip(("means", "quats", "scales", "opacities", "sh"), (means, *gaussians), strict=True)) | more
+    names = ("means", "quats", "scales", "opacities", "sh")[: 1 + len(gaussians)]  # others may come by name
+    given = dict(zip(names, (means, *gaussians), strict=True)) | more
 
     def of(world: int, name: str, value: Any, rank: int) -> Any:
         """What of ``value`` is of one world."""
-        if isinstance(value, tuple):
+        if isinstance(value, (tuple, list)):
             return tuple(of(world, name, part, rank) for part in value)
         inner = len(getattr(getattr(value, "dtype", None), "_shape_", ()))
         if not isinstance(value, wp.array) or value.ndim + inner <= rank:
