@@ -290,7 +290,7 @@ def test_worlds_are_separate_calls_into_one_array(device):
         assert torch.equal(wp.to_torch(images, requires_grad=False)[world], expected.image)
         assert torch.equal(wp.to_torch(found[world].alpha, requires_grad=False), expected.alpha)
         assert torch.equal(wp.to_torch(means.grad)[world], leaf.grad)
-    with pytest.raises(InputError, match=r"out\['image'\]: expected .* got \[3, 3, 3\]"):
-        tape.rasterize(
-            *(array for array in arrays.values()), scene.camera, out={"image": wp.zeros((3, 3), dtype=wp.vec3)}
-        )
+    wrong = {"image": r"out\['image'\]: expected .* got \[3, 3, 3\]", "depth": "some of image, alpha, got 'depth'"}
+    for name, sentence in wrong.items():
+        with pytest.raises(InputError, match=sentence):
+            tape.rasterize(*arrays.values(), scene.camera, out={name: wp.zeros((3, 3), dtype=wp.vec3)})

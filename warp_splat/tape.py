@@ -91,7 +91,8 @@ def rasterize(
         A :class:`TapeOutput`.
 
     Raises:
-        InputError: as :func:`warp_splat.rasterize` does, and if an argument is no Warp array.
+        InputError: as :func:`warp_splat.rasterize` does, if an argument is no Warp array, or ``out`` names a picture
+            that is not drawn.
     """
     given: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     pair = isinstance(sh, (tuple, list)) and len(sh) == 2
@@ -114,6 +115,8 @@ def rasterize(
                 leaf.requires_grad_(recorded and named[name].requires_grad)
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
+        if unknown := set(out or {}) - set(shown):
+            raise InputError(f"out: expected some of {', '.join(shown)}, got {min(unknown)!r}; leave that out.")
         with stage("tape"):
             pixels = {name: _array(name, tensor, recorded, (out or {}).get(name)) for name, tensor in shown.items()}
             if recorded:
