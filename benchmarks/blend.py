@@ -16,8 +16,10 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.bin import balanced_slices
+from warp_splat.raster.blend import Blending
 from warp_splat.raster.blend import blend as blend_splats
 from warp_splat.raster.data import Bins, Splats2D
+from warp_splat.raster.drivers import CPU
 from warp_splat.runtime import launch
 
 
@@ -44,7 +46,8 @@ class Lanes:
         bins = Bins(
             count, self.order, self.splats, *self.lists, slices, self.scene.tiles_x, self.scene.height, invalid=0
         )
-        self.image = blend_splats(self.projected, bins, torch.zeros(3), self.camera, RasterOptions(), self.mode).image
+        blending = Blending(bins, self.camera, RasterOptions(), CPU, self.mode)
+        self.image = blend_splats(self.projected, torch.zeros(3), blending).image
 
     def adjoint(self) -> None:
         self.grads = torch.autograd.grad(self.image, self.projected[:4], self.upstream, retain_graph=True)
