@@ -56,7 +56,8 @@ def plot_stages(path: Path, measured: Sequence[Mapping[str, Any]]) -> None:
 def plot_stability(path: Path, measured: Mapping[str, Any]) -> None:
     """Draw the growth of rounding along a chain against its bound, and the error of two formulas for a determinant."""
     errors = {(row["case"], row["mode"]): row for row in measured["verdicts"]}
-    chains = [(int(case.removeprefix("chain_")), mode) for case, mode in errors if case.startswith("chain_")]
+    found = [(case.removeprefix("chain_"), mode) for case, mode in errors]
+    chains = [(int(length), mode) for length, mode in found if length.isdigit()]
     lengths, modes = (list(dict.fromkeys(part)) for part in zip(*chains, strict=True))
     chain = Panel("error of gradients and of T, n layers", "n")
     chain.line("n eps", lengths, [n * measured["eps"] for n in lengths], color=report.INK, lw=1.0, ls="--")
