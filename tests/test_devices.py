@@ -81,12 +81,14 @@ def test_kernels_that_do_nothing_are_found(monkeypatch):
 def test_a_gpu_that_fails_gives_way_only_if_nobody_named_it(monkeypatch):
     monkeypatch.setattr(selftest, "check_device", failing(InputError("wrong.")))
     said = []
-    assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append) == HOST
+    monkeypatch.setattr(selftest, "prepare", lambda requested, threads: torch.device("cuda"))
+    assert selftest.settle_device("auto", 0, say=said.append) == HOST
     assert "wrong. Going on with the CPU." in said[-1]
-    refusal(lambda: selftest.settle_device(torch.device("cuda"), "cuda", say=said.append))
-    assert selftest.settle_device(HOST, "cpu", say=said.append) == HOST
+    refusal(lambda: selftest.settle_device("cuda", 0, say=said.append))
     monkeypatch.setattr(selftest, "check_device", lambda device, adjoint: None)
-    assert selftest.settle_device(torch.device("cuda"), "auto", say=said.append).type == "cuda"
+    assert selftest.settle_device("auto", 0, say=said.append).type == "cuda"
+    monkeypatch.undo()
+    assert selftest.settle_device("cpu", 0, say=said.append) == HOST
 
 
 def failing(error):

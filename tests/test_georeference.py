@@ -11,7 +11,7 @@ from splat_files import some_file
 
 from warp_splat.cli import main
 from warp_splat.errors import InputError
-from warp_splat.formats.coordinates import MODEL_FROM_WORLD, read_coordinates, write_coordinates
+from warp_splat.formats.coordinates import MODEL_FROM_WORLD, kept, read_coordinates, write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import write_cameras
 from warp_splat.inspect.subject import Subject
@@ -172,11 +172,15 @@ def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):
 
 def test_damaged_coordinates_get_one_sentence(tmp_path):
     assert read_coordinates(tmp_path) is None
-    for text in ("[]", '{"origin": [1, 2]}', '{"origin": [1, 2, NaN]}', '{"origin": ["a", 2, 3]}', "{"):
+    right = '{"origin": [1, 2, 3], '
+    wrong = [right + f'"residuals": {found}}}' for found in ("[1, 2]", '{"a": "x"}', '{"a": Infinity}')]
+    wrong += [right + '"left_out": 5}', '{"origin": [1, 2]}', '{"origin": [1, 2, NaN]}', '{"origin": ["a", 2, 3]}']
+    for text in (*wrong, f'{{"origin": [1{"0" * 400}, 2, 3]}}', "[]", "{"):
         (tmp_path / "coordinates.json").write_text(text)
         with pytest.raises(InputError, match=r"coordinates\.json"):
             read_coordinates(tmp_path)
     write_coordinates(tmp_path, {"origin": [1.0, 2.0, 3.0]})
     assert json.loads((tmp_path / "coordinates.json").read_text()) == read_coordinates(tmp_path)
+    assert kept({"origin": [10**400, 2, 3]}) is None
     write_coordinates(tmp_path, None)
     assert read_coordinates(tmp_path) is None

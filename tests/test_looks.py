@@ -40,6 +40,10 @@ def test_photographs_that_overlap_are_found_and_order_counts_where_it_means_some
     assert len(beside) == (0 if mixed else sum(min(COUNT - 1 - a, looks.NEIGHBORS) for a in range(COUNT)))
 
 
+def test_photographs_without_features_have_no_looks():
+    assert not looks.described_by_words(lambda index: np.zeros((0, 128), np.uint8), 3, seed=0).any()
+
+
 def test_neighbors_of_what_fits_are_compared_the_best_first():
     fits = {(0, 1): 200, (1, 2): 155, (0, 3): 100, (2, 3): 100, (3, 4): 149, (1, 5): 450}
     assert looks.beyond(fits, set(fits)) == [(0, 2), (0, 5), (1, 3), (2, 5)]  # 155 + 100, 200, 100 + 100, 155

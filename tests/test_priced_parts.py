@@ -172,6 +172,10 @@ def in_fits(change):
             in_fits(lambda fits: fits.update(view_009={"scale": None, "offset": 0})),
             "found {'scale': None, 'offset': 0} for view_009",
         ),
+        (
+            in_fits(lambda fits: fits.update(view_009={"scale": 10**400, "offset": 0})),
+            "depth_params.json: the file is damaged",
+        ),
     ],
 )
 def test_what_does_not_fit_is_one_sentence(damage, sentence, mapped):

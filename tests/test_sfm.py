@@ -107,7 +107,7 @@ def test_photographs_may_keep_their_lens(photos, scene, tmp_path):
         assert (tmp_path / "images" / view.name).read_bytes() == (photos[0] / view.name).read_bytes()
 
 
-def test_the_scene_is_said_to_be_complete(photos, scene, capsys):
+def test_the_scene_is_said_to_be_complete(photos, scene, tmp_path, capsys):
     before = {path: path.stat().st_mtime_ns for path in (scene / "sparse").rglob("*")}
     assert sfm(SfmConfig(str(photos[0]), str(scene))) == 0
     text = capsys.readouterr().out
@@ -119,6 +119,9 @@ def test_the_scene_is_said_to_be_complete(photos, scene, capsys):
     assert 0 < summary["reprojection_error_px"] < 1
     assert {path: path.stat().st_mtime_ns for path in (scene / "sparse").rglob("*")} == before
     assert sorted(path.name for path in scene.iterdir()) == ["images", "sfm", "sparse"]
+    kept = shutil.move(scene / "sfm" / "summary.json", tmp_path)  # as if the run had been killed right before
+    assert sfm(SfmConfig(str(photos[0]), str(scene))) == 0
+    shutil.move(kept, scene / "sfm" / "summary.json")
 
 
 @pytest.mark.parametrize(

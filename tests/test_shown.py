@@ -39,6 +39,11 @@ def test_contact_sheet_size(tmp_path, count, columns):
     assert lines * cell_height < sheet.shape[0] < lines * (cell_height + 60) + 132  # two lines at its head
 
 
+def test_names_with_dollars_are_no_mathematics(tmp_path):
+    report.contact_sheet(tmp_path / "sheet.png", {"$^$": [view("$^$.png"), view("$1_$2_.png")]})
+    assert load_png(tmp_path / "sheet.png").shape[1] == 1600
+
+
 @pytest.mark.parametrize(("height", "width"), [(40, 1), (1, 40)])
 def test_contact_sheet_of_strips_stays_small(tmp_path, height, width):
     """At the width of its cell, each would be 21,000 pixels high; a strip of 5,000 pixels took all memory."""

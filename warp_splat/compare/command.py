@@ -17,7 +17,7 @@ from warp_splat.formats.files import write_csv, write_json, write_text
 from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
-from warp_splat.runtime import launch, pool
+from warp_splat.runtime import pool
 
 DIRECTIONS = 4  # per parameter
 
@@ -36,8 +36,7 @@ def run(config: CompareConfig) -> int:
     if config.stability and config.device == "cuda":
         raise InputError("--device cuda: --stability computes on the CPU only; use --device cpu.")
     scenes = {} if config.stability else named_scenes(config.scene, print)
-    wanted = "cpu" if config.stability else config.device
-    device = settle_device(launch.prepare(wanted, config.threads), wanted, config.modes)
+    device = settle_device("cpu" if config.stability else config.device, config.threads, config.modes)
     out, log = prepare_folder(config.out), []  # to fail before all measuring, not after
 
     def say(text: str = "") -> None:

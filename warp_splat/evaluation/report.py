@@ -179,9 +179,9 @@ def new_figure(width: float, height: float, layout: Literal["constrained", "comp
     return Figure(figsize=(width, height), dpi=DPI, layout=layout, facecolor="white")
 
 
-def new_panels(height: float, rows: int = 1, columns: int = 1, width: float = WIDTH, **shared) -> tuple[Figure, Any]:
+def new_panels(height: float, rows: int = 1, columns: int = 1, **shared) -> tuple[Figure, Any]:
     """A figure in inches with axes in rows and columns, [rows, columns]; one alone for 1 x 1."""
-    figure = new_figure(width, height, layout="constrained")
+    figure = new_figure(WIDTH, height, layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=rows * columns == 1, **shared)
 
 
@@ -200,7 +200,7 @@ def _place_picture(
     axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, aspect=aspect)
     axes.set_anchor("NW")
     axes.set_axis_off()
-    axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5)
+    axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5, parse_math=False)
 
 
 def _draw_scale(figure: Figure, right: float, bottom: float) -> None:
@@ -216,7 +216,8 @@ def _write(figure: Figure, left: float, bottom: float, text: str, weight: str = 
     """Text that begins, or ends, at a place in inches."""
     size = 9 if weight == "bold" else 8
     width, height = figure.get_size_inches()
-    figure.text(left / width, bottom / height, text, fontsize=size, fontweight=weight, color=INK, ha=align)
+    style = {"fontsize": size, "fontweight": weight, "color": INK, "ha": align, "parse_math": False}
+    figure.text(left / width, bottom / height, text, **style)
 
 
 def _shorten(name: str, inches: float) -> str:

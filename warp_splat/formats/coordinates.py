@@ -42,7 +42,7 @@ def kept(found: object, axes: str = AXES) -> dict | None:
     """What a file of Gaussians with these ``axes`` repeats of them; None if they are none, or damaged."""
     try:
         return {**{name: checked(found).get(name) for name in KEPT}, "axes": axes}
-    except (Unexpected, ValueError, TypeError):
+    except (Unexpected, ValueError, TypeError, OverflowError):
         return None
 
 
@@ -62,13 +62,16 @@ def of_comments(comments: Sequence[str]) -> dict | None:
 
 
 def checked(found: object) -> dict:
-    """The same, if it has an origin of three finite numbers.
+    """The same, if it has an origin of three finite numbers, and what it says of photographs is of that kind.
 
     Raises:
         Unexpected: otherwise; or ValueError, TypeError.
     """
     if not isinstance(found, dict) or not isinstance(origin := found.get("origin"), list) or len(origin) != 3:
         raise Unexpected("no origin of three numbers")
-    if not np.isfinite(np.array(origin, np.float64)).all():
-        raise Unexpected("an origin that is not finite")
+    residuals, left_out = found.get("residuals", {}), found.get("left_out", [])
+    if not isinstance(residuals, dict) or not isinstance(left_out, list):
+        raise Unexpected("residuals, or what was left out, that are not by name")
+    if not np.isfinite(np.array([*origin, *residuals.values()], np.float64)).all():
+        raise Unexpected("a number that is not finite")
     return found

@@ -8,7 +8,6 @@ from warp_splat.errors import InputError
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.presets import PRESETS
 from warp_splat.raster.selftest import settle_device
-from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene import Scene, load_scene
 from warp_splat.scene.decoding import photo_memory
@@ -29,7 +28,7 @@ def check_cost(subject: Subject, say: Report) -> Iterator[Finding]:
     except InputError:
         return
     say("Trying a few steps (kernels are compiled once on a machine, about 20 s) ...")
-    device = settle_device(launch.prepare("auto", 0), "auto", say=say)
+    device = settle_device("auto", 0, say=say)
     sizes = [(view.camera.width, view.camera.height) for view in scene.train]
     try:
         with memory_explained(device, scene.points, sizes, "take smaller images (-r), or fewer Gaussians"):

@@ -88,7 +88,7 @@ def _sheet(subject: Subject, names: list[str]) -> Figure:
         top, left = index // COLUMNS * (height + gap) + gap, index % COLUMNS * (width + gap)
         small = subject.thumbnails[name]
         sheet[top : top + small.shape[0], left : left + small.shape[1]] = small
-        axes.text(left, top - 4, name[-14:], fontsize=5, color=INK)
+        axes.text(left, top - 4, name[-14:], fontsize=5, color=INK, parse_math=False)
     axes.imshow(sheet)
     axes.set_axis_off()
     return figure
@@ -117,7 +117,7 @@ def _on_photos(subject: Subject) -> Figure:
             pixels = photo.camera.pixels(points @ photo.camera.rotation.T + photo.camera.translation)
             axes.scatter(*pixels.T * small.shape[1] / photo.camera.width, c=ORANGE, s=1.5)
             title = photo.name
-        axes.set_title(title, fontsize=7, color=INK, pad=2)
+        axes.set_title(title, fontsize=7, color=INK, pad=2, parse_math=False)
         axes.set(xlim=(0, small.shape[1]), ylim=(small.shape[0], 0))
     if dots is not None:
         bar = figure.colorbar(dots, ax=cells[: len(photos)], shrink=0.4, aspect=40, location="bottom")

@@ -74,7 +74,7 @@ def check_coordinates(subject: Subject) -> Iterator[Finding]:
     if fitting:
         (half, _), (worst, name) = fitting[len(fitting) // 2], fitting[-1]
         text += f"; {len(fitting)} fit within {half:.2g} m (median), the worst, {name}, within {worst:.2g} m"
-    rest = f"; {len(left_out)} were left out: {few(left_out)}" if left_out else ""
+    rest = f"; {len(left_out)} were left out: {few(map(str, left_out))}" if left_out else ""
     yield Finding("coordinates", "warning" if left_out else "ok", f"{text}{rest}.")
 
 

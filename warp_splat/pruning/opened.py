@@ -19,7 +19,6 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished
-from warp_splat.runtime import launch
 from warp_splat.scene.types import Stored, View
 
 COVERED = 0.9  # of a pixel's light, from which on Gaussians of a crop explain it
@@ -37,7 +36,7 @@ class Opened(Finished):
     """
 
     def __init__(self, config: FinishedModel):
-        used = settle_device(launch.prepare(config.device, config.threads), config.device)
+        used = settle_device(config.device, config.threads)
         super().__init__(config.model, config.iteration, config.crop)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))

@@ -25,6 +25,7 @@ from warp_splat.raster.bin import count_twice
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 from warp_splat.runtime.devices import is_out_of_memory
+from warp_splat.runtime.launch import prepare
 
 # The far ball stands first: the device has to sort. Each shows in every pixel of the four tiles.
 CAMERA = Camera(24, 18, 20.0, 20.0, 12.3, 8.6, np.eye(3), np.zeros(3))
@@ -35,19 +36,22 @@ NEEDLES, FIELD = 20_000, Camera(1000, 700, 600.0, 600.0, 500.3, 350.6, np.eye(3)
 
 
 def settle_device(
-    device: torch.device, requested: str, adjoints: Sequence[str] = ("manual",), say: Callable[[str], object] = print
+    requested: str, threads: int, adjoints: Sequence[str] = ("manual",), say: Callable[[str], object] = print
 ) -> torch.device:
-    """``device``, if it passes the self-test; a GPU that "auto" chose and that fails gives way to the CPU, with a word.
+    """The device of a run, which :func:`prepare` chose and which passes the self-test.
+
+    A GPU that "auto" chose and that fails gives way to the CPU, with a word.
 
     Args:
-        device: on which the work is to be done.
         requested: "auto", "cpu" or "cuda", as the user had it.
+        threads: as :func:`prepare` takes them.
         adjoints: modes that will be used.
         say: receives what there is to say.
 
     Raises:
-        InputError: if a GPU was asked for by name and fails.
+        InputError: if a GPU was asked for by name and cannot be used, or fails.
     """
+    device = prepare(requested, threads)
     if device.type == "cpu":
         return device
     say("Testing the GPU; its kernels are compiled once on a machine ...")

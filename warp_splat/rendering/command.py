@@ -29,7 +29,6 @@ from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
 from warp_splat.rendering.finished import Finished
 from warp_splat.rendering.popping import popping_of
-from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
 from warp_splat.text import upward
@@ -93,7 +92,7 @@ def render_model(config: RenderConfig) -> int:
     say = (lambda *_: None) if config.quiet else print
     _check(config)
     metrics, absent = choose_metrics(config.lpips_weights)
-    device = settle_device(launch.prepare(config.device, config.threads), config.device, say=say)
+    device = settle_device(config.device, config.threads, say=say)
     folder, finished = _open(config)
     model, iteration = GaussianModel.from_splats(finished.file.splats).arranged(), finished.iteration
     if (config.orbit or config.video) and not len(model):

@@ -83,7 +83,7 @@ def _fit(entries: dict, name: str) -> Fit:
     if not isinstance(entry, dict):
         raise Unexpected(f"none for {name}")
     values = [entry.get(key) for key in Fit._fields]
-    if not all(isinstance(value, int | float) and np.isfinite(value) for value in values):
+    if not all(isinstance(value, int | float) and np.isfinite(float(value)) for value in values):
         raise Unexpected(f"{entry!s:.80} for {name}")
     return Fit(*map(float, values))
 

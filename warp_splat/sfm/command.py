@@ -69,7 +69,8 @@ def sfm(config: SfmConfig) -> int:
             summary = _reconstruct(root, names, scene, work, config, say)
         summary["seconds_of_last_run"] = round(time.perf_counter() - started, 1)
         write_json(work / "summary.json", summary)
-    _summarize(scene, json.loads((work / "summary.json").read_text()))
+    if (summary := work / "summary.json").is_file():  # else the run was stopped right before
+        _summarize(scene, json.loads(summary.read_text()))
     return 0
 
 

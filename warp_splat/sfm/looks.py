@@ -38,7 +38,8 @@ def described_by_words(features: Callable[[int], np.ndarray], count: int, seed: 
     for index in range(count):
         found = features(index)
         sample.append(found[random.permutation(len(found))[: -(-SAMPLE // count)]].astype(np.float32))
-    words = vocabulary(np.concatenate(sample), random)
+    known = np.concatenate(sample)
+    words = vocabulary(known if len(known) else np.zeros((1, known.shape[1]), np.float32), random)
     described = np.zeros((count, *words.shape), np.float32)
     for index in range(count):
         found = features(index).astype(np.float32)

@@ -97,7 +97,7 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
 def cost_of(trial: Trainer, task: Task, say: Callable[[str], None]) -> Cost:
     """What steps cost on this machine, for each image, as ``trial`` takes a few; it is of no use afterwards."""
     processes = trial.processes
-    measured = [StepTime(*row) for row in json.loads(processes.first(json.dumps(_measured(trial, task))))]
+    measured = processes.first(_measured(trial, task))
     for row in measured:
         say(f"  {1e3 * row.seconds:.1f} ms a step with {row.gaussians} Gaussians and {row.pixels} pixels")
     return Cost.of([row._replace(seconds=row.seconds / processes.images) for row in measured])

@@ -15,7 +15,7 @@ from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.ply import save_points
 from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
-from warp_splat.runtime import launch, pool
+from warp_splat.runtime import pool
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
 from warp_splat.scene.blocks import BLOCK
@@ -63,7 +63,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         raise InputError(f"--iterations {end}: expected at least {done}, as in {begun.path}; name a later end.")
     folder = _choose_folder(config, begun)
     say = speaker(quiet)
-    device = settle_device(launch.prepare(machine.device, threads), machine.device, [config.model.adjoint], say)
+    device = settle_device(machine.device, threads, [config.model.adjoint], say)
     if machine.data_device == "cuda" and device.type != "cuda":
         raise InputError("--data_device cuda: expected training on a GPU, too; use --data_device cpu.")
     source = data.source_path

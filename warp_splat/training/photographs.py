@@ -1,5 +1,6 @@
 """Which photograph a step sees; on its device and at its size, which may double from coarse to fine."""
 
+import copy
 import io
 import math
 import os
@@ -176,9 +177,8 @@ class Deck:
 
     def coming(self, count: int, steps: int) -> list[list[View]]:
         """The views of each of the next steps, which stay to be dealt."""
-        twin = Deck(self.views, 0)
-        twin.left = list(self.left)
-        twin.random.setstate(self.random.getstate())
+        twin = copy.copy(self)
+        twin.left, twin.random = list(self.left), copy.copy(self.random)
         return [twin.deal(count) for _ in range(steps)]
 
     def state(self) -> dict[str, list[int]]:

@@ -20,7 +20,7 @@ from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.formats.curve import along_curve
 from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.model_folder import prepare_folder
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays
+from warp_splat.formats.splats import COEFFICIENTS
 from warp_splat.gaussians import CHUNK, GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster.api import RenderOutput, render
@@ -82,7 +82,7 @@ class Trainer:
         means, degree = (scene.start.splats.means if scene.start else scene.points), config.model.sh_degree
         own = along_curve(torch.from_numpy(means).float())[processes.own(len(means))].numpy()
         if scene.start:
-            model = GaussianModel.from_splats(SplatArrays(*(rows[own] for rows in scene.start.splats)), degree)
+            model = GaussianModel.from_splats(scene.start.splats.take(own), degree)
         else:
             model = GaussianModel.from_points(scene.points, scene.colors, degree, own)
         self.model = model.to(self.device)

@@ -7,7 +7,6 @@ from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished
-from warp_splat.runtime import launch
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.scene.types import Scene
@@ -24,7 +23,7 @@ def view_model(config: ViewConfig) -> int:
     if not config.model:
         raise InputError("MODEL: expected the folder of a trained model, or a file of Gaussians; name one.")
     free_port(config.port)  # before the scene is loaded
-    device = settle_device(launch.prepare(config.device, config.threads), config.device)
+    device = settle_device(config.device, config.threads)
     finished = Finished(config.model, config.iteration, config.crop)
     model = GaussianModel.from_splats(finished.file.splats).arranged().to(device)
     print(f"{len(model)} Gaussians from {config.model}, iteration {finished.iteration}")
