@@ -12,6 +12,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import torch
 from common import MODELS, SCENE, option, parse, run_training, write_table
 from scipy.ndimage import maximum_filter, minimum_filter
 from street import make_street
@@ -22,6 +23,7 @@ from warp_splat.config import MergeConfig
 from warp_splat.formats.model_folder import find_iteration, ply_path
 from warp_splat.gaussians import GaussianModel
 from warp_splat.presets import PRESETS
+from warp_splat.raster.beside import rays
 from warp_splat.rendering.finished import Finished
 from warp_splat.scene import load_scene
 from warp_splat.scene.blocks import Block, merge_blocks
@@ -56,9 +58,8 @@ def train_together(folder: Path, source: Path, seed: int, width: int, steps: int
 
 def cells_in(camera: Camera, depth: np.ndarray, block: Block) -> np.ndarray:
     """The number of the cell in which each pixel has its ``depth`` [H, W]; its shape."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    points = ((rays * depth[..., None]).reshape(-1, 3) - camera.translation) @ camera.rotation
+    along = rays(camera, torch.device("cpu")).numpy()
+    points = (along * depth[..., None]).reshape(-1, 3) + camera.center
     held = [block._replace(number=number).holds(points) for number in range(len(block.cells))]
     return np.argmax(held, 0).reshape(depth.shape)
 

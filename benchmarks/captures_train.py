@@ -84,9 +84,7 @@ def measure(scene: Path, memory: float) -> dict:
     seconds, threads, first = [], [], 0.0
     for iteration in range(1, STEPS + 1):
         begun, worked = time.perf_counter(), time.process_time()
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+        trainer.advance(iteration)
         seconds.append(time.perf_counter() - begun)
         threads.append(time.process_time() - worked)
         first = first or time.perf_counter() - started

@@ -60,6 +60,23 @@ def run_training(model: Path, flags: Iterable) -> dict:
     return results[max(results, key=lambda name: int(name.removeprefix("ours_")))]
 
 
+@contextmanager
+def claimed(path: Path) -> Iterator[None]:
+    """A file that is the block's to write, empty meanwhile: others leave it alone. It goes if nothing comes of it."""
+    path.touch(exist_ok=False)
+    try:
+        yield
+    finally:
+        if not path.stat().st_size:
+            path.unlink()
+
+
+def status(name: str) -> int:
+    """A line of this process's status, in bytes (its unit is KiB)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * int(next(line.split()[1] for line in lines if line.startswith(name)))
+
+
 def in_process(*command) -> dict:
     """What a script prints last, as JSON, in a process of its own; ``command``: its path and its words."""
     found = subprocess.run([sys.executable, *map(str, command)], check=True, stdout=subprocess.PIPE, text=True)

@@ -12,6 +12,7 @@ import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import light
 import maps
 import numpy as np
 import torch
-from common import parse, transcribe
+from common import interleaved, parse, transcribe
 from exact_cameras import exact_camera, exact_render
 from light import Volume
 
@@ -133,16 +134,15 @@ def measure_times(
 ) -> dict[str, float]:
     """Processor seconds of projection and adjoint by each camera with its options, the least of some turns."""
     *geometry, sh = (tensor.detach().float().requires_grad_() for tensor in gaussians)
-    given, best = Gaussians(*geometry, sh, sh.new_zeros(len(sh), 0, 3)), dict.fromkeys(ways, np.inf)
-    for _ in range(TURNS):
-        for name, (camera, options) in ways.items():
-            known = () if isinstance(camera, Camera) else vars(camera).values()
-            learned = [leaf for leaf in known if isinstance(leaf, torch.Tensor)]
-            start = time.process_time()
-            splats = project(given, camera, options)
-            torch.autograd.grad(splats[:5], [*given[:5], *learned], [torch.ones_like(part) for part in splats[:5]])
-            best[name] = min(best[name], time.process_time() - start)
-    return best
+    given = Gaussians(*geometry, sh, sh.new_zeros(len(sh), 0, 3))
+
+    def once(camera: Camera | CameraParameters, options: RasterOptions) -> None:
+        known = () if isinstance(camera, Camera) else vars(camera).values()
+        learned = [leaf for leaf in known if isinstance(leaf, torch.Tensor)]
+        splats = project(given, camera, options)
+        torch.autograd.grad(splats[:5], [*given[:5], *learned], [torch.ones_like(part) for part in splats[:5]])
+
+    return interleaved({name: partial(once, *way) for name, way in ways.items()}, TURNS, time.process_time, min)
 
 
 def measure_gradients() -> list[dict[str, Any]]:

@@ -7,7 +7,6 @@ kernel adds into the Gaussian's row at once; no rows per instance, no second ker
 import copy
 import functools
 import inspect
-import linecache
 
 import torch
 import warp as wp
@@ -18,6 +17,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.cuda import adjoint
+from warp_splat.kernels.inline import defined
 from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.data import Gaussians, Pixels, alphas_of, variant_of
 from warp_splat.raster.drivers import CUDA, THREADS
@@ -65,10 +65,7 @@ def make_adding_block(variant: BlendVariant) -> wp.Kernel:
         "slots_out[k, column] = total", "wp.atomic_add(slots_out, bins.instances[k], column, total)"
     )
     assert changed != source
-    path, names = "<adjoint that adds>", dict(vars(adjoint))
-    linecache.cache[path] = (len(changed), None, changed.splitlines(keepends=True), path)  # where Warp finds it
-    exec(compile(changed, path, "exec"), names)
-    return names["make_reverse"]("manual", variant)
+    return defined("make_reverse", changed, dict(vars(adjoint)))("manual", variant)
 
 
 class Blends:

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from audit_targets.own import matrices_of
 from common import ROOT, milliseconds
 from made_up import cameras, make_gaussians, make_trainer, steps_of
 from preset import run
@@ -67,11 +68,8 @@ def measure_gsplat(count: int, width: int, height: int, device: str, repeats: in
     renderers = {"ours": lambda: render(gaussians, camera, background, RasterOptions()).image}
     if rasterization := _gsplat(device):
         means, quats, scales, opacities, *sh = gaussians
-        view = torch.eye(4, device=device)
-        view[:3, :3], view[:3, 3] = (torch.tensor(part).to(view) for part in (camera.rotation, camera.translation))
-        lens = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], device=device)
         given = (means, quats, scales, opacities)
-        more = (view[None], lens[None], width, height)
+        more = (*(matrix[None].to(device) for matrix in matrices_of(camera)), width, height)
         renderers["gsplat"] = lambda: rasterization(*given, torch.cat(sh, 1), *more, sh_degree=3)[0]
     rows = []
     for name, forward in renderers.items():

@@ -10,7 +10,8 @@ import json
 import time
 
 import numpy as np
-from common import RUNS, parse, write_table
+from common import RUNS, claimed, parse, write_table
+from made_up import take_steps
 
 from warp_splat.color import to_bytes
 from warp_splat.evaluation.metrics import psnr, ssim
@@ -40,10 +41,7 @@ def train(scene: Scene, share: float, parts: str, seed: int) -> dict[str, float]
     trainer = Trainer(scene, config)
     trainer.warm_up()
     begun, steps = time.process_time(), config.learn.iterations
-    for iteration in range(1, steps + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+    take_steps(trainer, steps)
     seconds = time.process_time() - begun
     plain = [psnr(to_bytes(trainer.look(view.camera).image, scene.linear), view.picture) for view in scene.test]
     alike = [ssim(trainer.picture(view.camera, view.name), view.picture) for view in scene.test]
@@ -61,10 +59,10 @@ def main() -> None:
     for seed, name, recipe in [] if arguments.only_table else jobs:
         path = paths[seed, name, recipe]
         if not path.exists():
-            path.touch()
-            scene = load_scene(places[name], eval=True, resolution=1)
-            path.write_text(json.dumps(train(scene, *RECIPES[recipe], seed)))
-            print(name, recipe, seed, path.read_text(), flush=True)
+            with claimed(path):
+                scene = load_scene(places[name], eval=True, resolution=1)
+                path.write_text(json.dumps(train(scene, *RECIPES[recipe], seed)))
+                print(name, recipe, seed, path.read_text(), flush=True)
     records = []
     for name in places:
         for recipe in RECIPES:

@@ -8,15 +8,13 @@ same steps. Both are judged on the lens's own pixels of views that were held out
 
 import contextlib
 import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import warp as wp
-from common import option, parse, picture_of, write_table
+from common import option, parse, picture_of, run_training, write_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "assets"))
 from make_scene import TARGET, orbit
@@ -24,6 +22,7 @@ from scene_geometry import still_life
 from scene_trace import GRID, LAMP, LAMP_HALF, Scene, Tracer, develop, trace
 
 from warp_splat.camera import Camera
+from warp_splat.formats.png import save_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.rendering.finished import Finished
@@ -71,11 +70,7 @@ def write_scene(folder: Path) -> None:
         seen = wp.array(np.ascontiguousarray(rays @ rotation, np.float32), dtype=wp.vec3, device="cpu")
         wp.launch(photograph_rays, image.size, [tracer.scene, wp.vec3(*place), seen], [image], device="cpu")
         name, pose = f"images/view_{index:03}.png", np.eye(4)
-        pixels = np.rint(image.numpy().reshape(SIZE, SIZE, 3) * 255).astype(np.uint8)
-        file = oiio.ImageOutput.create(str(folder / name))
-        file.open(str(folder / name), oiio.ImageSpec(SIZE, SIZE, 3, "uint8"))
-        file.write_image(pixels)
-        file.close()
+        save_png(folder / name, np.rint(image.numpy().reshape(SIZE, SIZE, 3) * 255).astype(np.uint8))
         pose[:3, :3], pose[:3, 3] = rotation.T * (1, -1, -1), place  # OpenGL's axes
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     content = {"camera_model": LENS.model, "fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE / 2, "cy": SIZE / 2}
@@ -101,20 +96,17 @@ def main() -> None:
         option("--work", type=Path, help="folder for scene and models; default: removed afterwards"),
     )
     with contextlib.ExitStack() as stack:
-        work = given.work or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        work = given.work.resolve() if given.work else Path(stack.enter_context(tempfile.TemporaryDirectory()))
         scene = work / "scene"
         if not scene.exists():
             scene.mkdir(parents=True)
             write_scene(scene)
         rows, data = [], {}
         for way in WAYS:
-            model = work / way
-            options = ["--eval", "--iterations", str(given.iterations), "--lens", way, "--quiet"]
-            command = [sys.executable, "train.py", "-s", str(scene), "-m", str(model), *options]
-            if not (model / "results.json").exists():
-                subprocess.run(command, check=True)
+            options = ["--eval", "--iterations", given.iterations, "--lens", way, "--quiet"]
+            run_training(work / way, ["-s", scene, *options])
             view = load_scene(scene, lens=way, report=str).train[0]
-            data[way] = own_psnr(scene, model)
+            data[way] = own_psnr(scene, work / way)
             rows.append([way, f"{view.camera.width} x {view.camera.height}", f"{data[way]:.2f}"])
     note = f"{given.iterations} steps, one seed; the embedded scene through a fisheye of 180 degrees across, {SIZE} px."
     write_table(

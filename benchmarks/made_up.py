@@ -122,9 +122,7 @@ def short_trainer(scene: Scene, steps: int, options: dict) -> Trainer:
 def take_steps(trainer: Trainer, steps: int) -> None:
     """All but the last update: a set that was changed a moment ago is unsettled."""
     for iteration in range(1, steps + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+        trainer.advance(iteration)
 
 
 class BlendScene(NamedTuple):

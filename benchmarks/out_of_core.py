@@ -19,7 +19,7 @@ import weakref
 from pathlib import Path
 
 import numpy as np
-from common import in_process, option, parse, write_table
+from common import in_process, option, parse, status, write_table
 from PIL import Image
 
 from warp_splat.camera import Camera
@@ -40,12 +40,6 @@ HEADERS = {
     "step s": lambda row: f"{row['step']:.2f}",
     "model": lambda row: row["sha256"][:12],
 }
-
-
-def status(name: str) -> int:
-    """A line of this process's status, in bytes (its unit is KiB)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * int(next(line.split()[1] for line in lines if line.startswith(name)))
 
 
 def make_scene(folder: Path) -> None:
@@ -99,9 +93,7 @@ def measure(scene: Path, count: int, limit: float, in_file: bool) -> dict:
         seconds, files = [], []
         for iteration in range(1, GROWTH + STEPS + 1):
             begun, had = time.perf_counter(), status("RssFile")
-            if iteration > 1:
-                trainer.update(iteration - 1)
-            trainer.differentiate(iteration)
+            trainer.advance(iteration)
             if iteration > GROWTH:
                 seconds.append(time.perf_counter() - begun)
                 files.append(status("RssFile") - had)

@@ -40,9 +40,7 @@ def trainer_of(scene: Path, memory: float | None, folder: str) -> Trainer:
 
 def step(trainer: Trainer, iteration: int) -> float:
     begun = time.perf_counter()
-    if iteration > 1:
-        trainer.update(iteration - 1)
-    trainer.differentiate(iteration)
+    trainer.advance(iteration)
     return time.perf_counter() - begun
 
 

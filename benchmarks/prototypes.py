@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import RUNS, option, parse, write_table
+from common import RUNS, claimed, option, parse, write_table
 from ingredients import INGREDIENTS, Ingredient
 
 from warp_splat.evaluation.metrics import ssim
@@ -66,9 +66,7 @@ def train(scene: Scene, name: str, share: float, seed: int, ingredient: Ingredie
         for place, trainer in enumerate(trainers):
             last, begun = trainer.config.learn.iterations, time.process_time()
             for iteration in range(1 + last * turn // TURNS_EACH, 1 + last * (turn + 1) // TURNS_EACH):
-                if iteration > 1:
-                    trainer.update(iteration - 1)
-                trainer.differentiate(iteration)
+                trainer.advance(iteration)
             seconds[place] += time.process_time() - begun
     made = zip(trainers, seconds, strict=True)
     return [measured(it, scene) | {"seconds": time, "cost": time / seconds[-1]} for it, time in made]
@@ -94,8 +92,7 @@ class Runs:
         for seed in range(seeds):
             path = self._path(what, name, share, seed)
             if not path.exists() and place and not self.only_table:
-                path.touch()
-                try:
+                with claimed(path):
                     if name not in self.scenes:
                         self.scenes[name] = load_scene(place, eval=True, resolution=SIZES[name][0], report=str)
                     made, *beside = train(self.scenes[name], name, share, seed, INGREDIENTS.get(what))
@@ -103,9 +100,6 @@ class Runs:
                     if beside:
                         self._path(PRESET, name, share, seed).write_text(json.dumps(beside[0]))
                     print(name, share, what, seed, {key: round(value, 3) for key, value in made.items()}, flush=True)
-                finally:
-                    if not path.stat().st_size:
-                        path.unlink()
             if path.exists() and path.stat().st_size:
                 found[seed] = json.loads(path.read_text())
         return found

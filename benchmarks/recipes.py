@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 import work
-from common import RUNS, parse, write_table
+from common import RUNS, claimed, parse, write_table
 
 from warp_splat.evaluation.metrics import psnr, ssim
 from warp_splat.evaluation.perceptual import flip
@@ -101,9 +101,7 @@ def measure(scene: Scene, options: dict) -> dict:
     marks = {iterations * mark // MARKS for mark in range(1, MARKS + 1)}
     for iteration in range(1, iterations + 1):
         start = time.process_time()
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+        trainer.advance(iteration)
         seconds += time.process_time() - start
         if iteration in marks:
             curve.append((iteration, seconds, trainer.evaluate(scene.test), len(trainer.model)))
@@ -136,17 +134,12 @@ def train_all(runs: Path, places: dict[str, Path]) -> None:
         path = file_of(runs, name, scene, limit, seed)
         if scene not in places or path.exists():
             continue
-        path.touch(exist_ok=False)
-        if scene not in scenes:
-            scenes[scene] = scene_of(scene, places[scene])
-        try:
-            with RECIPES[name].around():
-                found = measure(scenes[scene], options_of(scene, limit, seed, RECIPES[name]))
+        with claimed(path), RECIPES[name].around():
+            if scene not in scenes:
+                scenes[scene] = scene_of(scene, places[scene])
+            found = measure(scenes[scene], options_of(scene, limit, seed, RECIPES[name]))
             path.write_text(json.dumps(found))
             print(scene, limit, name, seed, round(found["psnr"], 2), round(found["seconds"]), flush=True)
-        finally:
-            if not path.stat().st_size:
-                path.unlink()
 
 
 def jobs_of() -> list[tuple[str, str, int, int]]:

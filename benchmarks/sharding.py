@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import ROOT, option, parse, write_table
+from common import ROOT, option, parse, status, write_table
 
 VIEWS, SPREAD, FEW = 4, 4.0, 1000
 SENT = 52 + 40  # bytes of a splat that travels, and of its gradients
@@ -29,12 +29,6 @@ COLUMNS = {
     **{"s a step": "{step:.2f}", "s an image": "{image:.3f}", "exchange s": "{exchange:.2f}"},
 }
 ALONE = ["unshare", "--net", "sh", "-c", 'ip link set lo up && exec "$@"', "sh"]  # a network without other traffic
-
-
-def status(name: str) -> int:
-    """Bytes of this process, from the kernel."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(name))
 
 
 def on_the_wire() -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from common import option, parse, write_table
+from made_up import take_steps
 
 from warp_splat.evaluation.metrics import ssim
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
@@ -45,10 +46,7 @@ def train(scene: Scene, name: str, factor: float, times: float, seed: int) -> di
     rates = {rate: times * getattr(config.learn, rate) for rate in RATES}
     trainer = Trainer(scene, of_length(config, factor, task).changed(**rates))
     trainer.warm_up()
-    for iteration in range(1, trainer.config.learn.iterations + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+    take_steps(trainer, trainer.config.learn.iterations)
     similar = [ssim(trainer.picture(view.camera), view.picture) for view in scene.test]
     reached = {"psnr": trainer.evaluate(scene.test), "train": trainer.evaluate(scene.train[::4])}
     return reached | {"ssim": float(np.mean(similar))}

@@ -5,13 +5,10 @@ Surfaces are those of the model's depths alone. Models are kept in a folder and 
     python benchmarks/surface_part.py --runs output/surface --fox path/to/fox --church path/to/church [--out folder]
 """
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-from common import ROOT, option, parse, write_table
+from common import option, parse, run_training, write_table
 from mesh import MEMORY, PIXELS, against_truth, to_mesh
 
 from warp_splat.config import MeshConfig
@@ -28,11 +25,8 @@ HEADERS = ("scene", "weights", "PSNR", "accuracy 1.0%", "F 1.0%", "normals, degr
 
 def row_of(scene: str, flags: tuple, weights: tuple[float, float], runs: Path) -> tuple:
     folder = runs / "_".join(f"{word}" for word in (*scene.split(), *weights))
-    if not (folder / "results.json").is_file():
-        more = ("--parts", "surface", "--surface_normals", weights[0], "--surface_views", weights[1])
-        command = [sys.executable, ROOT / "train.py", "-m", folder, "--eval", *flags, *(more if any(weights) else ())]
-        subprocess.run([*map(str, command)], check=True, cwd=ROOT)
-    result = next(iter(json.loads((folder / "results.json").read_text()).values()))
+    more = ("--parts", "surface", "--surface_normals", weights[0], "--surface_views", weights[1])
+    result = run_training(folder, ["--eval", *flags, *(more if any(weights) else ())])
     opened = Opened(MeshConfig(model=str(folder), output=""))
     views = agreed(drawn_views(opened, MEMORY))
     voxel = PIXELS * pixel(views)

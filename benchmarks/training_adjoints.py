@@ -170,9 +170,7 @@ def train_run(trainer: Trainer, result: Trained, reference: dict[int, torch.Tens
     checks = {last * k // EVALUATIONS for k in range(1, EVALUATIONS + 1)}
     for iteration in range(1, last + 1):
         start = time.perf_counter()
-        if iteration > 1:  # the last update is left out: a set that was densified a moment ago is unsettled
-            trainer.update(iteration - 1)
-        losses.append(trainer.differentiate(iteration).item())
+        losses.append(trainer.advance(iteration).item())  # no last update: a set densified just now is unsettled
         seconds += time.perf_counter() - start
         if iteration in checks:
             record = {"iteration": iteration, "seconds": seconds, "loss": float(np.mean(losses))}

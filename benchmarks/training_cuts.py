@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from common import option, parse, write_table
+from made_up import take_steps
 from scipy import stats
 
 from warp_splat.compare.workloads import SHORT
@@ -39,10 +40,7 @@ def trained(scene: Scene, seed: int, adjoint: str = "manual", **cuts) -> tuple[f
     trainer.options = replace(trainer.options, **cuts)
     trainer.warm_up()
     start = time.process_time()
-    for iteration in range(1, SHORT["iterations"] + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+    take_steps(trainer, SHORT["iterations"])
     seconds = time.process_time() - start
     return trainer.evaluate(scene.test), len(trainer.model), seconds
 

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 
 import torch
+from audit_targets.own import matrices_of
 from common import REPEATS, option, parse, write_table
 from made_up import cameras, make_gaussians
 
@@ -34,11 +35,7 @@ def by_ours(leaves: list[torch.Tensor], seen: list[Camera], together: bool) -> l
 
 def by_gsplats(leaves: list[torch.Tensor], seen: list[Camera], together: bool) -> list[torch.Tensor]:
     """Images of gsplat's function."""
-    viewmats, Ks = torch.eye(4).repeat(len(seen), 1, 1), torch.zeros(len(seen), 3, 3)
-    for index, camera in enumerate(seen):
-        viewmats[index, :3, :3] = torch.tensor(camera.rotation)
-        viewmats[index, :3, 3] = torch.tensor(camera.translation)
-        Ks[index] = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    viewmats, Ks = (torch.stack(matrices) for matrices in zip(*map(matrices_of, seen), strict=True))
     calls = [slice(None)] if together else [slice(index, index + 1) for index in range(len(seen))]
     images = [rasterization(*leaves, viewmats[call], Ks[call], *SIZE, sh_degree=3)[0] for call in calls]
     return list(torch.cat(images))

@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import linecache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from warp_splat.kernels import falloff, simd, splat
 from warp_splat.kernels.angle import angle
 from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.falloff import exp2_known, make_exp
+from warp_splat.kernels.inline import defined
 from warp_splat.kernels.simd import vec16
 from warp_splat.kernels.step import opaque
 
@@ -115,11 +115,8 @@ COVERED = {*PIECES, "rows"}  # rows are made where columns are taken
 
 def make_piece(name, number):
     """A kernel of x, y, z that calls the piece ``name``."""
-    path, names = f"<piece {name} of {number.__name__}>", {**KNOWN, "number": number}
     source = f"def piece(x: number, y: number, z: number):\n    return {PIECES[name][0]}\n"
-    linecache.cache[path] = (len(source), None, source.splitlines(keepends=True), path)  # where Warp finds it
-    exec(compile(source, path, "exec"), names)
-    piece = wp.func(names["piece"])
+    piece = wp.func(defined("piece", source, {**KNOWN, "number": number}))
 
     @wp.kernel(module="unique")
     def evaluate(x: wp.array[number], y: wp.array[number], z: wp.array[number], values_out: wp.array[number]):

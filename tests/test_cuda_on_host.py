@@ -9,6 +9,7 @@ import cuda_on_host
 import numpy as np
 import pytest
 import torch
+from audit_targets.own import matrices_of
 from common import using
 from cuda_on_host import build, recorded, run
 from scenes import PARAMETERS, cloud, dense_tile, make_camera
@@ -46,9 +47,8 @@ def sum_magnitudes():
     """Of gradients, which gsplat's function asks for."""
     scene = small()
     leaves = [getattr(scene, name).detach().clone().requires_grad_() for name in PARAMETERS]
-    camera, pose = scene.camera, torch.eye(4)
-    pose[:3, :3], pose[:3, 3] = torch.tensor(camera.rotation), torch.tensor(camera.translation)
-    lens = torch.tensor([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    camera = scene.camera
+    pose, lens = matrices_of(camera)
     more = {"sh_degree": int(scene.sh.shape[1] ** 0.5) - 1, "absgrad": True}
     image, *_ = rasterization(*leaves, pose[None], lens[None], camera.width, camera.height, **more)
     image.square().sum().backward()

@@ -103,7 +103,7 @@ def rasterize(
     named = {name: _checked(name, array) for name, array in given.items()}
     if hidden_from is not None:
         surface = wp.to_torch(_checked("hidden_from", hidden_from), requires_grad=False)
-        options = replace(options or RasterOptions(), hidden_from=surface)
+        options = replace(checks.check_options(adjoint, options), hidden_from=surface)
     tape = open_tape()
     recorded = tape is not None and any(array.requires_grad for array in named.values())
     with _torch_on(means.device, recorded):
@@ -261,6 +261,7 @@ def rasterize_worlds(
             raise InputError(f"{name}: expected one array for each of {len(cameras)} cameras, got {len(value)}.")
         return value[world] if value.ndim > 1 else value[world : world + 1]
 
+    checks.bases_of(cameras)
     found = []
     for world, camera in enumerate(cameras):
         room = {name: of(world, name, array, 0) for name, array in (out or {}).items()}

@@ -53,7 +53,7 @@ def draw_by_program(command: str):
     """
     try:
         parts = [part.format(**dict.fromkeys(PLACES, "")) for part in shlex.split(command)]
-    except (KeyError, IndexError, ValueError):
+    except (LookupError, AttributeError, TypeError, ValueError):
         parts = []
     if not parts or not ("{out}" in command or "{exr}" in command):
         raise InputError(f"--command: expected {{ply}}, {{cameras}} and {{out}} (or {{exr}}) in it, found {command!r}.")
@@ -126,7 +126,7 @@ def _browser():
 
 def _missing(page: Path) -> list[str]:
     """The packages that a page asks for and that are not there."""
-    packages = " ".join(PACKAGES.findall(page.read_text(encoding="utf-8"))).split()
+    packages = " ".join(PACKAGES.findall(page.read_text(encoding="utf-8", errors="replace"))).split()
     return [name for name in packages if not (CACHE / "node_modules" / name.rsplit("@", 1)[0]).exists()]
 
 

@@ -56,7 +56,11 @@ class Renderer:
             self.process = context.Process(target=_serve, args=(other, self.place), daemon=True)
             self.process.start()
             other.close()
-            self._receive(START_LIMIT)
+            try:
+                self._receive(START_LIMIT)
+            except RendererFailed:  # its process has ended, or is about to
+                self.close()
+                raise
         given = [tensor.numpy() for tensor in (*workload.gaussians, workload.background)]
         self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
         image, gradients, same = self._receive(self.limit * runs)

@@ -84,15 +84,13 @@ def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[st
     found = []
     for iteration in range(max(STAGES) + 1):
         if iteration:
-            trainer.differentiate(iteration)
+            trainer.advance(iteration)
         if iteration in STAGES:
             gaussians = Gaussians(*(tensor.detach().clone() for tensor in trainer.model.activated()))
             stage = f"{name}, step {iteration}"
             say(f"{stage}: {len(trainer.model)} Gaussians, {camera.width} x {camera.height} px")
             options = RasterOptions(sh_degree=trainer.degree)
             found.append(Workload(stage, gaussians, camera, trainer.background, options, sample_pixels(camera)))
-        if iteration:
-            trainer.update(iteration)
     return found
 
 

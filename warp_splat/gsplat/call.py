@@ -101,8 +101,9 @@ def rasterization(
     given = dict(locals())
     drawn: list[torch.Tensor] = []
     if sparse_grad and packed:
-        shapes = ("means", "quats", "scales", "covars")
-        given |= {name: _Thinned.apply(given[name], drawn) for name in shapes if given[name] is not None}
+        shapes = {"means": 1, "quats": 1, "scales": 1, "covars": 2}  # dimensions of what each Gaussian has
+        tensors = {name: given[name] for name in shapes if isinstance(given[name], torch.Tensor)}
+        given |= {name: _Thinned.apply(tensor, drawn, shapes[name]) for name, tensor in tensors.items()}
     request = check_request(Request(**given))
     seen = see(request)
     drawn.append(seen.drawn)
@@ -134,19 +135,19 @@ def _show(request: Request, seen: Seen) -> tuple[dict[str, torch.Tensor], Seen]:
 class _Thinned(torch.autograd.Function):
     """The same; its gradient is a sparse tensor of what any camera sees.
 
-    ``drawn`` gets the mask [S, C, N] of that before gradients come.
+    ``drawn`` gets the mask [S, C, N] of that before gradients come; ``own``: the last dimensions, of each Gaussian.
     """
 
     @staticmethod
-    def forward(ctx, tensor, drawn):
-        ctx.drawn = drawn
+    def forward(ctx, tensor, drawn, own):
+        ctx.drawn, ctx.own = drawn, own
         return tensor.clone()
 
     @staticmethod
     def backward(ctx, adj):
-        seen = ctx.drawn[0].any(1).view(adj.shape[:-1])
+        seen = ctx.drawn[0].any(1).view(adj.shape[: -ctx.own])
         places, values = seen.nonzero().T, adj[seen]
-        return torch.sparse_coo_tensor(places, values, adj.shape, is_coalesced=True, check_invariants=True), None
+        return torch.sparse_coo_tensor(places, values, adj.shape, is_coalesced=True, check_invariants=True), None, None
 
 
 def _tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:

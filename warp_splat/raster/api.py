@@ -11,7 +11,6 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
-from warp_splat.errors import InputError
 from warp_splat.raster import checks
 from warp_splat.raster.behind import put_behind
 from warp_splat.raster.beside import blend_beside
@@ -138,9 +137,7 @@ def rasterize_views(
     Raises:
         InputError: as :func:`rasterize` does.
     """
-    if isinstance(cameras, (Camera, CameraParameters)) or not isinstance(cameras, Sequence):
-        raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
-    bases = [checks.check_camera(camera) for camera in cameras]
+    bases = checks.bases_of(cameras)
     options = checks.check_options(adjoint, options)
     gaussians = checks.check_gaussians(means, quats, scales, opacities, sh)
     background = checks.check_background(background, means.device)

@@ -1,7 +1,7 @@
 """What :func:`warp_splat.rasterize` demands of its arguments, said in one sentence when it is not met."""
 
 import numbers
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -32,6 +32,13 @@ def check_camera(camera: Camera | CameraParameters) -> Camera:
         most, size = CAMERA_PIXELS_MOST, f"{camera.width} x {camera.height}"
         raise InputError(f"camera: expected at most {most} pixels, got {size}; resize it with .resized().")
     return camera
+
+
+def bases_of(cameras: Sequence[Camera | CameraParameters]) -> list[Camera]:
+    """The cameras, or their bases. Raises InputError if they are no sequence, or as :func:`check_camera` does."""
+    if not isinstance(cameras, Sequence):
+        raise InputError(f"cameras: expected a sequence of warp_splat.Camera, got {type(cameras).__name__}.")
+    return [check_camera(camera) for camera in cameras]
 
 
 @contextmanager

@@ -197,6 +197,12 @@ class Trainer:
         for after_step in having((*self.parts, self.growth), "after_step"):
             after_step(iteration)
 
+    def advance(self, iteration: int) -> torch.Tensor:
+        """:meth:`update` after the step before, if there was one, then :meth:`differentiate`; returns the loss."""
+        if iteration > 1:
+            self.update(iteration - 1)
+        return self.differentiate(iteration)
+
     def settle(self, begin: int, cooldown: int) -> None:
         """Let the cooldown begin at a step that is still to come: what was done is what these flags would have done."""
         self.config = self.config.changed(settle_from_iter=begin, cooldown=cooldown, minutes=0.0)

@@ -129,9 +129,7 @@ def quality(config: TrainConfig, scene: Scene, parts: list[str], steps: int, fol
     short = _shortened(config, scene, steps).changed(parts=",".join(parts), seed=config.learn.seed ^ fold)
     trainer = Trainer(part, short)
     for iteration in range(1, steps + 1):
-        if iteration > 1:
-            trainer.update(iteration - 1)
-        trainer.differentiate(iteration)
+        trainer.advance(iteration)
     values = []
     for view in trainer.refined(held):
         camera, photograph = trainer.photographs.at_size(view, steps)
